@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
-from tests.twin_master.watch.test_watch import PASSWORD, Mosquitto, write_csv
+from tests.twin_master.watch.watches import PASSWORD, Mosquitto, write_csv
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine

@@ -2,122 +2,41 @@
 
 from __future__ import annotations
 
-import copy
 import json
-import math
 import os
 import random
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from paho.mqtt import client as paho
 from typer.testing import CliRunner
 
 import uav_twin
 from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
-from scenarios import scenario_files
-from twin_master.assets.resolution import Overrides
+from tests.twin_master.watch.watches import begun, write_csv
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, line_of, read_records
-from twin_master.mission.loop import Flight, fly
+from twin_master.mission.loop import Flight
 from twin_master.network.estimator import ExactFilter
-from twin_master.scenario.notice import Noticing
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed
 from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.message import Message
-from twin_master.watch.mqtt import PASSWORD_VARIABLE, MqttFeed, broker_of
-from twin_master.watch.opening import begin_watch, resume_watch
+from twin_master.watch.opening import resume_watch
 from twin_master.watch.replay import BelievedModel
 from twin_master.watch.snapshot import flown
-from twin_master.watch.teaching import Question, Search, Teaching, both_patches
-from twin_master.watch.trial import Judge
+from uav_twin.cli import app
 
-
-@pytest.fixture(scope="module")
-def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
-    """`level_turns` of a real wing: without what flies and what really happens."""
-    kept, skipping = [], False
-    for line in load_scenario("level_turns").path.read_text(encoding="utf-8").splitlines():
-        if line.startswith("["):
-            skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
-        if not skipping:
-            kept.append(line)
-    path = tmp_path_factory.mktemp("scenario") / "my_wing.toml"
-    path.write_text("\n".join(kept) + "\n\n[watch]\nlag = 12\n", encoding="utf-8")
-    return load_scenario(path)
-
-
-@pytest.fixture(scope="module")
-def mission(base: Watch) -> Flight:
-    """The paper's mission, flown by the model that the watch believes."""
-    knowledge = replace(base.models[0].knowledge, scenario=load_scenario("level_turns").scenario)
-    plant = knowledge.plant(knowledge.truth(knowledge.scenario.mission.seed), base._source.open())
-    return fly(knowledge.scenario, knowledge.twin(), plant)
-
-
-def write_csv(path: Path, observed: np.ndarray, controls: np.ndarray, garbage: bool = False) -> Path:
-    lines = ["turn,control," + ",".join(f"strain_{number}" for number in range(1, 25))]
-    for turn, row in enumerate(observed):
-        cells = ",".join("" if np.isnan(value) else repr(value) for value in row.tolist())
-        lines.append(f"{turn},{('2g', '3g')[controls[turn]]},{cells}")
-        if garbage and turn % 7 == 3:
-            lines.append(f"{turn},4g,what")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
-
-
-@pytest.fixture(scope="module")
-def recorded(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The mission as a CSV file with some garbage between its turns."""
-    path = tmp_path_factory.mktemp("recorded") / "mission.csv"
-    return write_csv(path, mission.observed, mission.control_index, garbage=True)
-
-
-@pytest.fixture(scope="module")
-def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> Watch:
-    """A watch that has seen nothing."""
-    folder = tmp_path_factory.mktemp("base") / "watch"
-    watch, lock = begin_watch(scenario, folder, Overrides(), SilentProgress(), replace_run=False)
-    os.close(lock)
-    return watch
-
-
-def begun(base: Watch, folder: Path) -> Watch:
-    """Return a watch of the same configuration in a folder of its own, without calibrating again."""
-    shutil.copytree(base.folder, folder)
-    watch = copy.copy(base)
-    watch.folder, watch._path, watch.models = folder, folder / JOURNAL_NAME, list(base.models)
-    watch._patches = [None]
-    return watch
-
-
-@pytest.fixture(scope="module")
-def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the watch of the whole mission."""
-    folder = tmp_path_factory.mktemp("whole") / "watch"
-    watch = begun(base, folder)
-    decisions: list[dict[str, object]] = []
-    counts = watch.run(CsvFeed(recorded, watch.scenario), lambda decision: decisions.append(dict(decision)))
-    watch.store(counts)
-    assert [decision["turn"] for decision in decisions] == list(range(50))
-    assert all(0.5 <= float(str(decision["probability"])) <= 1.0 for decision in decisions)
-    (folder / "decisions.json").write_text(json.dumps(decisions))
-    return folder
+pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 
 
 def test_a_recorded_mission_is_watched_as_it_was_flown(mission: Flight, whole: Path) -> None:
@@ -360,7 +279,7 @@ def test_a_reader_that_leaves_ends_the_watch_in_order(
     assert "Broken" not in said
     # It has ended; only after a kill, before the summary is written, nobody knows what was told.
     for again in (0, 1):
-        result = CliRunner().invoke(app(), ["watch", "--resume", *out, "--no-report"], input="")
+        result = CliRunner().invoke(app, ["watch", "--resume", *out, "--no-report"], input="")
         assert result.exit_code == 0, result.output
         told = [json.loads(line) for line in result.stdout.splitlines()]
         assert [(decision["told_again"], decision["turn"] > 0) for decision in told] == [(True, True)] * again
@@ -385,19 +304,19 @@ def test_a_changed_journal_and_other_folders_are_refused(
         assert isinstance(kept, Message)
         np.testing.assert_array_equal(said.observed, kept.observed)
         assert said.turn == kept.turn
-    result = CliRunner().invoke(app(), ["watch", str(scenario.path), "--out", str(whole)])
+    result = CliRunner().invoke(app, ["watch", str(scenario.path), "--out", str(whole)])
     assert "holds a run already" in str(result.exception)
     with pytest.raises(Exception, match=r"this scenario has no `\[asset\]`"):
         uav_twin.fly(scenario, tmp_path / "run")
     for options in (["--resume", "--seed", "3"], ["--model-patch", "x.json"], []):
-        assert CliRunner().invoke(app(), ["watch", *options]).exit_code != 0
+        assert CliRunner().invoke(app, ["watch", *options]).exit_code != 0
 
 
 def test_the_shipped_recording_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The gauge that comes loose at turn 10, and the skin that softens from turn 25 on."""
     monkeypatch.setattr(Watch, "store", lambda *_arguments, **_options: None)
     folder = tmp_path / "a b"
-    result = CliRunner().invoke(app(), ["watch", "watched_wing", "--out", str(folder), "--pace", "0.001"])
+    result = CliRunner().invoke(app, ["watch", "watched_wing", "--out", str(folder), "--pace", "0.001"])
     assert result.exit_code == 0, result.output
     decisions = [json.loads(line) for line in result.stdout.splitlines()]
     assert [decision["turn"] for decision in decisions] == list(range(60))
@@ -409,18 +328,12 @@ def test_the_shipped_recording_is_noticed(tmp_path: Path, monkeypatch: pytest.Mo
     assert decisions[24]["none_of_these"] < 0.5
     assert decisions[-1]["none_of_these"] > 0.999
     assert f"--from-run '{folder}'" in result.stderr
-    again = CliRunner().invoke(app(), ["watch", "--resume", "--out", str(folder)])
+    again = CliRunner().invoke(app, ["watch", "--resume", "--out", str(folder)])
     told = [json.loads(line) for line in again.stdout.splitlines()]
     assert [(decision["turn"], decision["told_again"]) for decision in told] == [
         (59, True)
     ]  # nothing is read
     assert "60 messages." in again.stderr
-
-
-def app() -> object:
-    from uav_twin.cli import app as application
-
-    return application
 
 
 @pytest.mark.long
@@ -462,219 +375,6 @@ def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: Flight,
     assert figures["gap_after_patch_20"] < 0.97 * figures["gap_before_patch_20"]
 
 
-# A search that knows its answer: it waits for a gate, and leaves what `discrepancy run` leaves.
-ANSWER = """
-import json, pathlib, sys, time
-words, (answer, gate) = sys.argv[3:], sys.argv[1:3]
-out = pathlib.Path(words[words.index("--out") + 1])
-while gate != "-" and not pathlib.Path(gate).exists():
-    time.sleep(0.01)
-kind, patch = json.loads(pathlib.Path(answer).read_text())
-if kind is None:
-    sys.exit("Nothing can be said.")
-place = out.with_name("." + out.name)
-place.mkdir()
-(place / "verdict.json").write_text(json.dumps({"verdict": {"kind": kind, "sentence": "It is so."}}))
-(place / "patch.json").write_text(json.dumps(patch))
-place.rename(out)
-"""
-
-
-def patch_of(gain: float, channel: str = "g5") -> dict[str, Any]:
-    effects = [{"id": "loose", "primitives": ModelPatch((SensorGain(channel, gain),)).to_list()}]
-    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
-
-
-def search(watch: Watch, place: Path, kind: str | None, gain: float, gate: str = "-") -> Search:
-    answer, script = place / f"{kind}_{gain}.json", place / "answer.py"
-    answer.write_text(json.dumps([kind, patch_of(gain)]))
-    script.write_text(ANSWER)
-    return Search(watch.folder, 7, (sys.executable, str(script), str(answer), gate))
-
-
-def watchful(base: Watch, folder: Path) -> Watch:
-    watch = begun(base, folder)
-    watch.scenario = watch.scenario.model_copy(update={"notice": Noticing()})
-    watch.models = [BelievedModel(0, replace(base.models[0].knowledge, scenario=watch.scenario))]
-    watch._take_up()
-    return watch
-
-
-@pytest.fixture(scope="module")
-def loose(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The mission with a gauge that shows 30 % too little from turn 15 on."""
-    observed = mission.observed.copy()
-    observed[15:, 4] *= 0.7
-    return write_csv(tmp_path_factory.mktemp("loose") / "m.csv", observed, mission.control_index)
-
-
-def lines(watch: Watch) -> list[dict[str, Any]]:
-    return [record for record, _ in read_records(watch.folder / JOURNAL_NAME)]
-
-
-def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
-    base: Watch, mission: Flight, loose: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "whole").mkdir()
-    watch = watchful(base, tmp_path / "whole" / "watch")
-    decisions: list[dict[str, Any]] = []
-    told = search(watch, tmp_path, "named", -0.3)
-    watch.run(CsvFeed(loose, watch.scenario), lambda d: decisions.append(dict(d)), search=told)
-    records = lines(watch)
-    (verdict,) = [record["verdict"] for record in records if "verdict" in record]
-    (model,) = [record["model"] for record in records if "model" in record]
-    alarm = next(d for d in decisions for n in d["notices"] if n["kind"] == "alarm")
-    assert verdict["to_turn"] == alarm["turn"] + 10
-    assert 12 <= verdict["from_turn"] <= 18
-    assert model["from_turn"] == verdict["from_turn"]
-    assert model["before"]["rms_residual"] > 1.4 > 1.3 > model["after"]["rms_residual"]
-    said = [notice["sentence"] for d in decisions for notice in d["notices"]]
-    assert "named. It is so. The patch is tried" in said[1]
-    assert "is believed from turn" in said[2]
-    assert len(said) == 3
-    assert [notice.sentence for _, notice in watch.told(0)] == said  # in the report too, though filtered anew
-    # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
-    last = records[-1]["filtered"]
-    assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
-    # Stopped within the trial, and after the adoption: the same journal.
-    stopped = watchful(base, tmp_path / "stopped")
-    asked = verdict["to_turn"]
-    for end in (asked + 5, asked + 15, None):
-        stopped.run(
-            CsvFeed(loose, stopped.scenario), lambda _d: None, turns=end,
-            search=search(stopped, tmp_path, "named", -0.3),
-        )  # fmt: skip
-        journal = (stopped.folder / JOURNAL_NAME).read_bytes()
-        again = watchful(stopped, tmp_path / f"{end}")
-        assert (again.folder / JOURNAL_NAME).read_bytes() == journal
-        stopped = again
-    assert journal == (watch.folder / JOURNAL_NAME).read_bytes()
-
-
-def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:
-    for kind, gain, sentence in (
-        ("named", 0.3, "and is not adopted."),
-        ("family", -0.3, "--model-patch DIR/teaching/turns_"),
-        (None, 0.0, "the search ended without a verdict: Nothing can be said."),
-    ):
-        watch = watchful(base, tmp_path / f"{kind}{gain}")
-        finder = search(watch, tmp_path, kind, gain)
-        watch.run(CsvFeed(loose, watch.scenario), lambda _d: None, turns=44, search=finder)
-        records = lines(watch)
-        assert not any("model" in record for record in records)
-        notices = [n["sentence"] for record in records for n in record.get("notices", [])]
-        assert any(sentence in text for text in notices)
-        assert sum("searched for the cause" in text for text in notices) == 2
-
-
-def test_live_turns_do_not_wait_for_the_search(base: Watch, loose: Path, tmp_path: Path) -> None:
-    watch = watchful(base, tmp_path / "watch")
-    feed, gate = CsvFeed(loose, watch.scenario), tmp_path / "gate"
-    feed.replayable = False  # as a broker
-    finder = search(watch, tmp_path, "group", -0.3, str(gate))
-
-    def decide(decision: Any) -> None:
-        if decision["turn"] == 40:
-            gate.touch()
-            for _ in range(1000):
-                if any((watch.folder / "teaching").glob("turns*/verdict.json")):
-                    return
-                time.sleep(0.02)
-
-    watch.run(feed, decide, search=finder)
-    (verdict, *_) = [record for record in lines(watch) if "verdict" in record]
-    assert (verdict["turn"], verdict["verdict"]["turn"]) == (40, 40)
-    assert verdict["verdict"]["to_turn"] < 35
-
-
-def test_live_turns_do_not_wait_for_the_patched_model(
-    base: Watch, mission: Flight, loose: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is built beside them, and believed behind the turn that the journal says, to the bit."""
-    judges: list[Judge] = []
-
-    class Kept(Judge):
-        def __init__(self, *, wait: bool) -> None:
-            super().__init__(wait=wait)
-            judges.append(self)
-
-    monkeypatch.setattr("twin_master.watch.folder.Judge", Kept)
-    monkeypatch.setattr("twin_master.watch.trial.COURTESY", 0)
-    watch = watchful(base, tmp_path / "watch")
-    feed = CsvFeed(loose, watch.scenario)
-    feed.replayable = False  # as a broker
-    finder = search(watch, tmp_path, "group", -0.3)
-    trial_end = 0
-
-    def decide(decision: Any) -> None:
-        nonlocal trial_end
-        verdict = next((record["verdict"] for record in lines(watch) if "verdict" in record), None)
-        teaching = watch.folder / "teaching"
-        while verdict is None and teaching.is_dir() and not [*teaching.glob("turns*/verdict.json")]:
-            time.sleep(0.02)
-        trial_end = verdict["turn"] + 10 if verdict else 0
-        if trial_end and decision["turn"] == trial_end + 3:
-            while not judges[0].answered:  # the turns between were decided while it was built
-                time.sleep(0.02)
-
-    watch.run(feed, decide, search=finder)
-    model = next(record for record in lines(watch) if "model" in record)
-    assert model["turn"] == trial_end + 3
-    assert model["model"]["from_turn"] < 20
-    assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
-    twin, first = base.models[0].knowledge.twin(), model["model"]["from_turn"]
-    observed = mission.observed.copy()
-    observed[15:, 4] *= 0.7
-    knew = watch.models[1].knowledge.twin()
-    for number, row in enumerate(observed):
-        if number == first:
-            knew.restore_state(twin.save_state())
-            twin = knew
-        found = twin.turn(row, int(mission.control_index[number]))
-    assert lines(watch)[-1]["filtered"] == found.filtered.tolist()
-    again = watchful(watch, tmp_path / "again")
-    assert again._replayed(None).twin.save_state() == watch._replayed(None).twin.save_state()
-
-
-def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
-    return {"turn": number, "notices": list(alarms), "suspicion": {"log_evidence_none": evidence}}
-
-
-def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns() -> None:
-    teaching = Teaching(100.0)
-    alarm = {"kind": "alarm", "sentence": "a", "since": 3}
-    for number in range(12):
-        teaching.take(turn(number, 10.0, *([alarm] if number == 5 else [])))
-    for number in (12, 13, 14, 15):
-        teaching.take(turn(number, math.log(100.0) - 0.1))
-    assert teaching.question is None  # it did not hold ten turns after the alarm
-    teaching.take(turn(16, math.log(100.0)))
-    assert teaching.question == Question(3, 16)
-    told = {"kind": "verdict", "sentence": "v"}
-    teaching.take({"turn": 16, "verdict": {"to_turn": 16, "turn": 16, "tried": False, "notice": told}})
-    assert teaching.question is None
-    assert teaching.untold == [told]
-    for number in range(17, 40):
-        teaching.take(turn(number, 10.0))
-        assert (teaching.question is not None) == (number >= 27)
-    assert teaching.question == Question(3, 27)
-    assert teaching.untold == []
-    teaching.take({"turn": 40, "model": {"from_turn": 8, "notice": told, "alarms": [alarm]}})
-    assert (teaching.question, teaching.untold) == (None, [told, alarm])
-    for number in range(41, 60):
-        teaching.take(turn(number, 10.0))
-    assert teaching.question == Question(8, 49)  # the alarm of the new model, and not before it was believed
-
-
-def test_a_second_patch_stands_beside_the_first(tmp_path: Path) -> None:
-    for number, channel in enumerate(("g5", "g7")):
-        (tmp_path / str(number)).write_text(json.dumps(patch_of(-0.1, channel)))
-    both = json.loads(both_patches(tmp_path / "0", tmp_path / "1"))
-    assert [effect["primitives"][0]["channel"] for effect in both["effects"]] == ["g5", "g7"]
-    assert both["channels"] == {"g5": "strain[5]", "g7": "strain[7]"}
-    assert both_patches(None, tmp_path / "1") == (tmp_path / "1").read_bytes()
-
-
 def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
     before = (whole / JOURNAL_NAME).read_bytes()
     with flown(whole, 3, 20, SilentProgress()) as copy:
@@ -690,157 +390,6 @@ def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
         raise AssertionError
 
 
-def test_teaching_is_refused_at_the_start_where_nothing_could_look_for_a_cause(tmp_path: Path) -> None:
-    scenario = tmp_path / "bracket.toml"
-    scenario.write_text(scenario_files()["bracket"].read_text(encoding="utf-8") + "\n[notice]\n")
-    words = ["watch", str(scenario), "--observations", "-", "--out", str(tmp_path / "w"), "--teach"]
-    result = CliRunner().invoke(app(), words)
-    assert isinstance(result.exception, MissionInputError)
-    assert "this scenario has the role strain under z_heel, z_arm" in str(result.exception)
-    assert not (tmp_path / "w").exists()
-
-
-PASSWORD = "a password"
-
-
-class Mosquitto:
-    """A broker on the loopback that wants a user, or TLS, and keeps its sessions when it stops."""
-
-    def __init__(self, folder: Path, *, tls: bool = False) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
-        self.folder, self.tls = folder, tls
-        self.authority = folder / "certificate.pem"
-        subprocess.run(
-            ["mosquitto_passwd", "-b", "-c", str(folder / "users"), "wing", PASSWORD],
-            check=True,
-            capture_output=True,
-        )
-        lines = [
-            f"listener {self.port} 127.0.0.1", "allow_anonymous false", f"password_file {folder / 'users'}",
-            "persistence true", f"persistence_location {folder}/", "max_queued_messages 10000", "user root",
-        ]  # fmt: skip
-        if tls:
-            command = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2"
-            subprocess.run(
-                ["openssl", *command.split(), "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
-                 "-subj", "/CN=localhost",
-                 "-keyout", str(folder / "key.pem"), "-out", str(self.authority)],
-                check=True, capture_output=True,
-            )  # fmt: skip
-            lines += [f"certfile {self.authority}", f"keyfile {folder / 'key.pem'}"]
-        (folder / "mosquitto.conf").write_text("\n".join(lines) + "\n")
-        self.start()
-
-    def start(self) -> None:
-        self.process = subprocess.Popen(
-            ["mosquitto", "-c", str(self.folder / "mosquitto.conf")], stderr=subprocess.DEVNULL
-        )
-        for _ in range(400):
-            try:
-                socket.create_connection(("127.0.0.1", self.port), 1.0).close()
-                return
-            except OSError:
-                time.sleep(0.02)
-
-    def stop(self) -> None:
-        self.process.terminate()
-        self.process.wait(20)
-
-    def client(self, name: str) -> Any:
-        client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id=name, clean_session=False)
-        client.username_pw_set("wing", PASSWORD)
-        if self.tls:
-            client.tls_set(ca_certs=str(self.authority))
-        client.connect("localhost" if self.tls else "127.0.0.1", self.port)
-        client.loop_start()
-        return client
-
-
-@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
-@pytest.mark.parametrize("tls", [False, True])
-def test_over_a_broker_that_stops_and_a_hostile_publisher(
-    base: Watch, mission: Flight, whole: Path, tmp_path: Path, tls: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    broker = Mosquitto(tmp_path, tls=tls)
-    scheme, host = ("mqtts", "localhost") if tls else ("mqtt", "127.0.0.1")
-    where = broker_of(f"{scheme}://wing@{host}:{broker.port}/wing/7", broker.authority if tls else None)
-    watch = begun(base, tmp_path / "watch")
-    monkeypatch.setenv(PASSWORD_VARIABLE, "another")
-    with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
-        watch.run(MqttFeed(where, watch.scenario, watch.folder, str), lambda _decision: None)
-    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    notes: list[str] = []
-    feed = MqttFeed(where, watch.scenario, watch.folder, notes.append)
-    turns = len(mission.observed)
-    watching = threading.Thread(target=watch.run, args=(feed, feed.decide), kwargs={"turns": turns})
-    watching.start()
-    limit = time.monotonic() + 60.0
-    heard: list[dict[str, Any]] = []
-    listener = broker.client("listener")
-    listener.on_message = lambda _client, _data, message: heard.append(json.loads(message.payload))
-    listener.subscribe("wing/7/decision", qos=1)
-    while not any("Connected" in note for note in notes) and time.monotonic() < limit:
-        time.sleep(0.02)
-    publisher = broker.client("publisher")
-
-    def publish(first: int, last: int) -> None:
-        for turn in range(first, last):
-            row, control = mission.observed[turn], ("2g", "3g")[mission.control_index[turn]]
-            record = {"turn": turn, "control": control, "strain": row.tolist()}
-            publisher.publish("wing/7", json.dumps(record), qos=1).wait_for_publish(20)
-
-    publish(0, 20)
-    for number in range(1000):
-        publisher.publish("wing/7", b"garbage %d" % number, qos=0)
-    publisher.publish("wing/7", b"x" * 3_000_000, qos=0)
-    publisher.publish("wing/7", json.dumps({"strain": [1e-4] * 24}), qos=1)  # of which turn?
-    publish(15, 19)
-    if not tls:
-        broker.stop()
-        broker.start()
-        while not publisher.is_connected() and time.monotonic() < limit:
-            time.sleep(0.02)
-    publish(20, turns)
-    watching.join(60)
-    assert not watching.is_alive()
-    feed.close()
-    while (not heard or heard[-1]["turn"] < turns - 1) and time.monotonic() < limit:
-        time.sleep(0.02)
-    publisher.disconnect()
-    listener.disconnect()
-    broker.stop()
-    last, expected = (
-        json.loads((folder / JOURNAL_NAME).read_text().splitlines()[-1][65:])
-        for folder in (watch.folder, whole)
-    )
-    assert last["filtered"] == expected["filtered"]
-    assert last["intake"]["counts"]["late"] == 0
-    assert last["intake"]["counts"]["duplicates"] >= 4
-    assert 1 <= last["intake"]["counts"]["rejected"] < 1010  # a broker may lose or repeat some
-    assert {decision["turn"] for decision in heard} == set(range(turns))
-    assert all(decision["probability"] >= 0.5 for decision in heard)
-
-
-def test_addresses_of_brokers(base: Watch, tmp_path: Path) -> None:
-    assert broker_of("mqtt://host/a/b").port == 1883
-    assert broker_of("mqtts://me@host:1/a").user == "me"
-    assert broker_of("mqtts://me%40work@host:1/a").user == "me@work"
-    for wrong, match in (
-        ("mqtt://me:secret@host/a", "every user of this machine"),
-        ("mqtt://host/a/#", "one asset"),
-        ("mqtt://host/+/a", "one asset"),
-        ("mqtt://host", "is expected"),
-        ("mqtt://host:x/a", "is expected"),
-    ):
-        with pytest.raises(MissionInputError, match=match):
-            broker_of(wrong)
-    (tmp_path / "authority.pem").write_text("no certificate")
-    with pytest.raises(MissionInputError, match=r"authority.pem holds no certificate"):
-        MqttFeed(broker_of("mqtts://host/a", tmp_path / "authority.pem"), base.scenario, tmp_path, print)
-
-
 def test_a_slip_of_the_pen_makes_no_folder(scenario: LoadedScenario, tmp_path: Path) -> None:
     (tmp_path / "run.nc").touch()
     for source, said in (
@@ -851,7 +400,7 @@ def test_a_slip_of_the_pen_makes_no_folder(scenario: LoadedScenario, tmp_path: P
         (["-", "--teach"], "the scenario needs the table `[notice]`"),
     ):
         options = ["--out", str(tmp_path / "watch"), "--observations", *source]
-        result = CliRunner().invoke(app(), ["watch", str(scenario.path), *options])
+        result = CliRunner().invoke(app, ["watch", str(scenario.path), *options])
         assert said in str(result.exception)
         assert not (tmp_path / "watch").exists()
 
@@ -862,6 +411,6 @@ def test_what_is_watched_is_not_replaced_by_its_watch(
     shutil.copytree(whole, tmp_path / "watch")
     for source in (tmp_path / "watch", tmp_path / "watch" / "run.nc"):
         options = ["--out", str(tmp_path / "watch"), "--replace", "--observations", str(source)]
-        result = CliRunner().invoke(app(), ["watch", str(scenario.path), *options])
+        result = CliRunner().invoke(app, ["watch", str(scenario.path), *options])
         assert "choose another --out" in str(result.exception)
     assert (tmp_path / "watch" / JOURNAL_NAME).read_bytes() == (whole / JOURNAL_NAME).read_bytes()

@@ -1,0 +1,79 @@
+"""A wing and its watches, made once."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from reporting.progress import SilentProgress
+from tests.twin_master.watch.watches import begun, write_csv
+from twin_master.assets.resolution import Overrides
+from twin_master.mission.loop import Flight, fly
+from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.watch.feeds import CsvFeed
+from twin_master.watch.folder import Watch
+from twin_master.watch.opening import begin_watch
+
+
+@pytest.fixture(scope="package")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
+    """`level_turns` of a real wing: without what flies and what really happens."""
+    kept, skipping = [], False
+    for line in load_scenario("level_turns").path.read_text(encoding="utf-8").splitlines():
+        if line.startswith("["):
+            skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
+        if not skipping:
+            kept.append(line)
+    path = tmp_path_factory.mktemp("scenario") / "my_wing.toml"
+    path.write_text("\n".join(kept) + "\n\n[watch]\nlag = 12\n", encoding="utf-8")
+    return load_scenario(path)
+
+
+@pytest.fixture(scope="package")
+def mission(base: Watch) -> Flight:
+    """The paper's mission, flown by the model that the watch believes."""
+    knowledge = replace(base.models[0].knowledge, scenario=load_scenario("level_turns").scenario)
+    plant = knowledge.plant(knowledge.truth(knowledge.scenario.mission.seed), base._source.open())
+    return fly(knowledge.scenario, knowledge.twin(), plant)
+
+
+@pytest.fixture(scope="package")
+def recorded(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The mission as a CSV file with some garbage between its turns."""
+    path = tmp_path_factory.mktemp("recorded") / "mission.csv"
+    return write_csv(path, mission.observed, mission.control_index, garbage=True)
+
+
+@pytest.fixture(scope="package")
+def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> Watch:
+    """A watch that has seen nothing."""
+    folder = tmp_path_factory.mktemp("base") / "watch"
+    watch, lock = begin_watch(scenario, folder, Overrides(), SilentProgress(), replace_run=False)
+    os.close(lock)
+    return watch
+
+
+@pytest.fixture(scope="package")
+def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the watch of the whole mission."""
+    folder = tmp_path_factory.mktemp("whole") / "watch"
+    watch = begun(base, folder)
+    decisions: list[dict[str, object]] = []
+    counts = watch.run(CsvFeed(recorded, watch.scenario), lambda decision: decisions.append(dict(decision)))
+    watch.store(counts)
+    assert [decision["turn"] for decision in decisions] == list(range(50))
+    assert all(0.5 <= float(str(decision["probability"])) <= 1.0 for decision in decisions)
+    (folder / "decisions.json").write_text(json.dumps(decisions))
+    return folder
+
+
+@pytest.fixture(scope="package")
+def loose(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The mission with a gauge that shows 30 % too little from turn 15 on."""
+    observed = mission.observed.copy()
+    observed[15:, 4] *= 0.7
+    return write_csv(tmp_path_factory.mktemp("loose") / "m.csv", observed, mission.control_index)

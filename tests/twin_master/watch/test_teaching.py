@@ -1,0 +1,231 @@
+"""A watch that is taught: it asks for the cause, tries what is named, and adopts what explains more."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fe.runtime.patch import ModelPatch, SensorGain
+from fmu_asset.packing.patch_file import SCHEMA
+from scenarios import scenario_files
+from tests.twin_master.watch.watches import lines, watchful
+from twin_master.errors import MissionInputError
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.loop import Flight
+from twin_master.watch.feeds import CsvFeed
+from twin_master.watch.folder import Watch
+from twin_master.watch.teaching import Question, Search, Teaching, both_patches
+from twin_master.watch.trial import Judge
+from uav_twin.cli import app
+
+# A search that knows its answer: it waits for a gate, and leaves what `discrepancy run` leaves.
+ANSWER = """
+import json, pathlib, sys, time
+
+pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
+words, (answer, gate) = sys.argv[3:], sys.argv[1:3]
+out = pathlib.Path(words[words.index("--out") + 1])
+while gate != "-" and not pathlib.Path(gate).exists():
+    time.sleep(0.01)
+kind, patch = json.loads(pathlib.Path(answer).read_text())
+if kind is None:
+    sys.exit("Nothing can be said.")
+place = out.with_name("." + out.name)
+place.mkdir()
+(place / "verdict.json").write_text(json.dumps({"verdict": {"kind": kind, "sentence": "It is so."}}))
+(place / "patch.json").write_text(json.dumps(patch))
+place.rename(out)
+"""
+
+
+def patch_of(gain: float, channel: str = "g5") -> dict[str, Any]:
+    effects = [{"id": "loose", "primitives": ModelPatch((SensorGain(channel, gain),)).to_list()}]
+    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
+
+
+def search(watch: Watch, place: Path, kind: str | None, gain: float, gate: str = "-") -> Search:
+    answer, script = place / f"{kind}_{gain}.json", place / "answer.py"
+    answer.write_text(json.dumps([kind, patch_of(gain)]))
+    script.write_text(ANSWER)
+    return Search(watch.folder, 7, (sys.executable, str(script), str(answer), gate))
+
+
+def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
+    base: Watch, mission: Flight, loose: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "whole").mkdir()
+    watch = watchful(base, tmp_path / "whole" / "watch")
+    decisions: list[dict[str, Any]] = []
+    told = search(watch, tmp_path, "named", -0.3)
+    watch.run(CsvFeed(loose, watch.scenario), lambda d: decisions.append(dict(d)), search=told)
+    records = lines(watch)
+    (verdict,) = [record["verdict"] for record in records if "verdict" in record]
+    (model,) = [record["model"] for record in records if "model" in record]
+    alarm = next(d for d in decisions for n in d["notices"] if n["kind"] == "alarm")
+    assert verdict["to_turn"] == alarm["turn"] + 10
+    assert 12 <= verdict["from_turn"] <= 18
+    assert model["from_turn"] == verdict["from_turn"]
+    assert model["before"]["rms_residual"] > 1.4 > 1.3 > model["after"]["rms_residual"]
+    said = [notice["sentence"] for d in decisions for notice in d["notices"]]
+    assert "named. It is so. The patch is tried" in said[1]
+    assert "is believed from turn" in said[2]
+    assert len(said) == 3
+    assert [notice.sentence for _, notice in watch.told(0)] == said  # in the report too, though filtered anew
+    # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
+    last = records[-1]["filtered"]
+    assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
+    # Stopped within the trial, and after the adoption: the same journal.
+    stopped = watchful(base, tmp_path / "stopped")
+    asked = verdict["to_turn"]
+    for end in (asked + 5, asked + 15, None):
+        stopped.run(
+            CsvFeed(loose, stopped.scenario), lambda _d: None, turns=end,
+            search=search(stopped, tmp_path, "named", -0.3),
+        )  # fmt: skip
+        journal = (stopped.folder / JOURNAL_NAME).read_bytes()
+        again = watchful(stopped, tmp_path / f"{end}")
+        assert (again.folder / JOURNAL_NAME).read_bytes() == journal
+        stopped = again
+    assert journal == (watch.folder / JOURNAL_NAME).read_bytes()
+
+
+def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:
+    for kind, gain, sentence in (
+        ("named", 0.3, "and is not adopted."),
+        ("family", -0.3, "--model-patch DIR/teaching/turns_"),
+        (None, 0.0, "the search ended without a verdict: Nothing can be said."),
+    ):
+        watch = watchful(base, tmp_path / f"{kind}{gain}")
+        finder = search(watch, tmp_path, kind, gain)
+        watch.run(CsvFeed(loose, watch.scenario), lambda _d: None, turns=44, search=finder)
+        records = lines(watch)
+        assert not any("model" in record for record in records)
+        notices = [n["sentence"] for record in records for n in record.get("notices", [])]
+        assert any(sentence in text for text in notices)
+        assert sum("searched for the cause" in text for text in notices) == 2
+
+
+def test_live_turns_do_not_wait_for_the_search(base: Watch, loose: Path, tmp_path: Path) -> None:
+    watch = watchful(base, tmp_path / "watch")
+    feed, gate = CsvFeed(loose, watch.scenario), tmp_path / "gate"
+    feed.replayable = False  # as a broker
+    finder = search(watch, tmp_path, "group", -0.3, str(gate))
+
+    def decide(decision: Any) -> None:
+        if decision["turn"] == 40:
+            gate.touch()
+            for _ in range(1000):
+                if any((watch.folder / "teaching").glob("turns*/verdict.json")):
+                    return
+                time.sleep(0.02)
+
+    watch.run(feed, decide, search=finder)
+    (verdict, *_) = [record for record in lines(watch) if "verdict" in record]
+    assert (verdict["turn"], verdict["verdict"]["turn"]) == (40, 40)
+    assert verdict["verdict"]["to_turn"] < 35
+
+
+def test_live_turns_do_not_wait_for_the_patched_model(
+    base: Watch, mission: Flight, loose: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is built beside them, and believed behind the turn that the journal says, to the bit."""
+    judges: list[Judge] = []
+
+    class Kept(Judge):
+        def __init__(self, *, wait: bool) -> None:
+            super().__init__(wait=wait)
+            judges.append(self)
+
+    monkeypatch.setattr("twin_master.watch.folder.Judge", Kept)
+    monkeypatch.setattr("twin_master.watch.trial.COURTESY", 0)
+    watch = watchful(base, tmp_path / "watch")
+    feed = CsvFeed(loose, watch.scenario)
+    feed.replayable = False  # as a broker
+    finder = search(watch, tmp_path, "group", -0.3)
+    trial_end = 0
+
+    def decide(decision: Any) -> None:
+        nonlocal trial_end
+        verdict = next((record["verdict"] for record in lines(watch) if "verdict" in record), None)
+        teaching = watch.folder / "teaching"
+        while verdict is None and teaching.is_dir() and not [*teaching.glob("turns*/verdict.json")]:
+            time.sleep(0.02)
+        trial_end = verdict["turn"] + 10 if verdict else 0
+        if trial_end and decision["turn"] == trial_end + 3:
+            while not judges[0].answered:  # the turns between were decided while it was built
+                time.sleep(0.02)
+
+    watch.run(feed, decide, search=finder)
+    model = next(record for record in lines(watch) if "model" in record)
+    assert model["turn"] == trial_end + 3
+    assert model["model"]["from_turn"] < 20
+    assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
+    twin, first = base.models[0].knowledge.twin(), model["model"]["from_turn"]
+    observed = mission.observed.copy()
+    observed[15:, 4] *= 0.7
+    knew = watch.models[1].knowledge.twin()
+    for number, row in enumerate(observed):
+        if number == first:
+            knew.restore_state(twin.save_state())
+            twin = knew
+        found = twin.turn(row, int(mission.control_index[number]))
+    assert lines(watch)[-1]["filtered"] == found.filtered.tolist()
+    again = watchful(watch, tmp_path / "again")
+    assert again._replayed(None).twin.save_state() == watch._replayed(None).twin.save_state()
+
+
+def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
+    return {"turn": number, "notices": list(alarms), "suspicion": {"log_evidence_none": evidence}}
+
+
+def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns() -> None:
+    teaching = Teaching(100.0)
+    alarm = {"kind": "alarm", "sentence": "a", "since": 3}
+    for number in range(12):
+        teaching.take(turn(number, 10.0, *([alarm] if number == 5 else [])))
+    for number in (12, 13, 14, 15):
+        teaching.take(turn(number, math.log(100.0) - 0.1))
+    assert teaching.question is None  # it did not hold ten turns after the alarm
+    teaching.take(turn(16, math.log(100.0)))
+    assert teaching.question == Question(3, 16)
+    told = {"kind": "verdict", "sentence": "v"}
+    teaching.take({"turn": 16, "verdict": {"to_turn": 16, "turn": 16, "tried": False, "notice": told}})
+    assert teaching.question is None
+    assert teaching.untold == [told]
+    for number in range(17, 40):
+        teaching.take(turn(number, 10.0))
+        assert (teaching.question is not None) == (number >= 27)
+    assert teaching.question == Question(3, 27)
+    assert teaching.untold == []
+    teaching.take({"turn": 40, "model": {"from_turn": 8, "notice": told, "alarms": [alarm]}})
+    assert (teaching.question, teaching.untold) == (None, [told, alarm])
+    for number in range(41, 60):
+        teaching.take(turn(number, 10.0))
+    assert teaching.question == Question(8, 49)  # the alarm of the new model, and not before it was believed
+
+
+def test_a_second_patch_stands_beside_the_first(tmp_path: Path) -> None:
+    for number, channel in enumerate(("g5", "g7")):
+        (tmp_path / str(number)).write_text(json.dumps(patch_of(-0.1, channel)))
+    both = json.loads(both_patches(tmp_path / "0", tmp_path / "1"))
+    assert [effect["primitives"][0]["channel"] for effect in both["effects"]] == ["g5", "g7"]
+    assert both["channels"] == {"g5": "strain[5]", "g7": "strain[7]"}
+    assert both_patches(None, tmp_path / "1") == (tmp_path / "1").read_bytes()
+
+
+def test_teaching_is_refused_at_the_start_where_nothing_could_look_for_a_cause(tmp_path: Path) -> None:
+    scenario = tmp_path / "bracket.toml"
+    scenario.write_text(scenario_files()["bracket"].read_text(encoding="utf-8") + "\n[notice]\n")
+    words = ["watch", str(scenario), "--observations", "-", "--out", str(tmp_path / "w"), "--teach"]
+    result = CliRunner().invoke(app, words)
+    assert isinstance(result.exception, MissionInputError)
+    assert "this scenario has the role strain under z_heel, z_arm" in str(result.exception)
+    assert not (tmp_path / "w").exists()
