@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from reporting.errors import InvalidFigureError
+from reporting.hover import annotated
 
 # Okabe and Ito's palette for colour-blind readers; each colour has one meaning everywhere.
 OBSERVED: Final = "#595959"
@@ -132,18 +133,19 @@ def panel_label(axes: Axes, label: str, title: str = "", *, offset: float = 0.0)
 
 
 def to_svg(figure: Figure) -> bytes:
-    """Return the figure as SVG: text as outlines, deterministic ids, no date, no program name, no DTD."""
+    """Return the figure as SVG: text as outlines, values for the reader's pointer, no date, no DTD."""
     buffer = io.BytesIO()
     with publication_style():
         _read_powers(figure)
-        # All four must be left out for the block of metadata, with its addresses, to vanish.
-        figure.savefig(
-            buffer,
-            format="svg",
-            dpi=PNG_RESOLUTION,  # of what is rasterised in it
-            metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
-        )
-    text = buffer.getvalue().decode("utf-8")
+        with annotated(figure) as annotate:
+            # All four must be left out for the block of metadata, with its addresses, to vanish.
+            figure.savefig(
+                buffer,
+                format="svg",
+                dpi=PNG_RESOLUTION,  # of what is rasterised in it
+                metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
+            )
+        text = annotate(buffer.getvalue().decode("utf-8"))
     text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text, count=1)
     return text.encode("utf-8")
 

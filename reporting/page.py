@@ -1,6 +1,7 @@
 """A self-contained HTML page: sections, numbered figures and tables, one style sheet, nothing from outside.
 
-No script, no request to any server; light, and fit to be printed. All text is escaped.
+No request to any server; light, and fit to be printed. One short script shows the values under the
+pointer in figures; the page is whole without it. All text is escaped.
 """
 
 import html
@@ -171,12 +172,13 @@ class Page:
         subtitle = f'<p class="subtitle">{_text(self._subtitle)}</p>' if self._subtitle else ""
         footer = "".join(f"<p>{_text(line)}</p>" for line in self._footer)
         body = "\n".join(self._body) + ("</section>" if self._sections else "")
+        script = f"<script>\n{_own('hover.js')}</script>\n" if " data-axes=" in body else ""
         return (
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            f"<title>{_text(self._title)}</title>\n<style>\n{_style_sheet()}</style>\n</head>\n<body>\n<main>\n"
+            f"<title>{_text(self._title)}</title>\n<style>\n{_own('page.css')}</style>\n</head>\n<body>\n<main>\n"
             f"<header><h1>{_text(self._title)}</h1>{subtitle}</header>\n{navigation}\n{body}\n"
-            f"<footer>{footer}</footer>\n</main>\n</body>\n</html>\n"
+            f"<footer>{footer}</footer>\n</main>\n{script}</body>\n</html>\n"
         )
 
 
@@ -190,5 +192,5 @@ def _alignment(column: Column) -> str:
 
 
 @cache
-def _style_sheet() -> str:
-    return resources.files("reporting").joinpath("page.css").read_text(encoding="utf-8")
+def _own(name: str) -> str:
+    return resources.files("reporting").joinpath(name).read_text(encoding="utf-8")

@@ -22,7 +22,7 @@ from twin_master.errors import TwinMasterError
 from twin_master.fleet.flight import GROUPS, RESULT_NAME, fleet_config
 from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.outcome import FAILED, has_flown
-from twin_master.fleet.reading import group_figures, last_turns, shown
+from twin_master.fleet.reading import WITHIN, group_figures, last_turns, shown
 from twin_master.fleet.store import open_group
 from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.mission.preparation import Knowledge
@@ -86,6 +86,7 @@ def write_fleet_report(folder: Path | str) -> Path:
         f"{counted(twins, 'asset')} in {counted(len(groups), 'group')}, seed {fleet['seed']}",
     )
     page.add_section("The fleet")
+    page.add_paragraph(" ".join(_opening(fleet["groups"], groups)))
     _figures(page, groups)
     if failures:
         add_failures(
@@ -102,6 +103,41 @@ def write_fleet_report(folder: Path | str) -> Path:
         _group(page, folder, record, groups[record["name"]])
     atomic_write_text(folder / REPORT_NAME, page.render())
     return folder / REPORT_NAME
+
+
+def _opening(records: list[dict[str, Any]], groups: "dict[str, xr.Dataset]") -> list[str]:
+    """Return what a reader wants to know first: how many flew, how the control went, who is worst off."""
+    twins = sum(group.sizes["twin"] for group in groups.values())
+    flown = {name: has_flown(group["status"].values) for name, group in groups.items()}
+    sentences = [f"{sum(map(len, flown.values()))} of {counted(twins, 'asset')} have flown."]
+    delay = np.concatenate([group["delay"].values[flown[name]] for name, group in groups.items()])
+    called = delay[~np.isnan(delay)]
+    if len(called):
+        share = 100.0 * float(np.mean(called <= WITHIN))
+        step = next(iter(groups.values())).attrs["step_name"]
+        sentences.append(
+            f"In {counted(len(called), 'asset')} the damage called for another control; the fallback came "
+            f"within {WITHIN} {step}s of it in {share:.0f} %."
+        )
+    worst = []
+    for record in records:
+        group, rows = groups[record["name"]], flown[record["name"]]
+        if len(rows):
+            last = group["mean"].values[rows, last_turns(group)[rows]]
+            row = int(np.argmax(last.sum(axis=1)))
+            worst.append((float(last[row].sum()), record, rows[row], last[row]))
+    if worst:
+        _, record, row, state = max(worst, key=lambda entry: entry[0])
+        scenario = Scenario.model_validate(record["scenarios"][0])
+        scale, unit = scale_of(scenario)
+        believed = [
+            f"{factor.title or factor.name} {scale * value:.3g} {unit}"
+            for factor, value in zip(scenario.state, state.tolist(), strict=True)
+        ]
+        sentences.append(
+            f"The worst off is {record['members'][row][0]} of {record['name']}: {', '.join(believed)}."
+        )
+    return sentences
 
 
 def _figures(page: Page, groups: "dict[str, xr.Dataset]") -> None:
@@ -233,9 +269,12 @@ def course_figure(scenario: Scenario, mean: Float, state: Float, unit: str) -> F
         )
         for below, above in ((low, top), (quarter, three)):
             axes.fill_between(steps, below, above, color=style.PRESENT, alpha=style.BAND_OPACITY, linewidth=0)
-        axes.plot(steps, middle, color=style.PRESENT)
+        axes.plot(steps, middle, color=style.PRESENT, label="median of the filtered means")
         true = np.median(state[:, :, number], axis=0)
-        axes.plot(steps, true, color=style.TRUTH, linewidth=1.0, linestyle=(0, (4, 1.5, 1, 1.5)))
+        axes.plot(
+            steps, true, color=style.TRUTH, linewidth=1.0, linestyle=(0, (4, 1.5, 1, 1.5)),
+            label="median of the true states",
+        )  # fmt: skip
         axes.set_xlabel(scenario.mission.step_name)
         axes.set_ylabel(f"{factor.title or factor.name} ({unit})")
         style.panel_label(axes, "abcdefgh"[number % 8])

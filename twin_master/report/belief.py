@@ -90,14 +90,15 @@ def _mark_states(axes: Axes, record: RunRecord, turn: int) -> None:
     scales = state_scales(record)
     x, y = scales * record.filtered.mean[turn]
     axes.plot(
-        x, y, marker="D", markersize=4.0, color="white", markeredgecolor=style.PRESENT, markeredgewidth=1.1
-    )
+        x, y, marker="D", markersize=4.0, color="white", markeredgecolor=style.PRESENT, markeredgewidth=1.1,
+        label="mean of the belief",
+    )  # fmt: skip
     if record.truth_state is not None:
         x, y = scales * record.truth_state[turn]
         for color, width in (("white", 2.6), (style.TRUTH, 1.2)):
             axes.plot(
                 x, y, marker="o", markersize=9.0, markerfacecolor="none", markeredgecolor=color,
-                markeredgewidth=width,
+                markeredgewidth=width, label="truth",
             )  # fmt: skip
 
 
@@ -208,6 +209,7 @@ def _policy_map(axes: Axes, record: RunRecord, shape: tuple[int, ...]) -> None:
         markersize=6,
         color="white",
         markeredgecolor=style.PRESENT,
+        label="estimate at the start",
     )
     axes.set_xlabel(state_label(record, 0))
     axes.set_ylabel(state_label(record, 1))

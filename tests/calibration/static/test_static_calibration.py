@@ -182,7 +182,7 @@ class _Outside(html.parser.HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         named = dict(attrs)
-        if tag in ("script", "link", "img", "iframe"):
+        if tag in ("link", "img", "iframe"):
             self.fetched.append(tag)
         self.fetched += [v for k, v in named.items() if k in ("src", "href") and v and not v.startswith("#")]
 

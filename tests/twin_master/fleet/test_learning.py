@@ -17,6 +17,7 @@ from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.population import population
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, points_of, refined, shared
+from twin_master.fleet.reading import fleet_groups
 from twin_master.fleet.report import attention, write_fleet_report
 from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.network.inference import filter_sequence
@@ -278,7 +279,22 @@ def test_true_rates_may_differ_from_those_believed(tmp_path: Path) -> None:
 def test_the_report_names_who_needs_attention(grown: tuple[Fleet, Path]) -> None:
     fleet, folder = grown
     text = write_fleet_report(folder).read_text()
-    for words in ("60 assets in 1 group", "The assets by health", "Who needs attention next", "seed-"):
+    (group,) = fleet_groups(folder).values()
+    delay = group["delay"].values[~np.isnan(group["delay"].values)]
+    control = group["control_index"].values
+    last = [mean[flown >= 0][-1].sum() for mean, flown in zip(group["mean"].values, control, strict=True)]
+    opening = (
+        f"60 of 60 assets have flown. In {len(delay)} assets the damage called for another control; the "
+        f"fallback came within 2 turns of it in {100 * np.mean(delay <= 2):.0f}\u00a0%. The worst off is "
+        f"{fleet.groups[0].members[int(np.argmax(last))].name} of growing_damage: "
+    )
+    for words in (
+        opening,
+        "60 assets in 1 group",
+        "The assets by health",
+        "Who needs attention next",
+        "seed-",
+    ):
         assert words in text
     scenario = fleet.groups[0].scenarios[0]
     knowledge = kept_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
