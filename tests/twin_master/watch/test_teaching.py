@@ -26,11 +26,11 @@ from twin_master.watch.teaching import Question, Search, Teaching, both_patches
 from twin_master.watch.trial import Judge
 from uav_twin.cli import app
 
+pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
+
 # A search that knows its answer: it waits for a gate, and leaves what `discrepancy run` leaves.
 ANSWER = """
 import json, pathlib, sys, time
-
-pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 words, (answer, gate) = sys.argv[3:], sys.argv[1:3]
 out = pathlib.Path(words[words.index("--out") + 1])
 while gate != "-" and not pathlib.Path(gate).exists():
