@@ -144,7 +144,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
         time, force, start, release = 1100.0 * number + minutes, sign * levels, 0.0, None
         if ringdown:
             time, force, start = INTERVAL * np.arange(SAMPLES), np.zeros(SAMPLES), 1100.0 * number
-            release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=0)
+            release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=1)
             initial = np.zeros((1, 2))
             initial[0, 0] = release.deviation * random.standard_normal()
             moved = system.ringdown(end, release, initial, time, laws)

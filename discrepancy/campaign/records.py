@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.sampling import is_even, nearly_even
+from discrepancy.errors import CampaignDataError
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -194,9 +195,14 @@ class Release:
         modes start as that shape says, within `deviation`; False: the record starts later, and displacement
         and velocity of each of `mode_count` modes are free.
     mode_count : int
-        Modes whose initial state is free in addition.
+        Modes whose initial state is free, at least 1: the first entry is the amplitude, within `deviation`.
     time_zero_deviation : float
         Prior standard deviation of the time between release and first sample [s].
+
+    Raises
+    ------
+    CampaignDataError
+        If no mode is free.
     """
 
     displacement: float
@@ -204,6 +210,14 @@ class Release:
     at_rest: bool = True
     mode_count: int = 3
     time_zero_deviation: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a release whose amplitude no unknown stands for: it would count as exact, unseen."""
+        if self.mode_count < 1:
+            raise CampaignDataError(
+                f"The mode_count of a release must be at least 1, and {self.mode_count} came: the first mode "
+                "stands for the amplitude, which is known within `deviation` only."
+            )
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ class ReleaseSection(Section):
     unit: Literal["m", "mm", "um", "V", "mV", "1"] = "m"
     deviation: Positive = 0.05
     at_rest: bool = True
-    mode_count: Annotated[int, Field(ge=0, le=MOST_MODES)] = 3
+    mode_count: Annotated[int, Field(ge=1, le=MOST_MODES)] = 3
     time_zero_deviation: NotNegative = 0.0
 
     @field_validator("displacement")

@@ -88,7 +88,7 @@ def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
     values = [campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in model.parameters]
     rows = 0 if trial.release is None else trial.release.mode_count
     initial = np.zeros((rows, 2))
-    if trial.release is not None and not trial.release.at_rest and rows:
+    if trial.release is not None and not trial.release.at_rest:
         initial[0, 0] = 1.0  # the first mode at the nominal release displacement
     return Conditions(np.array(values), initial, (0.0, 0.0), trial.health)
 

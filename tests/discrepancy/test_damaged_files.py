@@ -69,6 +69,7 @@ def test_what_is_nested_too_deeply_is_refused(
         ("standard_deviation = 0.1", "standard_deviation = inf", "standard_deviation"),
         ("standard_deviation = 0.1", "standard_deviation = true", "standard_deviation"),
         ("standard_deviation = 0.1", "standard_deviation = 0.1, degrees_of_freedom = inf", "degrees_of_free"),
+        ('unit = "mm" }', 'unit = "mm", mode_count = 0 }', "mode_count"),
         ('unit = "mm" }', 'unit = "mm", mode_count = 1000000000 }', "mode_count"),
         ('unit = "mm" }', f'unit = "mm", mode_count = 1{"0" * 40} }}', "an integer of 133 bits"),
     ],

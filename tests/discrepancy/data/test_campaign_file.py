@@ -192,7 +192,7 @@ def campaigns(draw: st.DrawFn) -> Campaign:
                 health=draw(arrays(float, (count, 2), elements=st.floats(0.0, 1.0))),
                 health_deviation=draw(st.just(np.zeros((count, 2))) | arrays(float, (count, 2),
                 elements=positive)), release=draw(st.builds(Release, positive, positive, st.booleans(),
-                st.integers(0, 5), positive)) if kind is TrialKind.RINGDOWN
+                st.integers(1, 5), positive)) if kind is TrialKind.RINGDOWN
                 else None,
                 held_out=draw(st.booleans()),
                 noise_factor=draw(st.just(1.0) | positive),
