@@ -1,0 +1,117 @@
+"""The folder of a verdict: whole or not there, and the same bytes again."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from discrepancy.catalogue.library import library
+from discrepancy.files.patch import read_patch
+from discrepancy.files.residuals import read_residuals
+from discrepancy.files.verdict import read_verdict
+from discrepancy.judgement.separability import Separability
+from discrepancy.report.content import ReportInput
+from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.page import render_report
+from discrepancy.verdict import VerdictKind
+from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
+from discrepancy.workflow import Investigation, investigate
+from reporting.errors import FileNotWrittenError
+from tests.discrepancy.rigs import ORIGIN, measured
+
+pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
+
+
+def test_the_folder_of_a_named_effect(drag: Investigation, written: Path) -> None:
+    assert drag.verdict.kind is VerdictKind.NAMED
+    folder = written
+    page = next(folder.glob("*.html")).read_text(encoding="utf-8")
+    assert "quadratic aerodynamic damping" in page
+    assert "F = c |v| v" in page  # the equation of the catalogue
+    assert page.count("<script>") == page.count("<script") == 1
+    assert not re.search(r'(?:src|href)="(?!#|data:)', page)  # self-contained
+    assert str(folder.parent) not in page
+    for title in ("Verdict", "Where the gap is", "Proof on held-out trials", "What this campaign can decide"):
+        assert f">{title}<" in page
+    assert len(set(re.findall(r'\bid="([^"]+)"', page))) == len(re.findall(r'\bid="([^"]+)"', page))
+    stored = read_verdict(folder / "verdict.json")
+    assert stored.verdict.sentence == drag.verdict.sentence
+    patch = read_patch(folder / "patch.json")
+    assert patch.patch == drag.verdict.effects[0].patch
+    assert patch.verdict is VerdictKind.NAMED
+    row = patch.intervals[0][0]
+    assert row.low < row.value < row.high
+    residuals = read_residuals(folder / "residuals.nc")
+    assert len(residuals.trials) == len(drag.campaign.trials)
+    pictures = {path.name for path in (folder / "figures").iterdir()}
+    assert {"history.svg", "history.png", "evidence.svg", "backbone.svg", "separability.png"} <= pictures
+    assert not list(folder.parent.glob(".*"))  # nothing half-written is left
+
+
+def test_a_report_repeats_bit_for_bit(drag: Investigation, able: Separability, written: Path) -> None:
+    intervals = read_patch(written / "patch.json").intervals
+    content = ReportInput(drag, ORIGIN, able, intervals)
+    figures = report_figures(content)
+    page = render_report(content, draw(figures), figures)
+    assert page == next(written.glob("*.html")).read_text(encoding="utf-8")
+
+
+def test_a_null_has_no_patch_and_no_model_after(tmp_path: Path) -> None:
+    campaign, model = measured(kind="static")
+    found = investigate(campaign, model, library())
+    assert found.verdict.kind is VerdictKind.NOTHING_MISSING
+    report = write_verdict_folder(tmp_path / "v", VerdictContent(found, ORIGIN))
+    assert not (tmp_path / "v" / "patch.json").exists()
+    page = report.read_text(encoding="utf-8")
+    assert "with the effect" not in page
+    assert "nothing is missing" in page
+
+
+def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path: Path) -> None:
+    campaign, model = measured(kind="static")
+    wrong = tuple(replace(trial, values=1e6 * trial.values) for trial in campaign.trials)
+    found = investigate(replace(campaign, trials=wrong), model, library())
+    assert found.verdict.kind is VerdictKind.DATA_ERROR
+    report = write_verdict_folder(tmp_path / "v", VerdictContent(found, ORIGIN))
+    page = report.read_text(encoding="utf-8")
+    assert found.verdict.sentence.split(",")[0] in page
+    assert "Proof" not in page
+    assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
+
+
+def test_a_folder_is_replaced_on_demand_only_and_only_if_it_is_a_verdict(tmp_path: Path) -> None:
+    campaign, model = measured(kind="static")
+    content = VerdictContent(investigate(campaign, model, library()), ORIGIN)
+    folder = tmp_path / "v"
+    write_verdict_folder(folder, content)
+    (folder / "stray.txt").write_text("x", encoding="utf-8")
+    with pytest.raises(FileNotWrittenError, match="--replace"):
+        write_verdict_folder(folder, content)
+    write_verdict_folder(folder, content, replace_it=True)
+    assert not (folder / "stray.txt").exists()
+    other = tmp_path / "thesis"
+    other.mkdir()
+    (other / "chapter.tex").write_text("x", encoding="utf-8")
+    with pytest.raises(FileNotWrittenError, match="not touched"):
+        check_folder(other, replace_it=True)
+    with pytest.raises(FileNotWrittenError, match="no folder"):
+        check_folder(other / "chapter.tex", replace_it=True)
+
+
+def test_a_failure_while_writing_leaves_the_old_folder(
+    drag: Investigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "v"
+    folder.mkdir()
+    (folder / "verdict.json").write_text("old", encoding="utf-8")
+
+    def refuse(patch: Path, target: Path) -> str:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(FileNotWrittenError, match="No space"):
+        write_verdict_folder(folder, VerdictContent(drag, ORIGIN, pack=refuse), replace_it=True)
+    assert (folder / "verdict.json").read_text(encoding="utf-8") == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["v"]

@@ -1,0 +1,201 @@
+"""What a page says of a verdict: the finding first, then its grounds."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from discrepancy.campaign.records import TrialKind
+from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
+from discrepancy.report.check_tables import (
+    confused_lines,
+    group_lines,
+    needs,
+    neighbours,
+    rows_of,
+    untested_lines,
+)
+from discrepancy.report.content import ReportInput
+from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.findings import add_verdict, closing_sentence
+from discrepancy.report.grounds import add_gates
+from discrepancy.report.page import render_report
+from discrepancy.report.parameter_table import parameter_rows
+from discrepancy.report.residual_figures import (
+    size_table,
+)
+from discrepancy.report.text import (
+    headline,
+    number,
+    percent,
+    remainders_sentence,
+    residual_sizes,
+    shares_sentence,
+)
+from discrepancy.verdict import ExplainedShare, NotFitted, RemainderEstimate, VerdictKind
+from discrepancy.workflow import Investigation
+from reporting.page import Page
+from reporting.words import listing
+from tests.discrepancy.rigs import FEW, ORIGIN
+
+pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
+
+
+def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: Investigation) -> None:
+    assert drag.proof is not None
+    closed, held = drag.proof.gap_closed, drag.proof.held_out_after
+    assert held is not None
+    said = closing_sentence(drag)
+    assert said.startswith(f"It closes {percent(closed)} % of the gap on held-out trials: χ²/dof is ")
+    assert f"and {number(held.chi_square_per_dof)} after it" in said
+    page = Page("a", "b")
+    page.add_section("c")
+    add_verdict(page, ReportInput(drag, ORIGIN))  # without intervals of the patch, by its parameters
+    text = html.unescape(page.render()).replace("\N{NO-BREAK SPACE}", " ")
+    assert text.index(headline(drag.verdict)) < text.index("Its size: ") < text.index(said)
+    assert text.count(f"{percent(closed)} %") == 1
+    # no name, no gap to close, no proof
+    group = replace(drag, verdict=replace(drag.verdict, kind=VerdictKind.GROUP))
+    assert closing_sentence(group).startswith("The best hypothesis, which is no name, closes")
+    none = replace(drag, proof=replace(drag.proof, gap_closed=float("nan")))
+    assert closing_sentence(none).startswith("On held-out trials χ²/dof is ")
+    worse = replace(drag, proof=replace(drag.proof, gap_closed=-0.2, held_out_after=None))
+    assert closing_sentence(worse).startswith("On fitted trials χ²/dof is ")
+    assert closing_sentence(replace(drag, proof=None)) == ""
+
+
+def test_parameters_are_shown_before_and_after(drag: Investigation) -> None:
+    rows = parameter_rows(drag)
+    assert [row[0] for row in rows] == ["stiffness factor", "damping factor"]
+    assert drag.fit is not None
+    fitted = drag.problem.shared.parameters(drag.fit.point.shared)  # type: ignore[union-attr]
+    for row, item, value in zip(rows, drag.model.parameters, fitted, strict=True):
+        moments = [[float(part) for part in cell.split(" ± ")] for cell in row[2:]]
+        assert moments[0] == pytest.approx([item.mean, norm.ppf(0.95) * item.deviation], rel=0.03)
+        assert moments[2][0] == pytest.approx(value, abs=0.06 * moments[2][1])
+        assert moments[2][1] < moments[0][1]
+    nothing = replace(drag, fit=drag.search.none)  # type: ignore[union-attr]
+    assert [row[:4] for row in parameter_rows(nothing)] == [row[:4] for row in rows]
+    assert {len(row) for row in parameter_rows(nothing)} == {4}
+
+
+def test_gates_say_what_they_compare(drag: Investigation) -> None:
+    page = Page("a", "b")
+    page.add_section("c")
+    add_gates(page, drag)
+    text = page.render()
+    absolute, shape, consistency, _ = drag.verdict.gates
+    for gate in (absolute, consistency):
+        assert f"p = {gate.statistic:.2g}</td>" in text
+        assert f"p at least {gate.limit:g}</td>" in text
+    assert f"at most {shape.limit:g} nat</td>" in text
+
+
+def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_judged(
+    drag: Investigation,
+) -> None:
+    absolute, shape, consistency, _ = drag.verdict.gates
+    gates = (
+        replace(absolute, passed=None, statistic=float("nan")), shape,
+        replace(consistency, passed=False, statistic=2e-5),
+    )  # fmt: skip
+    verdict = replace(drag.verdict, kind=VerdictKind.UNEXPLAINED, effects=(), gates=gates)
+    page = Page("a", "b")
+    page.add_section("c")
+    add_verdict(page, ReportInput(replace(drag, verdict=verdict, proof=None), ORIGIN))
+    assert "p of the consistency; a fit has at least 0.001" in page.render()
+
+
+def test_a_reader_sees_which_trial_is_held_out(drag: Investigation) -> None:
+    assert drag.before is not None
+    _, names, _ = size_table(drag.before)
+    trials = drag.campaign.trials
+    assert names == [f"{t.name} (held out)" if t.held_out else t.name for t in trials]
+    assert any(trial.held_out for trial in trials)
+    caption = report_figures(ReportInput(drag, ORIGIN))["residual_table"].caption
+    assert f"Held out: {listing(trial.name for trial in trials if trial.held_out)};" in caption
+
+
+def test_what_explains_most_of_the_gap_is_told_first(drag: Investigation) -> None:
+    assert drag.location is not None
+    assert drag.before is not None
+    gap = {"static": 0.0, "ring-down": 0.0}
+    for item in drag.before.trials:
+        if not item.trial.held_out:
+            kind = "static" if item.trial.kind is TrialKind.STATIC else "ring-down"
+            gap[kind] += float(np.nansum(item.standardised**2) - item.expected_variance[item.used].sum())
+    told = [item.share * max(gap[item.trials], 0.0) for item in drag.location.disagreements]
+    assert len(told) > 1
+    assert told == sorted(told, reverse=True)
+
+
+def test_each_reason_is_given_once_and_each_confusion_by_name(able: Separability) -> None:
+    assert untested_lines(able) == ["Not testable: washout. The campaign has no flight trial to fit."]
+    lines = confused_lines(able)
+    assert len(lines) == sum(bool(neighbours(able, name)) for name in able.identifiers)
+    for line in lines:
+        name = line.split()[1]
+        assert all(other in line for other in neighbours(able, name))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_effect_is_not_the_nearest_to_itself(drag: Investigation, count: int) -> None:
+    hidden = tuple(
+        Detectability(effect, "", "", DETECTED / (n + 2) ** 2, "size", 1.0, "1", 0.5)
+        for n, effect in enumerate(FEW[:count])
+    )
+    (told,) = (
+        line
+        for line in needs(Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW)
+        if "would not be seen" in line
+    )
+    first = FEW[0].identifier.replace("_", " ")
+    assert told.count(first) == (1 if count == 1 else 2)
+    assert told.endswith("with noise 2 times smaller or 4 times as many trials.")
+
+
+def test_rows_of_what_can_be_decided(drag: Investigation, able: Separability) -> None:
+    rows = {row[0]: row for row in rows_of(able)}
+    assert set(rows) == {effect.identifier for effect in FEW}
+    assert rows["washout"][1] == "no"
+    assert rows["quadratic_damping"][1] == "yes"
+    for row, name in enumerate(able.identifiers):
+        near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSED
+        near[row] = False
+        assert neighbours(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
+    assert group_lines(able)
+    text = " ".join(needs(able, drag.campaign, FEW))
+    for group in able.groups:
+        assert group[0].replace("_", " ") in text
+
+
+def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag: Investigation) -> None:
+    verdict = replace(
+        drag.verdict,
+        kind=VerdictKind.NAMED_IN_PART,
+        explained=ExplainedShare(0.94, 0.92, 0.953, 3.1, 0.9, 0.06, 0.04, "held-out"),
+        remainders=(RemainderEstimate("displacement", 3.1, 0.25, 2.0),),
+        not_fitted=(NotFitted("washout", "No flight trial."), NotFitted("free_play", "screened out", 0.3)),
+    )
+    content = ReportInput(replace(drag, verdict=verdict), ORIGIN)
+    figures = report_figures(content)
+    assert figures["shares"].title == "What the gap is made of"
+    text = render_report(content, draw({"shares": figures["shares"]}), {"shares": figures["shares"]})
+    text = text.replace("\N{NO-BREAK SPACE}", " ")
+    for words in (
+        "90.0 % of the mean square on held-out trials",
+        "displacement 3.1 noises over 0.25 s, swinging at 2 Hz",
+        "It closes 94 % of the gap on held-out trials (92 to 95 %) and leaves 3.1 noises.",
+        "No flight trial.",
+        "closes most of the gap on trials that it did not see",
+    ):
+        assert words in text
+    assert shares_sentence(replace(verdict, explained=None)) == ""
+    assert verdict.explained is not None
+    # a mean square of 25 in units of the noise, of which 2.5 are left
+    assert residual_sizes(verdict.explained) == ("5", "1.6")
+    assert remainders_sentence(replace(verdict, remainders=())) == ""

@@ -1,0 +1,47 @@
+"""Simulated campaigns of the single-mass rig."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from discrepancy.campaign.records import Campaign
+from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.library import effect_by_identifier, library
+from discrepancy.files.document import Origin
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.sources.examples import example_campaign, plan_for
+from fe.runtime.patch import (
+    ModelPatch,
+)
+from reporting.provenance import collect_provenance
+
+MODEL = "single_mass_rig"
+
+
+ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run rig", collect_provenance(0))
+
+
+def measured(hidden: str = "", value: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:
+    """A simulated campaign of the single-mass rig."""
+    model = LumpedModel.load(MODEL)
+    outputs = tuple(item.name for item in model.description.output)
+    plan = plan_for(model, outputs, model.description.input[0].name)
+    plan = replace(plan, duration=0.5 * plan.duration)
+    patch = ModelPatch()
+    if hidden:
+        effect = effect_by_identifier(hidden, library())
+        bare = example_campaign(model, kind, 4, plan)  # type: ignore[arg-type]
+        setting = Setting(bare, model, model.scales(bare))
+        values = {item.name: item.prior.value(0.0) for item in effect.parameters}
+        values[effect.parameters[0].name] = value
+        patch = effect.patch(setting, values, effect.places(setting)[0])
+    return example_campaign(model, kind, 4, plan, patch), model  # type: ignore[arg-type]
+
+
+FEW = tuple(
+    effect
+    for effect in library()
+    if effect.identifier
+    in ("quadratic_damping", "coulomb_friction", "structural_damping", "gauge_gain", "load_cell", "washout")
+)
+"""Part of the catalogue, where the whole one would only take time."""

@@ -1,0 +1,45 @@
+"""A model by its name or file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from discrepancy.errors import ModelError
+from discrepancy.model_choice import ModelKind, choose_model
+from tests.discrepancy.rigs import MODEL
+
+
+def test_models_by_name_and_file(tmp_path: Path) -> None:
+    shipped = choose_model(MODEL)
+    assert shipped.kind is ModelKind.LUMPED
+    assert shipped.path is None
+    text = (Path(__file__).parents[2] / "discrepancy" / "lumped_models" / f"{MODEL}.toml").read_text(
+        encoding="utf-8"
+    )
+    file = tmp_path / "rig.toml"
+    file.write_text(text, encoding="utf-8")
+    own = choose_model(file)
+    assert own.source_hash == shipped.source_hash
+    assert own.label == "rig.toml"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("no_such_rig", "three_mass_chain"),
+        ("missing.toml", "no model file"),
+        ("missing.nc", "no model file"),
+        ("wing.fmu", "is an FMU"),
+        ("table.csv", "is no model"),
+        ("broken.toml", "not valid TOML"),
+        ("design.toml", "design"),
+    ],
+)
+def test_models_that_cannot_be_used(name: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "table.csv").write_text("a,b\n", encoding="utf-8")
+    (tmp_path / "broken.toml").write_text("mass = [", encoding="utf-8")
+    (tmp_path / "design.toml").write_text("name = 'half a wing'\n", encoding="utf-8")
+    with pytest.raises(ModelError, match=message):
+        choose_model(tmp_path / name if "." in name else name)
