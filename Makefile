@@ -48,7 +48,7 @@ fmu: $(VENV)/.runtime ## Build the wing as an FMU into runs/wing.fmu
 
 .PHONY: docs
 docs: $(DOCS_VENV)/.docs ## Run the notebooks and build the site of the documentation into build/docs; a warning is an error
-	$(DOCS_VENV)/bin/python -m sphinx -j 2 -q -W --keep-going -c docs/site -d build/doctrees docs build/docs
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(DOCS_VENV)/bin/python -m sphinx -j 2 -q -W --keep-going -c docs/site -d build/doctrees docs build/docs
 	@echo "The site is build/docs/index.html."
 
 .PHONY: lock

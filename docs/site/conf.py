@@ -3,7 +3,9 @@
 import inspect
 from pathlib import Path
 
+import jupyter_client
 from sphinx.application import Sphinx
+from traitlets import CaselessStrEnum
 
 import uav_twin
 
@@ -26,6 +28,15 @@ nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_execution_timeout = 600
 nb_merge_streams = True
+
+
+class _EncryptedKernels(jupyter_client.AsyncKernelManager):
+    """Kernels whose messages are encrypted; those of the default warn that theirs are not."""
+
+    transport_encryption = CaselessStrEnum(["disabled", "auto", "required"], default_value="auto")
+
+
+jupyter_client.AsyncKernelManager = _EncryptedKernels  # nbclient takes no configuration from Sphinx
 
 napoleon_google_docstring = False
 napoleon_use_ivar = True

@@ -1,8 +1,9 @@
 """Teaching: from an alarm to a verdict on what the model lacks, to a trial of its patch, to its adoption.
 
 What is asked when is a pure function of the journal (`Teaching`), so that a watch that was killed and taken
-up again asks, tries and adopts the same. The search for the cause is a process of its own, of low priority:
-the very command that the alarm names. Its verdict is a line of the journal behind the turn in which it came.
+up again asks, tries and adopts the same. The search for the cause is a process of its own, of low priority
+beside a live watch: the very command that the alarm names. Its verdict is a line of the journal behind the
+turn in which it came.
 """
 
 import json
@@ -180,7 +181,7 @@ class Search:
         folder = question.folder(self.watch)
         while not (folder / "verdict.json").is_file():
             if self._process is None:
-                self._begin(question)
+                self._begin(question, waited_for=wait)
             elif (code := self._process.poll()) is not None and not (folder / "verdict.json").is_file():
                 self._process = None
                 raise TwinMasterError(last_words(self._log(question), code))
@@ -194,10 +195,10 @@ class Search:
         folder = question.folder(self.watch)
         return folder.with_name(folder.name + ".log")
 
-    def _begin(self, question: Question) -> None:
+    def _begin(self, question: Question, *, waited_for: bool) -> None:
         log = self._log(question)
         log.parent.mkdir(exist_ok=True)
-        self._process = beside([*self.command, *self.words(question)], log)
+        self._process = beside([*self.command, *self.words(question)], log, waited_for=waited_for)
 
     def end(self) -> None:
         """End the process, if there is one; a watch that is taken up again asks again."""

@@ -231,14 +231,18 @@ class Judge:
         self._process = self._folder = None
 
 
-def beside(command: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
-    """Begin a process of low priority that no key of this terminal ends; what it says goes to a file."""
+def beside(command: Sequence[str], log: Path, *, waited_for: bool = False) -> "subprocess.Popen[bytes]":
+    """Begin a process that no key of this terminal ends; what it says goes to a file.
+
+    Its priority is low unless it is `waited_for`.
+    """
     with log.open("wb") as file:
         process = subprocess.Popen(
             [*command], stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
         )
-    with suppress(ProcessLookupError):
-        os.setpriority(os.PRIO_PROCESS, process.pid, COURTESY)
+    if not waited_for:
+        with suppress(ProcessLookupError):
+            os.setpriority(os.PRIO_PROCESS, process.pid, COURTESY)
     return process
 
 
