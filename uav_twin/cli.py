@@ -23,7 +23,7 @@ from uav_twin.wing import wing_app
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="A predictive structural digital twin of a UAV wing.",
+    help="A digital twin of a structure that loses stiffness: a wing, a mesh of yours, or any FMU.",
 )
 
 

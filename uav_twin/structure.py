@@ -69,6 +69,8 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
 def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     yield "name", record["name"], ""
     yield "mesh", f"{record['mesh']}: {record['elements']:,} {record['kind']}, {record['nodes']:,} nodes", ""
+    if record["linear_elements"]:
+        yield "elements", "linear: far too stiff in bending; take quadratic ones", ""
     if record["loose_nodes"]:
         first = ", ".join(str(number) for number in record["loose_nodes"][:3])
         yield "nodes left out", f"{len(record['loose_nodes'])} touch no element, among them {first}", ""
@@ -107,6 +109,7 @@ def structure_record(structure: "Structure", modes: int) -> dict[str, Any]:
         "mesh": design.mesh,
         "design_hash": structure.design_hash,
         "kind": mesh.kind.name,
+        "linear_elements": not mesh.kind.edges,
         "elements": len(mesh.cells),
         "nodes": len(mesh.points),
         "loose_nodes": [int(number) for number in mesh.loose],

@@ -126,7 +126,9 @@ class LumpedDescription(ModelDescription):
         n, m = self.size, self.states
         if n == 0 and m == 0:
             raise ValueError("mass is missing (or capacity, of states of first order)")
-        second = [("stiffness", self.stiffness)] if self.stiffness or (n and not self.free) else []
+        if n and not (self.stiffness or self.stiffness_part or self.free):
+            raise ValueError("stiffness is missing: give it, or [[stiffness_part]], or say `free = true`")
+        second = [("stiffness", self.stiffness)] if self.stiffness else []
         second += [(f"{kind} {part.name!r}", part.matrix) for kind, part in self._parts_of("mass")]
         if n and self.damping is None and not self.free:
             raise ValueError("'damping' is missing")

@@ -163,7 +163,8 @@ def _from_meshio(path: Path) -> FileMesh:
         raise MeshError(f"The mesh file {path} cannot be read as {path.suffix}: {why}.") from None
     except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
         raise MeshError(
-            f"The mesh file {path} cannot be read as {path.suffix}; it is damaged or cut off ({error!r})."
+            f"The mesh file {path} cannot be read as {path.suffix}: the reader (meshio) says {str(error)!r}; "
+            "it is damaged, cut off, or of another dialect. Write it anew, or as .msh or .inp."
         ) from None
     kind = _one_kind(path, found)
     numbers = np.cumsum([0, *(len(block.data) for block in found.cells)])

@@ -84,6 +84,11 @@ def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name: str) -> Non
             'role = "stress"',
             "The binding uav_wing has no observation 'stress'",
         ),
+        (
+            "standard_deviation_microstrain = 125",
+            'unit = "percent"\nstandard_deviation_microstrain = 125',
+            "gives value 1 of `strain` in 1, and `observation.unit` of the scenario says percent",
+        ),
         ('design = "uav_wing"', 'design = "my_wing.toml"', "my_wing.toml cannot be read"),
         ('binding = "uav_wing"', 'binding = "my_binding.toml"', "my_binding.toml cannot be read"),
         ("steps = 50", "steps = -1", "steps"),

@@ -93,6 +93,7 @@ def test_info_says_what_a_structure_is(
     text = capsys.readouterr().out
     for part in (
         "1 8-node hexahedra, 8 nodes",
+        "linear: far too stiff in bending",
         "1 touch no element, among them 9",
         "scaled by e",
         "holds x, y, z",

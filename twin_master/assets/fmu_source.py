@@ -302,7 +302,19 @@ class FmuSource:
 
     def _observed(self, binding: "Binding") -> slice:
         """Return where the observed quantity stands among the observations of the binding."""
-        return self._slice(binding, self._scenario.observation.role)
+        return self._measured(binding, self._scenario.observation.role)
+
+    def _measured(self, binding: "Binding", role: str) -> slice:
+        """Return where a role stands whose units are those that the scenario says, if it says any."""
+        chosen = self._slice(binding, role)
+        bound, said = binding.observation[role].units, self._scenario.observation.sensor_units
+        for number, (there, here) in enumerate(zip(bound, said, strict=True), 1):
+            if there != here != "1":
+                raise MissionInputError(
+                    f"the binding {binding.name} gives value {number} of `{role}` in {there}, and "
+                    f"`observation.unit` of the scenario says {here}: write the same unit in both."
+                )
+        return chosen
 
     def _slice(self, binding: "Binding", role: str) -> slice:
         expected = self._scenario.observation.count
@@ -340,7 +352,7 @@ class FmuSource:
             )
         return InnerRoles(
             state=truth.state,
-            observation=self._slice(binding, truth.observation or self._scenario.observation.role),
+            observation=self._measured(binding, truth.observation or self._scenario.observation.role),
             received=None if truth.received is None else self._slice(binding, truth.received),
         )
 

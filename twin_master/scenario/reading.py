@@ -89,9 +89,8 @@ def _sentence(error: Mapping[str, Any], table: Mapping[str, Any]) -> str:
         keys = _known_keys(location[:-1], table)
         return f"unknown key `{_written(location, table)}`; the keys known there are {', '.join(keys)}."
     if kind == "missing":
-        section = _section_at(location[:-1], table)
-        unit = section.units.get(str(location[-1]))
-        return f"`{_written(location, table)}{f'_{unit}' if unit else ''}` is missing."
+        name = _with_unit(_section_at(location[:-1], table), str(location[-1]))
+        return f"`{_written(location, table).removesuffix(str(location[-1]))}{name}` is missing."
     if kind == "value_error":
         where = _written(location, table)
         message = str(error["ctx"]["error"])
@@ -168,4 +167,9 @@ def _section_at(location: tuple[int | str, ...], table: Mapping[str, Any]) -> ty
 
 def _known_keys(location: tuple[int | str, ...], table: Mapping[str, Any]) -> list[str]:
     section = _section_at(location, table)
-    return [f"{key}_{section.units[key]}" if key in section.units else key for key in section.model_fields]
+    return [_with_unit(section, key) for key in section.model_fields]
+
+
+def _with_unit(section: type[Section], key: str) -> str:
+    """Return a key with the unit that its name may carry, in brackets."""
+    return f"{key}[_{section.units[key]}]" if key in section.units else key

@@ -445,6 +445,7 @@ def test_what_cannot_be_answered_is_refused_in_a_sentence(
         chain.respond(what, outputs, patch(*items), ONES)
 
 
+SPRINGS = "stiffness = [[3.0, -1.0], [-1.0, 1.0]]\n"
 GOOD = """
 format = 1
 name = "a"
@@ -499,6 +500,7 @@ vector = [0.0, 1.0]
         ('"x"\nvector = [0.0, 1.0]', '"x"\nvector = "up"', r"output\[1\].vector: a list .* but 'up' came"),
         ("ratios = [0.01, 0.01]", "ratios = [0.01, -0.2]", r"damping.ratios\[2\]: .* but -0.2 came"),
         ("[damping]\nratios = [0.01, 0.01]", "", "'damping' is missing"),
+        (SPRINGS, "", r"stiffness is missing: give it, or \[\[stiffness_part\]\]"),
         ("[damping]\nratios = [0.01, 0.01]", "[[damping]]", "damping: a table is expected"),
         ("[[output]]", "[output]", r"write \[\[output\]\] for each, not \[output\]"),
     ],
@@ -547,6 +549,17 @@ station = 0.1
 [root]
 lever = ROW
 """
+
+
+def test_all_stiffness_may_be_in_parts(tmp_path: Path) -> None:
+    part = SPRINGS.replace("stiffness", '[[stiffness_part]]\nname = "all"\nmatrix')
+    (tmp_path / "whole.toml").write_text(GOOD)
+    (tmp_path / "parts.toml").write_text(GOOD.replace(SPRINGS, "") + part)
+    pulled = static([1.5], load_place="in")
+    for name in ("whole", "parts"):
+        model = LumpedModel.load(tmp_path / f"{name}.toml")
+        response = model.respond(pulled, (("x", Quantity.DISPLACEMENT),), patch(), Conditions(np.ones(0)))
+        assert response.values[0, 0] == pytest.approx(1.5 * 1.5, rel=1e-12)  # K⁻¹ = [[1, 1], [1, 3]] / 2
 
 
 @pytest.mark.parametrize("damping", ["ratios", "matrix"])

@@ -58,7 +58,7 @@ BROKEN = {
     "levels that do not increase": (LEVELS, "[0, 40, 20, 60, 80]", ["levels", "z1", "increase"]),
     "levels above 100 %": (LEVELS, "[0, 20, 40, 60, 180]", ["levels_percent", "180"]),
     "missing key with a unit": ("standard_deviation_microstrain = 150\n", "",
-                                ["truth.noise.standard_deviation_microstrain", "missing"]),
+                                ["truth.noise.standard_deviation[_microstrain]", "missing"]),
     "first control unknown": ('first_control = "3g"', 'first_control = "4g"', ["2g, 3g", "4g"]),
     "controls with other inputs": ("{ load_factor = 2.0 }", "{ load = 2.0 }", ["2g", "3g", "same inputs"]),
     "normalised by nothing": ('normalise_error_by = "load_factor"', 'normalise_error_by = "lift"', ["lift"]),
