@@ -108,7 +108,7 @@ CUBIC_STIFFNESS = Effect(
         ShapeParameter(
             "asymmetry",
             "s",
-            "the force is (1 + s) times as large at x > 0 and (1 - s) times at x < 0",
+            "asymmetry (the force is 1 + s times as large at x > 0, 1 - s times at x < 0)",
             0.0,
             Prior("uniform", -1.0, 1.0),
         ),

@@ -38,12 +38,15 @@ def when_sentence(windows: Sequence[GapWindow]) -> str:
     if all(window.begin is None and window.end is None for window in found):
         return "The gap is there throughout the records."
     told = sorted(found, key=lambda window: (window.begin is None, -window.size))[:TOLD]
-    parts = [
-        f"in {window.trial!r} {window_text(window)}, {window.size:.2g} times the noise" for window in told
-    ]
+    parts = [f"in {window.trial!r} {window_text(window)}, {_times(window.size)} the noise" for window in told]
     more = len(found) - len(told)
     rest = f"; and {more} more" if more else ""
     return f"The gap is there {'; '.join(parts)}{rest}."
+
+
+def _times(size: float) -> str:
+    two = f"{size:.2g}"
+    return f"{float(two):,.0f} times" if "e+0" in two else f"{two} times"
 
 
 def begins_inside(windows: Sequence[GapWindow]) -> bool:

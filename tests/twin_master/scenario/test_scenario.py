@@ -47,7 +47,7 @@ BROKEN = {
     "unknown key": ("steps = 50", "stepps = 50", ["mission.stepps", "unknown key", "steps"]),
     "unknown key in an array": ('title = "gentle turn"', 'tittle = "x"', ["control[1].tittle", "values"]),
     "wrong unit": ("standard_deviation_microstrain = 150", "standard_deviation_millistrain = 0.15",
-                   ["truth.noise.standard_deviation_millistrain", "standard_deviation_microstrain"]),
+                   ["truth.noise.standard_deviation_millistrain", "standard_deviation[_microstrain]"]),
     "missing key": ("steps = 50\n", "", ["mission.steps", "missing"]),
     "text for a number": ("gamma = 0.6", 'gamma = "0.6"', ["planner.gamma", "number", "'0.6'"]),
     "gamma too large": ("gamma = 0.6", "gamma = 1.0", ["planner.gamma", "less than 1", "1.0"]),
