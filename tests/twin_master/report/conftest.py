@@ -11,17 +11,17 @@ from twin_master.report import page as report
 from twin_master.report import reading as report_reading
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def tree() -> xr.DataTree:
     return synthetic_run.build_tree()
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory, tree: xr.DataTree) -> Path:
     return synthetic_run.write_run(tmp_path_factory.mktemp("runs") / "run", tree)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def record(folder: Path) -> report_data.RunRecord:
     return report_reading.read_run(folder)
 

@@ -19,7 +19,7 @@ from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begin_watch
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
     """`level_turns` of a real wing: without what flies and what really happens."""
     kept, skipping = [], False
@@ -33,7 +33,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
     return load_scenario(path)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def mission(base: Watch) -> Flight:
     """The paper's mission, flown by the model that the watch believes."""
     knowledge = replace(base.models[0].knowledge, scenario=load_scenario("level_turns").scenario)
@@ -41,14 +41,14 @@ def mission(base: Watch) -> Flight:
     return fly(knowledge.scenario, knowledge.twin(), plant)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def recorded(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The mission as a CSV file with some garbage between its turns."""
     path = tmp_path_factory.mktemp("recorded") / "mission.csv"
     return write_csv(path, mission.observed, mission.control_index, garbage=True)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> Watch:
     """A watch that has seen nothing."""
     folder = tmp_path_factory.mktemp("base") / "watch"
@@ -57,7 +57,7 @@ def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> 
     return watch
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the watch of the whole mission."""
     folder = tmp_path_factory.mktemp("whole") / "watch"
@@ -71,7 +71,7 @@ def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory)
     return folder
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def loose(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The mission with a gauge that shows 30 % too little from turn 15 on."""
     observed = mission.observed.copy()
