@@ -69,6 +69,7 @@ def _record(
              "channel": fault.channel, "trial": fault.trial}
             for fault in faults
         ],
+        "remarks": list(data.remarks),
         "effects": [] if able is None else [
             {"effect": item.effect.identifier, "testable": not item.reason, "reason": item.reason,
              "place": item.place, "parameter": item.parameter, "detectable_from": item.detectable,
@@ -106,6 +107,8 @@ def _show(
     )
     for fault in faults:
         console.print(f"{'Fault' if fault.fatal else 'Limit'}: {fault.sentence}", soft_wrap=True)
+    for remark in data.remarks:
+        console.print(f"Note: {remark}", soft_wrap=True)
     if able is None:
         return
     shown = [at for at, title in enumerate(HEADINGS) if title not in ("testable", "confused with")]

@@ -75,9 +75,14 @@ def test_faults_of_the_data_end_with_a_sentence_and_a_report(
     text = (campaign / "campaign.toml").read_text(encoding="utf-8")
     assert 'unit = "mm"' in text
     (campaign / "campaign.toml").write_text(text.replace('unit = "mm"', 'unit = "m"', 1), encoding="utf-8")
+    table = next(path for path in campaign.glob("*.csv") if path.name != "noise.csv")
+    first, *rows = table.read_text(encoding="utf-8").splitlines()
+    table.write_text("\n".join([f"{first},weather", *(f"{row},1" for row in rows)]), encoding="utf-8")
     capsys.readouterr()
     assert call(monkeypatch, "check", str(campaign), *RIG) == 1
-    assert "Fault:" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "Fault:" in shown
+    assert "no channel has the column 'weather'" in shown
     assert call(monkeypatch, "run", str(campaign), *RIG, "--out", str(tmp_path / "v")) == 1
     caught = capsys.readouterr()
     assert "1000" in caught.err or "10^" in caught.err or "unit" in caught.err
