@@ -81,8 +81,8 @@ def create_run_folder(
         )
     if occupied and not replace:
         raise RunFolderExistsError(
-            f"{folder} holds a run already: choose another --out, continue it with --resume {folder}, "
-            "or give --replace."
+            f"{folder} holds a run already: choose another --out, go on with it by --resume, or give "
+            "--replace."
         )
     held = lock_run_folder(folder) if occupied else None
     try:

@@ -84,6 +84,7 @@ def watch(
     kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up again.
     """
     from twin_master.assets.resolution import Overrides
+    from twin_master.store.outcome import REPORT_NAME
     from twin_master.watch.folder import Patched
 
     if (model_patch is None) != (from_turn is None) or (model_patch is not None and not resume):
@@ -109,6 +110,8 @@ def watch(
             os.close(lock)
         refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
         typer.echo(f"Watch: {watched.folder}, {counts.received} messages{refused}.", err=True)
+        if not no_report and counts.received:
+            typer.echo(f"Report: {watched.folder / REPORT_NAME}", err=True)
 
 
 def _recording(scenario: "Scenario") -> str | None:
@@ -215,18 +218,20 @@ def _asked(
     if observations is None and loaded is not None:
         observations = _recording(loaded.scenario.moved(loaded.path.parent))
     if observations is not None:
-        _check_source(observations, follow, ca_file)
+        _check_source(observations, None if loaded is None else loaded.scenario, follow, ca_file)
     return loaded, observations
 
 
-def _check_source(observations: str, follow: bool, ca_file: Path | None) -> None:
+def _check_source(observations: str, scenario: "Scenario | None", follow: bool, ca_file: Path | None) -> None:
     """Find slips of the pen before a model is built and a folder made."""
     from twin_master.errors import MissionInputError
-    from twin_master.watch.feeds import check_file
+    from twin_master.watch.feeds import check_file, file_feed
     from twin_master.watch.mqtt import broker_of, is_broker
 
     if is_broker(observations):
         broker_of(observations, ca_file)
+    elif observations != "-" and scenario is not None:
+        file_feed(Path(observations), scenario, follow=follow)
     elif observations != "-":
         check_file(Path(observations), follow=follow)
     elif follow:

@@ -35,7 +35,6 @@ __all__ = ["MonitorSettings", "WatchfulEstimator", "Words"]
 Float = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
 
-COMMAND = "uav-twin discrepancy run --from-run DIR"
 _PREFIX = "notice/"
 _FROM_THE_START = 0.5
 """Prior share of faults that are there from the first turn; the others begin at a later one."""
@@ -103,12 +102,18 @@ class Words:
         From the values of the sensors, SI, to what is printed.
     units : tuple of str
         Printed unit of each sensor; none where they are empty or "1".
+    names : tuple of str
+        What each sensor is called beside its number, if anything.
+    command : str
+        What looks for the cause of an alarm; empty where nothing can.
     """
 
     step: str = "turn"
     sensor: str = "gauge"
     factor: float = 1.0
     units: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    command: str = "uav-twin discrepancy run --from-run DIR"
 
     def value(self, sensor: int, *values: float) -> list[str]:
         """Return values of a sensor as they are printed."""
@@ -117,7 +122,7 @@ class Words:
 
     def sensors(self, numbers: Sequence[int]) -> str:
         """Return sensors, counted from 0, in words."""
-        names = [str(g + 1) for g in numbers]
+        names = [f"{g + 1} ({self.names[g]})" if self.names else str(g + 1) for g in numbers]
         if len(names) == 1:
             return f"{self.sensor} {names[0]}"
         return f"{self.sensor}s {', '.join(names[:-1])} and {names[-1]}"
@@ -391,11 +396,13 @@ class WatchfulEstimator:
     def _alarm(self, turn: int, what: str, gauges: list[int], log_value: float, onset: float) -> Notice:
         odds, step, first = float(np.exp(min(log_value, 700.0))), self._words.step, round(onset)
         since = f"since about {step} {first}" if first else "from the start"
-        command = f"{COMMAND} --from-turn {first}" if first else COMMAND
+        search = f"; to find the cause: {self._words.command}" if self._words.command else ""
+        search += f" --from-turn {first}" if search and first else ""
+        evidence = f"{odds:,.0f}" if 1e3 <= odds < 1e6 else f"{odds:.3g}"
         return Notice(
             "alarm",
-            f"{step.capitalize()} {turn}: {what}, {since} (evidence {odds:.3g} against the model, alarm from "
-            f"{self._settings.threshold:g}); to find the cause: {command}",
+            f"{step.capitalize()} {turn}: {what}, {since} (evidence {evidence} against the model, alarm from "
+            f"{self._settings.threshold:g}){search}",
             tuple(g + 1 for g in gauges),
             odds,
             first,

@@ -1,5 +1,7 @@
 """The estimator that a scenario asks for: one that learns, one that gives notice, or both."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,10 +53,11 @@ def scenario_estimator(
 
 def _words(scenario: Scenario) -> Words:
     observation = scenario.observation
+    more: dict[str, Any] = {"names": observation.titles} | ({} if scenario.searchable else {"command": ""})
     if observation.role == "strain" and set(observation.sensor_units) == {"1"}:
-        return Words(scenario.mission.step_name, "gauge", 1e6, ("microstrain",) * observation.count)
+        return Words(scenario.mission.step_name, "gauge", 1e6, ("microstrain",) * observation.count, **more)
     sensor = "gauge" if observation.role == "strain" else "sensor"
-    return Words(scenario.mission.step_name, sensor, 1.0, observation.sensor_units)
+    return Words(scenario.mission.step_name, sensor, 1.0, observation.sensor_units, **more)
 
 
 def learning_filter(

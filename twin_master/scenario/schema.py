@@ -215,6 +215,11 @@ class Scenario(Section):
         return {**table, "asset": {"kind": WATCHED_KIND}, "truth": untold}
 
     @property
+    def searchable(self) -> bool:
+        """Whether `discrepancy run --from-run` reads its runs: strains of a wing with two regions."""
+        return self.observation.role == "strain" and {*self.state_names} == {"z1", "z2"}
+
+    @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the state factors, the outermost first."""
         return tuple(factor.name for factor in self.state)

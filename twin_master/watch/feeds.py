@@ -60,6 +60,11 @@ class CsvFeed:
             raise MissionInputError(f"{path} cannot be read as CSV: {error}.") from None
         if not any(names):
             raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
+        if names[0].startswith("{"):
+            raise MissionInputError(
+                f"{path} holds JSON lines, and a file of observations is CSV or NetCDF: hand them over by "
+                f"standard input, `--observations - < {path}`."
+            )
         self._names = ["turn" if name in _TURN_COLUMNS else name for name in names]
         sensors = [place for place, name in enumerate(self._names) if name not in _OTHERS and name[:1] != "_"]
         try:

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -69,8 +70,10 @@ def broker_of(address: str, authority: Path | None = None, *, many: bool = False
     Raises
     ------
     MissionInputError
-        It is no such address, has a password in it, or a topic of many assets.
+        paho-mqtt is not installed, or it is no such address, has a password in it, or a topic of many assets.
     """
+    if find_spec("paho") is None:
+        raise MissionInputError("observations over MQTT need paho-mqtt: pip install 'uav-twin[mqtt]'.")
     try:
         parts = urlsplit(address)
         port, topic = parts.port, unquote(parts.path.lstrip("/"))
@@ -108,19 +111,15 @@ class Session:
     Raises
     ------
     MissionInputError
-        paho-mqtt is not installed, or the authority's file holds no certificate.
+        The authority's file holds no certificate.
     """
 
     def __init__(self, broker: Broker, name: str, folder: Path, note: Callable[[str], None]) -> None:
-        try:
-            from paho.mqtt import client as paho
-            from paho.mqtt.enums import CallbackAPIVersion
-            from paho.mqtt.packettypes import PacketTypes
-            from paho.mqtt.properties import Properties
-        except ImportError:
-            raise MissionInputError(
-                "observations over MQTT need paho-mqtt: pip install 'uav-twin[mqtt]'."
-            ) from None
+        from paho.mqtt import client as paho
+        from paho.mqtt.enums import CallbackAPIVersion
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
         self._broker = broker
         self._note = note
         self._came: deque[Any] = deque()

@@ -51,7 +51,7 @@ def check_teachable(scenario: Scenario) -> None:
     if scenario.notice is None:
         raise MissionInputError(NO_ALARMS)
     role, states = scenario.observation.role, ", ".join(scenario.state_names)
-    if role != "strain" or {*scenario.state_names} != {"z1", "z2"}:
+    if not scenario.searchable:
         raise MissionInputError(NO_WING.format(f"the role {role} under {states}"))
     if not getattr(scenario.belief, "design", None):
         raise MissionInputError(NO_WING.format(f"the belief `{scenario.belief.kind}` without a design"))

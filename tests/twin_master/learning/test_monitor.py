@@ -11,7 +11,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from twin_master.errors import InvalidModelError
-from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator
+from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator, Words
 from twin_master.mission.preparation import Knowledge, prepare_twin
 from twin_master.network.estimator import Carried, Estimate, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
@@ -242,9 +242,11 @@ def wing() -> Knowledge:
     return prepare_twin("level_turns")
 
 
-def fly(wing: Knowledge, turns: int, spoil: dict[int, float], begin: int = 0) -> list[Estimate]:
+def fly(
+    wing: Knowledge, turns: int, spoil: dict[int, float], begin: int = 0, words: Words | None = None
+) -> list[Estimate]:
     """Return 3g turns of the wing with gauges whose gain is off from a turn on."""
-    estimator = WatchfulEstimator(wing.twin().estimator, wing.sensor_model, wing.draws.values)
+    estimator = WatchfulEstimator(wing.twin().estimator, wing.sensor_model, wing.draws.values, words=words)
     random, before, estimates = np.random.default_rng(1), None, []
     for turn in range(turns):
         shown = wing.sensor_model.mean[0, 1].copy()
@@ -276,6 +278,14 @@ def test_a_gauge_that_is_off_is_named(
     last = estimates[-1].suspicion
     assert last is not None
     assert last.gauge_off > 0.5
+
+
+def test_an_alarm_names_no_command_where_none_looks_for_causes(wing: Knowledge) -> None:
+    words = Words(names=tuple(f"place {number}" for number in range(1, 25)), command="")
+    estimates = fly(wing, 12, {5: 0.3}, words=words)
+    alarm = next(notice.sentence for estimate in estimates for notice in estimate.notices)
+    assert "gauge 5 (place 5) shows too much" in alarm
+    assert alarm.endswith("against the model, alarm from 100)")
 
 
 def test_what_no_state_explains_is_not_taken_for_a_gauge(wing: Knowledge) -> None:

@@ -86,6 +86,11 @@ def folder(scenario: Path) -> Path:
     return run
 
 
+def test_the_search_for_causes_is_named_for_a_wing_alone() -> None:
+    for name, searched in (("watched_wing", True), ("three_regions", False), ("pump_wear", False)):
+        assert load_scenario(name).scenario.searchable is searched
+
+
 def test_the_console_names_turn_gauge_and_the_command(folder: Path) -> None:
     said = (folder.parent / "said.txt").read_text()
     alarm = next(line for line in said.splitlines() if line.startswith("Turn ") and "gauge 5" in line)

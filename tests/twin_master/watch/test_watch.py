@@ -392,8 +392,12 @@ def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
 
 def test_a_slip_of_the_pen_makes_no_folder(scenario: LoadedScenario, tmp_path: Path) -> None:
     (tmp_path / "run.nc").touch()
+    (tmp_path / "wrong.csv").write_text("turn,strian_1\n")
+    (tmp_path / "lines.jsonl").write_text('{"turn": 0, "strain_1": 1e-4}\n')
     for source, said in (
         (["missing.csv"], "there is no file"),
+        ([str(tmp_path / "wrong.csv")], "the column `strian_1` is no sensor"),
+        ([str(tmp_path / "lines.jsonl")], "holds JSON lines"),
         ([str(tmp_path / "run.nc"), "--follow"], "only a CSV file can be followed"),
         (["-", "--follow"], "--follow belongs to a CSV file"),
         (["mqtt://host"], "is expected"),
