@@ -204,6 +204,9 @@ class FmuMotion:
         first = displacement if way.hold is None else min(1.0, 0.1 * self._runs.input_limit(way.hold))
         if displacement == 0.0:
             return 0.0
+        kind = ("free", (("hold", ""),))
+        if way.hold is not None and self._linear.get(kind) and self._silent.get(kind):
+            return displacement * first / shown(first)
         zero = shown(0.0)
         amount, reached = first, shown(first) - zero
         slope = reached / first
@@ -326,13 +329,12 @@ class FmuMotion:
         if system is None:
             return self._stepped(laws, port_of, state, step, steps, loads, free)
         x_rows, x_direct = system.outputs[self.ports.x], system.direct[self.ports.x]
-        v_rows, v_direct, velocity = (
-            x_rows @ system.generator,
-            np.zeros_like(x_direct),
-            np.empty((steps + 1, 0)),
-        )
+        v_rows, v_direct = x_rows @ system.generator, np.zeros_like(x_direct)
+        key = ("velocity", state, step, steps, tuple((part.key, value) for part, value in loads))
         grid = step * np.arange(steps + 1)
-        velocity = CubicSpline(grid, free[:, self.ports.x])(grid, 1)
+        velocity = self._runs.remembered(
+            key, lambda: np.asarray(CubicSpline(grid, free[:, self.ports.x])(grid, 1))
+        ).copy()
         for number, column in enumerate(self.ports.v):
             if column >= 0:
                 v_rows[number], v_direct[number] = system.outputs[column], system.direct[column]
@@ -353,8 +355,12 @@ class FmuMotion:
         kind = tuple(part.kind for part, _ in loads)
         kind_names = tuple((part.kind, part.name) for part, _ in loads)
         released = all(name in ("displacement", "velocity", "hold") for name in kind)
+        fine = self.ports.system(state, step, steps, refinement)
+        parts = self.ports.parts(step * refinement)
+        ratio, larger = refinement // parts, step * refinement / parts
         possible = (
-            refinement > 1
+            fine is not None
+            and ratio > 1
             and released
             and self.ports.quiet
             and self._linear.get(("free", kind_names)) is True
@@ -366,13 +372,14 @@ class FmuMotion:
             size = self._units[part.kind, part.name]
 
             def moved(part: Excitation = part, size: float = size) -> FloatArray:
-                base = self.ports.system(state, step * refinement, ceil(steps / refinement))
-                fine = self.ports.system(state, step, steps, refinement)
-                if base is None or fine is None or not self.ports.refinable:
+                base = self.ports.system(state, larger, ceil(steps / ratio), parts)
+                if base is None:
                     return np.zeros(0)
-                coarse = self.free(state, step * refinement, ceil(steps / refinement), [(part, size)])
+                coarse = self.free(state, larger, ceil(steps / ratio), [(part, size)])
                 start = base.start_of(coarse, LINEAR)
-                return np.zeros(0) if start is None else fine.free(start, steps)
+                if start is None or fine is None:
+                    return np.zeros(0)
+                return np.vstack((coarse[:1], fine.free(start, steps)[1:]))
 
             unit = self._runs.remembered(("refined", state, step, steps, refinement, part.key, size), moved)
             if not len(unit):

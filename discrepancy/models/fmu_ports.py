@@ -20,6 +20,8 @@ LINEAR = 1e-6
 RECORD = 600
 """Steps of the answer to a port's force that are recorded."""
 KEPT_SYSTEMS = 64
+SAFE_TURN = 0.8 * np.pi
+"""Turn of a mode in a step up to which it does not become half a circle as parameters change [rad]."""
 
 
 class FmuPorts:
@@ -42,8 +44,6 @@ class FmuPorts:
         Columns of the ports' displacements and velocities; -1: there is no velocity.
     quiet : bool
         Whether the FMU was seen to show nothing without excitation.
-    refinable : bool or None
-        Whether systems of smaller steps may be computed from larger ones; None: not tried yet.
     """
 
     def __init__(self, description: FmuModelDescription, runs: FmuRuns, run: Run) -> None:
@@ -53,40 +53,61 @@ class FmuPorts:
         self.x = [runs.columns[f"port.{port.name}.displacement"] for port in self._ports]
         self.v = [runs.columns.get(f"port.{port.name}.velocity", -1) for port in self._ports]
         self.quiet = False
-        self.refinable: bool | None = None
+        self._parts: dict[float, int] = {}
+        self._confirmed_to: dict[float, int] = {}
         self._zero_inputs = dict.fromkeys(runs.asset.binding.load, 0.0)
         self._systems: OrderedDict[Hashable, PortSystem | None] = OrderedDict()
         self._linear: bool | None = None
 
+    def parts(self, whole: float) -> int:
+        """Return into how many parts a step [s] is divided so that its system tells those of smaller steps.
+
+        A mode that turns by more than half a circle in a step looks like a slower one there.
+        """
+        return self._parts.get(whole, 1)
+
     def system(self, state: State, step: float, steps: int, refinement: int = 1) -> PortSystem | None:
         """Return what forces at the ports do in a linear FMU; None if it is not linear.
 
-        Where the FMU confirms it once, the system of a `refinement` is computed from that of the larger step.
+        Where the FMU confirms it once, the system of a `refinement` is computed from that of a larger step.
         """
         if not self._description.superposition or self._linear is False:
             return None
         key = (state, step)
-        if refinement > 1 and self.refinable is not False and key not in self._systems:
-            base = self.system(state, step * refinement, ceil(steps / refinement))
-            if base is not None:
-                self._systems[key] = finer = base.refined(refinement)
-                if self.refinable is None:
-                    self.refinable = self._confirmed(finer, state, step, max(min(steps, RECORD), 64))
-                    if not self.refinable:
-                        del self._systems[key]
         if key in self._systems:
             self._systems.move_to_end(key)
             return self._systems[key]
-        count = max(min(steps, RECORD), 64)
-        records = self.records(state, step, count)
-        system = port_system(records, self.x, step)
-        if system is not None and self._linear is None:
-            self._linear = self._confirmed(system, state, step, count)
-            system = system if self._linear else None
+        system = self._from_larger(state, step, steps, refinement)
+        if system is None:
+            count = max(min(steps, RECORD), 64)
+            system = port_system(self.records(state, step, count), self.x, step)
+            if system is not None and self._linear is None:
+                self._linear = self._confirmed(system, state, step, count)
+                system = system if self._linear else None
         self._systems[key] = system
         if len(self._systems) > KEPT_SYSTEMS:
             self._systems.popitem(last=False)
         return system
+
+    def _from_larger(self, state: State, step: float, steps: int, refinement: int) -> PortSystem | None:
+        """Return the system of a refinement made from that of a larger step; None if there is none such."""
+        whole = step * refinement
+        parts = self.parts(whole)
+        ratio = refinement // parts
+        if ratio < 2 or refinement % parts:
+            return None
+        base = self.system(state, whole / parts, ceil(steps / ratio), parts)
+        if base is None:
+            return None
+        finer = base.refined(ratio)
+        known, count = self._confirmed_to.get(base.step, 1), max(min(steps, RECORD), 64)
+        new = ratio > known
+        if base.largest_turn > SAFE_TURN or (new and not self._confirmed(finer, state, step, count)):
+            self._parts[whole] = refinement
+            self._systems.clear()  # what was computed from the same step
+            return None
+        self._confirmed_to[base.step] = max(ratio, known)
+        return finer
 
     def _size(self, number: int) -> float:
         return min(1.0, 0.1 * self._runs.input_limit(self._ports[number].force))

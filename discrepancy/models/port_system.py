@@ -12,6 +12,8 @@ FloatArray = NDArray[np.float64]
 MOST_STATES = 40
 """Largest order of a linear system that is made from records."""
 HANKEL_ROWS = 160
+ROUNDING = 1e-11
+"""Largest error of a matrix put together from its eigenvectors, as a share of its largest entry."""
 FIT = 1e-7
 """Largest error of a linear system against the record that it is made of, as a share of the record."""
 
@@ -37,9 +39,28 @@ class PortSystem:
     step: float
 
     @cached_property
+    def _spectrum(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Eigenvalues (n,) of A, its eigenvectors and their inverse; None where too close to tell."""
+        values, shapes = np.linalg.eig(self.transition)
+        try:
+            inverse = np.linalg.inv(shapes)
+        except np.linalg.LinAlgError:
+            return None
+        error = np.max(np.abs((shapes * values) @ inverse - self.transition))
+        return (values, shapes, inverse) if error <= ROUNDING * np.max(np.abs(self.transition)) else None
+
+    @cached_property
     def generator(self) -> FloatArray:
         """Matrix (n, n) of the motion in time, s' = G s without forces [1/s]."""
-        return np.asarray(np.real(logm(self.transition)) / self.step)
+        if self._spectrum is None:
+            return np.asarray(np.real(logm(self.transition)) / self.step)
+        values, shapes, inverse = self._spectrum
+        return np.asarray(np.real((shapes * np.log(values.astype(complex))) @ inverse) / self.step)
+
+    @property
+    def largest_turn(self) -> float:
+        """Largest turn of a mode in a step [rad]; beyond pi it would look like a smaller one."""
+        return float(np.max(np.abs(np.angle(np.linalg.eigvals(self.transition)))))
 
     def refined(self, parts: int) -> "PortSystem":
         """Return the same system with steps that are so many times smaller."""
@@ -48,9 +69,11 @@ class PortSystem:
         block[:order, :order], block[:order, order:] = self.generator, np.eye(order)
         whole, part = expm(block * self.step), expm(block * self.step / parts)
         start = np.linalg.solve(whole[:order, order:], self.drive)
-        return PortSystem(
+        finer = PortSystem(
             part[:order, :order], part[:order, order:] @ start, self.outputs, self.direct, self.step / parts
         )
+        vars(finer)["generator"] = self.generator  # the motion in time is the same
+        return finer
 
     def motion(self, forces: FloatArray) -> FloatArray:
         """Return the outputs (N + 1, C) under forces (N, P), from rest."""
@@ -66,11 +89,15 @@ class PortSystem:
         return np.asarray(values)
 
     def start_of(self, free: FloatArray, tolerance: float) -> FloatArray | None:
-        """Return the state (n,) from which the system moves as `free` (K, C), None if it does not."""
-        rows = np.empty((*free.shape, len(self.transition)))
-        rows[0] = self.outputs
-        for k in range(1, len(free)):
-            rows[k] = rows[k - 1] @ self.transition
+        """Return the state (n,) from which the system moves as `free` (K, C), None if it does not.
+
+        The first row of `free` does not count: what holds the structure until then may act on outputs.
+        """
+        free = free[1:]
+        rows, power = (self.outputs @ self.transition)[np.newaxis], self.transition
+        while len(rows) < len(free):
+            rows, power = np.concatenate((rows, rows @ power)), power @ power
+        rows = rows[: len(free)]
         size = np.max(np.abs(free), axis=0)
         weight = 1.0 / np.where(size > 0.0, size, 1.0)
         flat = (rows * weight[:, None]).reshape(-1, len(self.transition))

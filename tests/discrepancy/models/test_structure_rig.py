@@ -12,9 +12,10 @@ import pytest
 
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.models.fmu import FmuModel
+from discrepancy.models.fmu_excitation import Excitation
 from discrepancy.models.interface import Conditions
 from fe.reduction.structure_basis import reduce_structure
-from fe.runtime.patch import ModelPatch
+from fe.runtime.patch import ModelPatch, PowerStiffness
 from fe.runtime.structure_model import StructureModel
 from fe.runtime.structure_motion import StructureMotion
 from fe.structure.design import load_structure
@@ -78,6 +79,39 @@ def test_it_is_the_structure_in_motion(pair: tuple[FmuModel, StructureModel]) ->
     )
     largest = np.abs(wanted).max(axis=0)
     np.testing.assert_allclose(seen[1:] / largest, wanted / largest, atol=1e-3)
+
+
+def test_systems_of_small_steps_come_from_steps_that_tell_all_modes(
+    pair: tuple[FmuModel, StructureModel],
+) -> None:
+    """At 10 kHz modes of 5.8 and 8.7 kHz look like slower ones; smaller steps need a finer base."""
+    model, _ = pair
+    motion, step = model.motion, 1e-4
+    for refinement in (1, 2, 4):
+        system = motion.ports.system(motion.nominal, step / refinement, 400, refinement)
+        assert system is not None
+        force = np.random.default_rng(refinement).uniform(-1.0, 1.0, (400, 1))
+        loads = [(Excitation("input", "push", force[:, 0].copy()), 1.0)]
+        wanted = motion.free(motion.nominal, step / refinement, 400, loads)
+        largest = np.abs(wanted).max(axis=0)
+        np.testing.assert_allclose(system.motion(force) / largest, wanted / largest, atol=1e-6)
+    assert motion.ports.parts(step) == 2
+
+
+def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(pair: tuple[FmuModel, StructureModel]) -> None:
+    """A spring of next to no stiffness changes nothing, nor the acceleration that a release begins with."""
+    model, _ = pair
+    trial = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4, mode_count=1))
+    spring = ModelPatch((PowerStiffness("tip", 1e-9, 1.0, 0, 1e-3),))
+    for e in (1.0, 1.03):
+        conditions = Conditions(np.array([e, 0.05]))
+        wanted = model.respond(trial, OUTPUTS, ModelPatch(), conditions).values
+        for refinement in (8, 16):
+            before = model.runs.step_count
+            seen = model.respond(trial, OUTPUTS, spring, conditions, refinement=refinement).values
+            largest = np.abs(wanted).max(axis=0)
+            np.testing.assert_allclose(seen / largest, wanted / largest, atol=1e-6)
+    assert model.runs.step_count == before  # confirmed at the first parameters
 
 
 def test_a_structure_without_a_force_is_refused(write_beam: Callable[..., Path], tmp_path: Path) -> None:
