@@ -238,14 +238,20 @@ class FmuModel:
                 )
             return Response(self._at_rest_values(trial, conditions, parts)[:, columns])
         state = self._trials.state(trial, conditions, parts.settings, 0)
-        values, step = self._moving(trial, conditions, state, parts, refinement)
+        values, step = self._moving(trial, conditions, state, parts, refinement, columns)
         rate, zero = conditions.clock
         quantities = self.runs.quantities
         derivatives = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
         return sampled(values[:, columns], step, (1.0 + rate) * trial.time + zero, derivatives)
 
     def _moving(
-        self, trial: Trial, conditions: Conditions, state: State, patch: SortedPatch, refinement: int
+        self,
+        trial: Trial,
+        conditions: Conditions,
+        state: State,
+        patch: SortedPatch,
+        refinement: int,
+        columns: Sequence[int],
     ) -> tuple[FloatArray, float]:
         """Return all outputs (K, C) on the grid of the communication step [s], and the step."""
         if not len(patch.laws):
@@ -256,6 +262,7 @@ class FmuModel:
             trial,
             state,
             refinement,
+            columns,
         )
 
     def _free(

@@ -269,12 +269,13 @@ class FmuMotion:
     # ------------------------------------------------------------ laws
 
     def with_laws(
-        self, laws: Laws, excite: Excite, trial: Trial, state: State, refinement: int
+        self, laws: Laws, excite: Excite, trial: Trial, state: State, refinement: int, seen: Sequence[int]
     ) -> tuple[FloatArray, float]:
         """Return the outputs (K, C) of a dynamic trial with laws at ports, and the step [s].
 
-        Steps are halved until that changes no output by more than `CONVERGED` of its largest motion (rms);
-        what was enough is kept for laws of this kind up to twice as strong.
+        Steps are halved until that changes no column of `seen` by more than `CONVERGED` of its largest motion
+        (rms), nor the displacement of a port; what was enough is kept for laws of this kind up to twice as
+        strong. An accelerometer that nobody reads would ask for steps many times smaller.
 
         Raises
         ------
@@ -286,16 +287,24 @@ class FmuMotion:
             return self._coupled(laws, state, step, steps, loads), step
         strength = float(np.max(np.abs(laws.values[:, 0])))
         exponents = np.round(np.clip(laws.values[:, 1:3], -9.0, 9.0), 1)  # what is rough needs shorter steps
-        key = (trial.kind, trial.interval, laws.ports, laws.numbers.tobytes(), exponents.tobytes())
+        watched = sorted({*seen, *self.ports.x})
+        key = (
+            tuple(watched),
+            trial.kind,
+            trial.interval,
+            laws.ports,
+            laws.numbers.tobytes(),
+            exponents.tobytes(),
+        )
         known, tried = self._refinements.get(key, (1, 0.0))
         if strength > 2.0 * tried:
-            known = self._converged(laws, excite, state, known)
+            known = self._converged(laws, excite, state, known, watched)
             self._refinements[key] = (known, strength)
         refinement *= known
         step, steps, loads = excite(refinement)
         return self._coupled(laws, state, step, steps, loads, refinement), step
 
-    def _converged(self, laws: Laws, excite: Excite, state: State, begin: int) -> int:
+    def _converged(self, laws: Laws, excite: Excite, state: State, begin: int, watched: Sequence[int]) -> int:
         refinement, change, coarse = begin, np.inf, None
         while refinement <= MOST_REFINEMENT:
             step, steps, loads = excite(refinement)
@@ -303,10 +312,10 @@ class FmuMotion:
                 coarse = self._coupled(laws, state, step, steps, loads, refinement)
             step, steps, loads = excite(2 * refinement)
             fine = self._coupled(laws, state, step, steps, loads, 2 * refinement)
-            shared = fine[::2][: len(coarse)]
+            shared = fine[::2, watched][: len(coarse)]
             with np.errstate(all="ignore"):  # an unstable coupling grows beyond all numbers
                 size = np.max(np.abs(shared - shared.mean(axis=0)), axis=0)
-                difference = np.sqrt(np.mean((coarse[: len(shared)] - shared) ** 2, axis=0))
+                difference = np.sqrt(np.mean((coarse[: len(shared), watched] - shared) ** 2, axis=0))
                 change = float(np.max(difference / np.where(size > 0.0, size, np.inf)))
             if not np.isfinite(difference).all():
                 change = np.inf

@@ -114,6 +114,23 @@ def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(pair: tuple[FmuModel,
     assert model.runs.step_count == before  # confirmed at the first parameters
 
 
+def test_an_accelerometer_that_nobody_reads_does_not_shorten_the_steps(
+    pair: tuple[FmuModel, StructureModel],
+) -> None:
+    model, _ = pair
+    trial = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4, mode_count=1))
+    law = ModelPatch((PowerStiffness("tip", 10.0, 3.0, 0, 1e-4),))
+    found, refinements = [], []
+    for outputs in (OUTPUTS, OUTPUTS[:2]):
+        model.motion._refinements.clear()
+        moved = model.respond(trial, outputs, law, Conditions(np.array([1.0, 0.05])))
+        found.append(moved.values[:, :2])
+        refinements += [parts for parts, _ in model.motion._refinements.values()]
+    largest = np.abs(found[0]).max(axis=0)
+    np.testing.assert_allclose(found[1] / largest, found[0] / largest, atol=5e-4)
+    assert refinements[1] < refinements[0]
+
+
 def test_a_structure_without_a_force_is_refused(write_beam: Callable[..., Path], tmp_path: Path) -> None:
     design = load_structure(write_beam(tmp_path, {'unit = "N", ': "", "load_factor": "gee"}, cells=1))
     with pytest.raises(FmuBuildError, match="no control in N and no load_factor"):
