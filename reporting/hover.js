@@ -1,7 +1,7 @@
 "use strict";
 // Shows the value under the pointer, or under a tap, in the figures of the page; without it the page is whole.
 (() => {
-  const REACH = 40; // pixels from the pointer to the nearest point
+  const REACH = 40, REACH_IN_MAP = 8; // pixels from the pointer to the nearest point
   const sign = document.createElement("div");
   sign.className = "reading";
   sign.hidden = true;
@@ -48,24 +48,44 @@
     ].filter(Boolean).join("\n");
   };
 
+  const inMap = ({ title, x, y, maps }, right, up) => {
+    const cell = ({ limits: [low, high] }, edges, part) => {
+      const at = low + part * (high - low), found = edges.findIndex((edge, k) => (at - edge) * (at - edges[k + 1]) <= 0);
+      return [found, ((edges[found] + edges[found + 1]) / 2 - low) / (high - low)];
+    };
+    for (const map of maps) {
+      const [i, across] = cell(x, map.x, right), [j, above] = cell(y, map.y, up), held = map.values[j]?.[i];
+      if (held == null) continue;
+      return [title, [x.name, value(x, across)].filter(Boolean).join(": "), [y.name, value(y, above)].filter(Boolean).join(": "),
+        `${map.name}: ${held}`].filter(Boolean).join("\n");
+    }
+    return "";
+  };
+
+  const mark = (svg, [x, y], scale) => {
+    ring = document.createElementNS(svg.namespaceURI, "circle");
+    for (const [key, of] of Object.entries({ class: "ring", cx: x, cy: y, r: 4 / scale })) ring.setAttribute(key, of);
+    svg.append(ring);
+  };
+
   const show = (svg, panels, event) => {
     const matrix = svg.getScreenCTM(), pointer = new DOMPoint(event.clientX, event.clientY).matrixTransform(matrix.inverse());
-    let best = null, least = REACH / matrix.a;
+    let best = null, least = REACH / matrix.a, cell = "";
     for (const panel of panels) {
       const [left, right, bottom, top] = panel.box;
       if (pointer.x < left - 4 || pointer.x > right + 4 || pointer.y > bottom + 4 || pointer.y < top - 4) continue;
+      cell = inMap(panel, (pointer.x - left) / (right - left), (bottom - pointer.y) / (bottom - top));
+      if (cell) least = Math.min(least, REACH_IN_MAP / matrix.a);
       for (const series of panel.series) for (const point of series.points) {
         const distance = Math.hypot(point[0] - pointer.x, point[1] - pointer.y);
         if (distance <= least) { least = distance; best = { panel, series, point }; }
       }
     }
     hide();
-    if (!best) return;
-    sign.textContent = text(best.panel, best.series, best.point);
+    if (!best && !cell) return;
+    sign.textContent = best ? text(best.panel, best.series, best.point) : cell;
     sign.hidden = false;
-    ring = document.createElementNS(svg.namespaceURI, "circle");
-    for (const [key, of] of Object.entries({ class: "ring", cx: best.point[0], cy: best.point[1], r: 4 / matrix.a })) ring.setAttribute(key, of);
-    svg.append(ring);
+    if (best) mark(svg, best.point, matrix.a);
     const { width, height } = sign.getBoundingClientRect(), end = document.documentElement.clientWidth - width - 8;
     sign.style.left = `${Math.max(8, Math.min(event.clientX + 14, end))}px`;
     sign.style.top = `${event.clientY > height + 24 ? event.clientY - height - 14 : event.clientY + 20}px`;

@@ -1,4 +1,4 @@
-"""What a reader of a page sees under the pointer: the values of lines and points, their names and units.
+"""What a reader of a page sees under the pointer: values of lines, points and maps, their names and units.
 
 An SVG of matplotlib has every point of a line already. What it lacks are the scales of the panels and the
 names of the lines; `annotated` adds these as attributes, and the script of a page (`hover.js`) reads both.
@@ -14,13 +14,18 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.collections import FillBetweenPolyCollection, PathCollection
+from matplotlib.collections import FillBetweenPolyCollection, PathCollection, QuadMesh
 from matplotlib.colors import to_hex
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 
 _POINTS_PER_INCH = 72.0
+_MOST_CELLS = 5000
+"""Cells of a map whose values a page holds."""
+_FEW_COLOURS = 20
+"""So few colours stand for names, such as those of controls, and not for values."""
 _Look = tuple[str, str, str]
 
 
@@ -36,7 +41,7 @@ def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
     for axes in figure.axes:
         if {axes.get_xscale(), axes.get_yscale()} <= {"linear", "log"}:
             found = list(_marked(axes, names))
-            if any(attribute == "data-series" for _, attribute, _ in found):
+            if any(attribute == "data-series" for _, attribute, _ in found) or _maps(axes):
                 marked += [*found, (axes, "data-axes", "")]
     marked = [entry for entry in marked if entry[0].get_gid() is None]
     for number, (artist, _, _) in enumerate(marked):
@@ -124,10 +129,40 @@ def _frame(axes: Axes) -> dict[str, Any]:
     ]  # fmt: skip
     return {
         "title": axes.get_title(loc="left") or axes.get_title(),
+        "maps": _maps(axes),
         "box": [round(value, 3) for value in place],
         "x": _scale(axes.xaxis, axes.get_xlim(), axes.get_xscale(), next(filter(None, column), "")),
         "y": _scale(axes.yaxis, axes.get_ylim(), axes.get_yscale(), next(filter(None, row), "")),
     }
+
+
+def _maps(axes: Axes) -> list[dict[str, Any]]:
+    """Return the maps of a panel: edges of columns x and rows y, values with null where there is none."""
+    figure, found = axes.get_figure(root=True), []
+    if figure is None or _is_bar(axes) or {axes.get_xscale(), axes.get_yscale()} != {"linear"}:
+        return []
+    label = next((other.get_ylabel() for other in figure.axes if _is_bar(other)), "") or "value"
+    for artist in (*axes.collections, *axes.images):
+        if not isinstance(artist, QuadMesh | AxesImage) or artist.get_cmap().N < _FEW_COLOURS:
+            continue
+        values: Any = np.ma.masked_invalid(np.ma.asarray(artist.get_array()))
+        if values.ndim != 2 or values.size > _MOST_CELLS:
+            continue
+        if isinstance(artist, QuadMesh):
+            corners = np.asarray(artist.get_coordinates())
+            x, y = corners[0, :, 0], corners[:, 0, 1]
+        else:
+            left, right, bottom, top = artist.get_extent()
+            ends = (bottom, top) if artist.origin == "lower" else (top, bottom)
+            x, y = np.linspace(left, right, values.shape[1] + 1), np.linspace(*ends, values.shape[0] + 1)
+        rows = [[None if cell is None else float(f"{cell:.3g}") for cell in row] for row in values.tolist()]
+        found.append({"x": x.tolist(), "y": y.tolist(), "values": rows, "name": label})
+    return found
+
+
+def _is_bar(axes: Axes) -> bool:
+    """Whether a panel is the scale of colours beside a map."""
+    return hasattr(axes, "_colorbar")
 
 
 def _scale(axis: Axis, limits: tuple[float, float], kind: str, name: str) -> dict[str, Any]:

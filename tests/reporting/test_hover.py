@@ -32,6 +32,14 @@ def drawing() -> "figures.Figure":
         right = figure.add_axes((0.55, 0.1, 0.35, 0.3))
         right.scatter([1.0, 2.0, 3.0], [0.0, 1.0, 1.0], label="choice")
         right.set_yticks([0, 1], ["2g", "3g"])
+        field = figure.add_axes((0.55, 0.42, 0.3, 0.1))
+        mesh = field.pcolormesh(
+            [0.5, 1.5, 2.5, 3.5], [0.0, 10.0, 20.0], [[0.1, 0.25, 0.5], [1.0, np.nan, 3.0]]
+        )
+        figure.colorbar(mesh, cax=figure.add_axes((0.9, 0.42, 0.02, 0.1)), label="residual")
+        field.set_xlabel("gauge")
+        image = figure.add_axes((0.1, 0.42, 0.3, 0.1))
+        image.imshow([[1.0, 2.0], [3.0, 4.0]], aspect="auto")
     return figure
 
 
@@ -44,12 +52,22 @@ SEEN = {
 """What is said at the middle point of each series, in the order of drawing."""
 
 
+CELLS = {
+    (3, 0.9, 0.25): ["gauge: 3", "5", "residual: 0.5"],
+    (3, 0.1, 0.75): ["gauge: 1", "15", "residual: 1"],
+    (3, 0.5, 0.75): None,
+    (4, 0.75, 0.75): ["1", "0", "residual: 2"],
+    (4, 0.25, 0.25): ["0", "1", "residual: 3"],
+}
+"""What is said in maps: number of the panel, share of its width and height; None where there is no value."""
+
+
 def test_drawing_changes_nothing_of_a_figure() -> None:
     figure = drawing()
     first = figures.to_svg(figure)
     assert figures.to_svg(figure) == first
     assert all(artist.get_gid() is None for axes in figure.axes for artist in (axes, *axes.get_children()))
-    assert first.count(b"data-axes=") == 3
+    assert first.count(b"data-axes=") == 5  # the scale of colours is none
     assert first.count(b"data-series=") == len(SEEN)  # a limit has no points
     assert not re.search(rb'id="hover', first)
 
@@ -78,6 +96,15 @@ def test_the_pointer_and_a_tap_are_told_what_was_drawn(tmp_path: Path) -> None:
             tab.send("Input.dispatchMouseEvent", type="mouseMoved", x=x + 2.0, y=y + 1.0)
             assert tab.value(f"{sign}.innerText").split("\n") == lines
             assert tab.value("document.querySelectorAll('.ring').length") == 1
+        at = """(panel, right, up) => { const group = document.querySelectorAll('[data-axes]')[panel];
+          const [x0, x1, y0, y1] = JSON.parse(group.dataset.axes).box;
+          const place = new DOMPoint(x0 + right * (x1 - x0), y0 + up * (y1 - y0));
+          const seen = place.matrixTransform(group.closest('svg').getScreenCTM());
+          return [seen.x, seen.y]; }"""
+        for place, cell in CELLS.items():
+            left, top = tab.value(f"({at})({', '.join(map(str, place))})")
+            tab.send("Input.dispatchMouseEvent", type="mouseMoved", x=left, y=top)
+            assert tab.value(f"{sign}.hidden ? null : {sign}.innerText.split('\\n')") == cell
         tab.press("Escape")
         assert tab.value(f"{sign}.hidden")
         tab.send("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
@@ -86,4 +113,4 @@ def test_the_pointer_and_a_tap_are_told_what_was_drawn(tmp_path: Path) -> None:
         tab.send("Emulation.setEmulatedMedia", media="print")
         assert tab.value(f"getComputedStyle({sign}).display") == "none"
         assert tab.errors == []
-        assert tab.requests == [f"file://{file}"]
+        assert [one for one in tab.requests if not one.startswith("data:")] == [f"file://{file}"]
