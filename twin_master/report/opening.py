@@ -21,7 +21,8 @@ def opening_sentences(record: RunRecord) -> tuple[str, ...]:
     """Return at most three sentences on a run; what the record does not hold is not spoken of."""
     check = predictive_check(record)
     agreement = "" if check is None else _agreement(record, check)
-    return tuple(sentence for sentence in (_decision(record), _belief(record), agreement) if sentence)
+    decision = f"{_decision(record).removesuffix('.')}{_not_followed(record)}."
+    return tuple(sentence for sentence in (decision, _belief(record), agreement) if sentence)
 
 
 def _decision(record: RunRecord) -> str:
@@ -73,6 +74,15 @@ def _fallback(record: RunRecord) -> Fallback | None:
         record.control_index,
         np.asarray(record.truth_state, dtype=np.float64),
     )
+
+
+def _not_followed(record: RunRecord) -> str:
+    """Return how often a real asset was under another control than the one that its twin had asked for."""
+    if not record.config.get("watched") or record.decision_probability is None:
+        return ""
+    asked = np.argmax(record.decision_probability[:-1], axis=1)
+    missed = int(np.count_nonzero(asked != record.control_index[1:]))
+    return f"; at {_count(missed, record.step_word)} the twin had asked for another control" if missed else ""
 
 
 def _belief(record: RunRecord) -> str:

@@ -54,7 +54,12 @@ def test_the_first_sentence_follows_the_record(record: report_data.RunRecord) ->
     )
     # of a real asset nothing is known but what was recorded
     watched = replace(record, config={**record.config, "watched": True}, truth_state=None, first_step=1000)
-    assert flown(watched, *range(31, 50)) == "The asset left 3g for 2g at turn 1031."
+    obeyed = np.tile([0.1, 0.9], (50, 1))
+    obeyed[30:] = [0.8, 0.2]  # asked for 2g from turn 31 on
+    left = flown(watched, *range(31, 50), decision_probability=obeyed)
+    assert left == "The asset left 3g for 2g at turn 1031."
+    kept = flown(watched, decision_probability=obeyed)
+    assert kept == "The asset kept 3g at every turn; at 19 turns the twin had asked for another control."
     assert "truth" not in " ".join(opening_sentences(watched))
     assert flown(record, policy=None) == "The twin kept 3g at every turn."
     one = replace(record, controls=("3g",), control_index=np.zeros(50, dtype=np.int64))
