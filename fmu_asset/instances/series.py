@@ -39,8 +39,8 @@ class Series:
     """
 
     def __init__(self, requests: npt.NDArray[np.float64], replies: npt.NDArray[np.float64]) -> None:
-        self.requests = memoryview(requests.reshape(-1)).cast("B")  # type: ignore[arg-type]
-        self.replies = memoryview(replies.reshape(-1)).cast("B")  # type: ignore[arg-type]
+        self.requests = requests.reshape(-1).data.cast("B")
+        self.replies = replies.reshape(-1).data.cast("B")
         self.count, self.done = len(requests), 0
         self.reply_size = replies.itemsize * replies.shape[1]
 
