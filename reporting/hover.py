@@ -176,6 +176,8 @@ def _scale(axis: Axis, limits: tuple[float, float], kind: str, name: str) -> dic
         return found
     places = [float(place) for place in axis.get_majorticklocs()]
     texts = axis.get_major_formatter().format_ticks(places)
+    if not name and not any(texts):
+        found["unsaid"] = True
     if any(text and not _is_number(text) for text in texts):
         found["texts"] = [[place, " ".join(text.split())] for place, text in zip(places, texts, strict=True)]
     return found

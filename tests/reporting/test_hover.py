@@ -40,6 +40,7 @@ def drawing() -> "figures.Figure":
         field.set_xlabel("gauge")
         image = figure.add_axes((0.1, 0.42, 0.3, 0.1))
         image.imshow([[1.0, 2.0], [3.0, 4.0]], aspect="auto")
+        image.set_yticks([])
     return figure
 
 
@@ -56,8 +57,8 @@ CELLS = {
     (3, 0.9, 0.25): ["gauge: 3", "5", "residual: 0.5"],
     (3, 0.1, 0.75): ["gauge: 1", "15", "residual: 1"],
     (3, 0.5, 0.75): None,
-    (4, 0.75, 0.75): ["1", "0", "residual: 2"],
-    (4, 0.25, 0.25): ["0", "1", "residual: 3"],
+    (4, 0.75, 0.75): ["1", "residual: 2"],
+    (4, 0.25, 0.25): ["0", "residual: 3"],
 }
 """What is said in maps: number of the panel, share of its width and height; None where there is no value."""
 
