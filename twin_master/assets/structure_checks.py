@@ -28,7 +28,10 @@ def frequencies_observed(scenario: Scenario) -> int:
 
 
 def check_observed(scenario: Scenario, design: "StructureDesign") -> None:
-    """Refuse observations that a structure does not have; raises `MissingObservationModelError`."""
+    """Refuse observations that a structure does not have; raises `MissingObservationModelError`.
+
+    Titles that are its sensors in another order raise `MissionInputError`: they would name the wrong ones.
+    """
     from fe.reduction.settings import ModalSettings
 
     known = {
@@ -61,6 +64,13 @@ def check_observed(scenario: Scenario, design: "StructureDesign") -> None:
         raise MissingObservationModelError(
             f"the structure {design.name} has {known[role]} sensors of `{role}`, and the scenario "
             f"expects {scenario.observation.count}."
+        )
+    sensors = {"strain": design.gauge, "displacement": design.displacement}.get(role, ())
+    names, titles = [part.name for part in sensors], [*scenario.observation.titles]
+    if titles != names and sorted(titles) == sorted(names):
+        raise MissionInputError(
+            f"`observation.titles` are {', '.join(titles)}, and the structure {design.name} has these "
+            f"sensors in the order {', '.join(names)}: give the titles in that order."
         )
 
 

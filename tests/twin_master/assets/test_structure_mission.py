@@ -159,6 +159,10 @@ def test_the_field_of_the_last_estimate_is_written(flown: Path) -> None:
         ({"calibration": {"source": "static_test"}}, "`static_test` is for wings"),
         ({"observation": {"role": "displacement"}}, "expects 4"),
         ({"observation": {"count": 3, "titles": ["a", "b", "c"]}}, "expects 3"),
+        (
+            {"observation": {"titles": ["arm", "heel", "tip", "back"]}},
+            "has these sensors in the order heel, arm, tip, back",
+        ),
         ({"asset": {"parameters": {"e": 1.0, "f": 2.0}}}, "parameter f"),
         ({"asset": {"parameters": {"e": 1.2}}}, r"parameter e is 1\.2, .* range 0\.9 to 1\.1; give"),
         ({"control": high("control", "values", {"load_factor": 30.0})}, "control smooth is 30, .* 0 to 4;"),
