@@ -109,7 +109,7 @@ def _state(record: RunRecord, factor: int) -> str:
     ends = np.clip(mean + np.array([-2.0, 2.0]) * deviation, *record.levels[factor][[0, -1]])
     form, true = (".1f", ".0f") if unit == "%" else (".3g", ".3g")
     low, high = (f"{scale * end:{form}}" for end in ends)
-    interval = f"{low} to {high}" if low != high else "sure to the digit shown"
+    interval = f"{low} to {high}" if low != high else "no other level is believed"
     if record.truth_state is not None:
         interval += f", truth {scale * record.truth_state[-1, factor]:{true}}"
     printed = f"{scale * mean:{form}} {unit}".rstrip()

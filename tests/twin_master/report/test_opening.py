@@ -103,4 +103,4 @@ def test_what_was_learnt_and_many_states(record: report_data.RunRecord) -> None:
         filtered=replace(record.filtered, mean=mean, standard_deviation=0.0 * deviation),
     )  # fmt: skip
     said = opening_sentences(six)[1]
-    assert f"d at {mean[-1, 0]:.3g} mm (sure to the digit shown) and 2 other states as the figures" in said
+    assert f"d at {mean[-1, 0]:.3g} mm (no other level is believed) and 2 other states as the figures" in said
