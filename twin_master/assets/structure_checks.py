@@ -65,8 +65,11 @@ def check_observed(scenario: Scenario, design: "StructureDesign") -> None:
             f"the structure {design.name} has {known[role]} sensors of `{role}`, and the scenario "
             f"expects {scenario.observation.count}."
         )
-    sensors = {"strain": design.gauge, "displacement": design.displacement}.get(role, ())
-    names, titles = [part.name for part in sensors], [*scenario.observation.titles]
+    names = {
+        "strain": [part.name for part in design.gauge],
+        "displacement": [part.name for part in design.displacement],
+    }.get(role, [])
+    titles = [*scenario.observation.titles]
     if titles != names and sorted(titles) == sorted(names):
         raise MissionInputError(
             f"`observation.titles` are {', '.join(titles)}, and the structure {design.name} has these "
