@@ -6,9 +6,11 @@ pointer in figures; the page is whole without it. All text is escaped.
 
 import html
 import re
+from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from hashlib import sha256
 from importlib import resources
 
 from reporting.errors import InvalidFigureError
@@ -172,7 +174,7 @@ class Page:
         subtitle = f'<p class="subtitle">{_text(self._subtitle)}</p>' if self._subtitle else ""
         footer = "".join(f"<p>{_text(line)}</p>" for line in self._footer)
         body = "\n".join(self._body) + ("</section>" if self._sections else "")
-        script = f"<script>\n{_own('hover.js')}</script>\n" if " data-axes=" in body else ""
+        script = f"<script>{_own('hover.js')}</script>\n" if " data-axes=" in body else ""
         return (
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -189,6 +191,12 @@ def _text(text: str) -> str:
 
 def _alignment(column: Column) -> str:
     return ' class="number"' if column.numeric else ""
+
+
+@cache
+def script_source() -> str:
+    """Return the source by which a Content-Security-Policy allows the script of pages."""
+    return f"'sha256-{b64encode(sha256(_own('hover.js').encode()).digest()).decode()}'"
 
 
 @cache

@@ -1,5 +1,7 @@
 """A page is self-contained, escaped, numbered and well-formed."""
 
+import base64
+import hashlib
 import re
 from html.parser import HTMLParser
 
@@ -7,7 +9,7 @@ import pytest
 
 from reporting import figures
 from reporting.errors import InvalidFigureError
-from reporting.page import Column, Page, Table
+from reporting.page import Column, Page, Table, script_source
 
 VOID = {"meta", "br", "link", "img"}
 
@@ -82,6 +84,12 @@ def test_page_asks_nothing_of_any_server() -> None:
             assert (attributes.get(name) or "#").startswith("#")
     assert "@import" not in text
     assert not re.search(r"url\((?!#)", text)
+
+
+def test_a_server_can_allow_the_script_and_no_other() -> None:
+    (script,) = re.findall(r"<script>(.*?)</script>", page().render(), re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert script_source() == f"'sha256-{digest}'"
 
 
 def test_ids_are_unique_and_links_lead_somewhere() -> None:

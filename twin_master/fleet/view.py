@@ -19,7 +19,7 @@ from tornado.web import Application, RequestHandler
 from reporting import figures as style
 from reporting.errors import ReportingError
 from reporting.json_file import read_json
-from reporting.page import Column, Page, Table
+from reporting.page import Column, Page, Table, script_source
 from reporting.words import counted
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
@@ -249,7 +249,7 @@ class _Answer(RequestHandler):
 
     def set_default_headers(self) -> None:
         for name, value in HEADERS.items():
-            self.set_header(name, value)
+            self.set_header(name, value.replace("script-src 'self'", f"script-src 'self' {script_source()}"))
 
     def get(self) -> None:
         self.set_header("Content-Type", f"{self._kind}; charset=utf-8")
