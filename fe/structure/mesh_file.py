@@ -4,6 +4,7 @@ import contextlib
 import io
 import warnings
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,17 @@ def _check_parts(mesh: StructureMesh) -> None:
         )
 
 
+def _bulk_data(path: Path) -> Any:
+    """Return a Nastran deck as meshio reads it, also one of bulk data alone, as Gmsh writes it."""
+    import meshio
+
+    text = path.read_text(encoding="utf-8", errors="replace")
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / "deck.bdf"
+        copy.write_text(text if "BEGIN BULK" in text.upper() else f"BEGIN BULK\n{text}", encoding="utf-8")
+        return meshio.read(copy)
+
+
 def _from_meshio(path: Path) -> FileMesh:
     import meshio
 
@@ -151,7 +163,7 @@ def _from_meshio(path: Path) -> FileMesh:
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
-            found = meshio.read(path)
+            found = _bulk_data(path) if path.suffix.lower() == ".bdf" else meshio.read(path)
     except meshio.ReadError as error:
         raise MeshError(
             f"The mesh file {path} cannot be read: {str(error).strip('. ') or 'its format is not known'}."

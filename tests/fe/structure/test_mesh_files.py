@@ -43,6 +43,18 @@ def test_formats_agree(
     assert len(mesh.boundary) == {4: 20, 6: 14, 8: 10}[len(mesh.kind.corners)]
 
 
+def test_a_nastran_deck_may_be_bulk_data_alone(box: Callable[..., Any], tmp_path: Path) -> None:
+    """As Gmsh writes it; the property of an element is its set."""
+    points, cells = box("tetra10", (1, 1, 1))
+    meshio.write(tmp_path / "whole.bdf", meshio.Mesh(points, [("tetra10", cells)]))
+    whole = (tmp_path / "whole.bdf").read_text()
+    assert "BEGIN BULK" in whole
+    (tmp_path / "bulk.bdf").write_text(whole.split("BEGIN BULK\n")[1])
+    found, bulk = (read_mesh(tmp_path / name, 1.0, "m") for name in ("whole.bdf", "bulk.bdf"))
+    np.testing.assert_array_equal(bulk.cells, found.cells)
+    np.testing.assert_array_equal(bulk.points, found.points)
+
+
 def test_physical_groups_of_gmsh_are_sets(box: Callable[..., Any], tmp_path: Path) -> None:
     points, cells = box("tetra10", (2, 1, 1))
     faces = [row for row in _faces(cells) if (points[list(row), 0] == 0.0).all()]
