@@ -187,7 +187,7 @@ class StructureMesh:
         if found is None:
             surface = self._named_faces(name)
             if surface is None:
-                known = _listed((*self.node_sets, *self.face_sets))
+                known = _listed(tuple(dict.fromkeys((*self.node_sets, *self.face_sets))))
                 raise MeshError(
                     f"{where}: {self.source} holds no set of nodes or faces named {name!r}; there are "
                     f"{known}."
