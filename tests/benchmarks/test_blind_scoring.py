@@ -88,6 +88,7 @@ def test_interval_of_a_share(hits: int, count: int) -> None:
     assert wilson(hits, count) == pytest.approx((wanted.low, wanted.high), abs=1e-6)
 
 
+@pytest.mark.long
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--out", str(tmp_path)]
     sizes = ["--count-per-effect", "0", "--nulls", "4", "--pairs", "0", "--outside", "0", "--traps", "0"]

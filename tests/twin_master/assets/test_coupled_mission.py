@@ -120,6 +120,7 @@ def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
 
 
+@pytest.mark.long
 def test_a_system_of_one_fmu_flies_as_the_fmu_alone(
     folder: Path, direct: dict[str, Path], tmp_path: Path
 ) -> None:
