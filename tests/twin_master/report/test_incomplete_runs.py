@@ -22,6 +22,17 @@ from twin_master.report.text import (
 )
 
 
+def without(tree: xr.DataTree, missing: str) -> xr.DataTree:
+    """A run without a group, or without a variable: GROUP/VARIABLE."""
+    part = xr.DataTree.from_dict({name: tree[name].to_dataset() for name in tree.children})
+    group, _, variable = missing.partition("/")
+    if variable:
+        part[group] = xr.DataTree(part[group].to_dataset().drop_vars(variable))
+    else:
+        del part[group]
+    return part
+
+
 @pytest.mark.parametrize(
     "missing",
     [
@@ -40,13 +51,9 @@ from twin_master.report.text import (
 )  # fmt: skip
 @pytest.mark.usefixtures("no_drawing")
 def test_a_missing_part_is_left_out(tmp_path: Path, tree: xr.DataTree, missing: str) -> None:
-    part = xr.DataTree.from_dict({name: tree[name].to_dataset() for name in tree.children})
-    group, _, variable = missing.partition("/")
-    if variable:
-        part[group] = xr.DataTree(part[group].to_dataset().drop_vars(variable))
-    else:
-        del part[group]
-    text = report.write_report(synthetic_run.write_run(tmp_path / "run", part)).read_text(encoding="utf-8")
+    text = report.write_report(synthetic_run.write_run(tmp_path / "run", without(tree, missing))).read_text(
+        encoding="utf-8"
+    )
     assert text.count("<figure") >= 4
     if missing == "truth":
         assert "truth" not in text.replace("the truth, which", "")
@@ -126,14 +133,8 @@ def test_a_folder_without_a_run_gives_one_sentence(tmp_path: Path) -> None:
 )
 @pytest.mark.usefixtures("no_drawing")
 def test_another_layout_gives_one_sentence(tmp_path: Path, tree: xr.DataTree, missing: str) -> None:
-    part = xr.DataTree.from_dict({name: tree[name].to_dataset() for name in tree.children})
-    group, _, variable = missing.partition("/")
-    if variable:
-        part[group] = xr.DataTree(part[group].to_dataset().drop_vars(variable))
-    else:
-        del part[group]
     with pytest.raises(RunFolderError, match="layout of a run"):
-        report.write_report(synthetic_run.write_run(tmp_path / "run", part))
+        report.write_report(synthetic_run.write_run(tmp_path / "run", without(tree, missing)))
 
 
 def test_other_axes_give_one_sentence(tmp_path: Path, tree: xr.DataTree) -> None:
