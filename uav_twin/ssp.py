@@ -91,6 +91,12 @@ def simulate(
     iterations: Annotated[
         int, typer.Option(help="How often a step of a circle of components is made at most.", min=1)
     ] = 1,
+    delay: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="END", help="Delay the connection to this end by a step: it breaks a loop there."
+        ),
+    ] = None,
     interpolation: InterpolationName = None,
     in_process: InProcess = False,
     replace: Replace = False,
@@ -109,7 +115,7 @@ def simulate(
     given = _single_numbers(values or [])
     with tempfile.TemporaryDirectory() as folder:
         system = read_ssp(file, folder)
-        wiring = join_ssp(system)
+        wiring = join_ssp(system, delay or ())
         span = (system.span[0], system.span[1] if stop_time is None else stop_time)
         planned = system_experiment(wiring, span=span, step_size=step_size, values=given)
         with CoupledAsset(
@@ -155,7 +161,9 @@ def check(
     for problem in result.problems:
         typer.secho(f"problem: {problem}", fg="red", err=True)
     for loop in () if json else result.loops:
-        terminal.say(f"warning: {loop}")
+        terminal.say(
+            f"warning: {loop} `uav-twin ssp simulate` does so by --delay, --iterations, --algorithm jacobi."
+        )
     if not result.passed:
         raise typer.Exit(1)
     order = ", ".join(f"{name} ({model})" for name, model in result.components)

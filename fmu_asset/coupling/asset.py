@@ -65,7 +65,7 @@ class CoupledAsset(SteppedAsset):
     CouplingError
         If the system cannot be joined.
     AlgebraicLoopError
-        If it has an algebraic loop and no iterations are allowed.
+        If it has an algebraic loop, and the algorithm is Gauss-Seidel without iterations.
     BindingError
         If the binding does not fit.
     FmuFileError, FmuUnsupportedError
@@ -95,7 +95,7 @@ class CoupledAsset(SteppedAsset):
         super().__init__(binding)
         self._jacobi, self._iterations, self._tolerance = algorithm == "jacobi", iterations, tolerance
         loops = self._wiring.schedule.loops
-        if loops and iterations == 1:
+        if loops and iterations == 1 and not self._jacobi:  # Jacobi delays every connection
             raise AlgebraicLoopError(loop_sentence(loops))
         self._roles: Roles = resolve_roles(self._wiring, binding)
         self._ranges = {

@@ -69,13 +69,7 @@ def system_experiment(
         (size for d in described for size in (d.fixed_step or d.step_size,) if size is not None), default=None
     )
     start, steps, size = steps_to(span[0] or 0.0, span[1], step_size or declared_step)
-    observed = {name: wiring.units[name] or "1" for name in wiring.outward}
-    shown = {port.end for port in wiring.outward.values()}
-    for component, item in wiring.declared.items():
-        for variable in item.variables.values():
-            own = Endpoint(component, variable.name) not in shown
-            if own and variable.causality == "output" and variable.kind != "String":
-                observed[f"{component}.{variable.name}"] = variable.unit or "1"
+    observed = every_output(wiring)
     if not observed:
         raise BindingError(f"The system {wiring.structure.name} gives no number that could be observed.")
     parameters, inputs = {}, {}
@@ -95,6 +89,18 @@ def system_experiment(
     return SystemExperiment(
         binding, steps, {name: given[name] for name in parameters}, {name: given[name] for name in inputs}
     )
+
+
+def every_output(wiring: Wiring) -> dict[str, str]:
+    """Return the units of all outputs of a system, and of those of its components that it does not show."""
+    observed = {name: wiring.units[name] or "1" for name in wiring.outward}
+    shown = {port.end for port in wiring.outward.values()}
+    for component, item in wiring.declared.items():
+        for variable in item.variables.values():
+            own = Endpoint(component, variable.name) not in shown
+            if own and variable.causality == "output" and variable.kind != "String":
+                observed[f"{component}.{variable.name}"] = variable.unit or "1"
+    return observed
 
 
 def _settable(wiring: Wiring, name: str) -> tuple[str, str]:

@@ -206,6 +206,6 @@ def loop_sentence(loops: Sequence[Sequence[Endpoint]]) -> str:
     return (
         "The connections close "
         f"{'an algebraic loop' if len(loops) == 1 else f'{len(loops)} algebraic loops'} ({shown}{more}): "
-        "every value in it depends on itself at the same moment; delay one of its connections, or allow "
-        "iterations."
+        "every value in it depends on itself at the same moment; delay one of its connections, allow "
+        "iterations, or take the algorithm jacobi, which delays all of them."
     )

@@ -1,7 +1,7 @@
 """A system of FMUs as data: components, connectors of the system, connections; no file is opened here."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -35,10 +35,14 @@ class Setting:
         The value.
     unit : str or None
         Its unit; that of the variable if None.
+    factor, offset : float
+        The variable is factor * value + offset, the value converted to its unit.
     """
 
     value: SettingValue
     unit: str | None = None
+    factor: float = 1.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class Connector:
 
 @dataclass(frozen=True)
 class Connection:
-    """What flows from one end to another: target = factor * source + offset, then converted in unit.
+    """What flows from one end to another: target = factor * source + offset.
 
     Attributes
     ----------
@@ -85,7 +89,7 @@ class Connection:
         An output of a component or an input of the system; an input of a component or an output of the
         system.
     factor, offset : float
-        The linear transformation, in the unit of the source.
+        The linear transformation, of the source converted to the unit of the target (SSP 1.0, section 4.4).
     convert_units : bool
         Whether the value is converted where the units of the ends differ.
     delayed : bool
@@ -138,6 +142,26 @@ class SystemStructure:
         raise CouplingError(
             f"The system {self.name} has no component {name!r}; it has "
             f"{listed(c.name for c in self.components)}."
+        )
+
+    def delayed(self, targets: Iterable[str]) -> "SystemStructure":
+        """Return the system with the connections to these ends delayed.
+
+        Raises
+        ------
+        CouplingError
+            If no connection ends there.
+        """
+        ends = {self.locate(target) for target in targets}
+        missing = ends - {connection.target for connection in self.connections}
+        if missing:
+            raise CouplingError(
+                f"No connection of the system {self.name} ends at {listed(sorted(missing))}, so none can be "
+                f"delayed there; connections end at {listed(c.target for c in self.connections)}."
+            )
+        return replace(
+            self,
+            connections=tuple(replace(c, delayed=c.delayed or c.target in ends) for c in self.connections),
         )
 
     def locate(self, text: str) -> Endpoint:

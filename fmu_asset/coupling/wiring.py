@@ -239,7 +239,7 @@ class Wiring:
                 f"{connection.source} is in {source!r} and {connection.target} in {target!r}, and there is "
                 "no conversion between the two; correct the connection, or suppress the conversion of units."
             )
-        return composed(own, unit)
+        return composed(unit, own)
 
     def _definitions(self, end: Endpoint) -> tuple[UnitInfo, ...]:
         return self.declared[end.component].description.units if end.component else self.structure.units
@@ -276,15 +276,6 @@ class Wiring:
                 f"{end} cannot be set to {value!r}: it is of the type {variable.kind}"
                 + (f" with the items {listed(items)}." if items else ", and a number is needed.")
             )
-        wrong = (
-            (isinstance(value, bool) and variable.kind != "Boolean")
-            or (not isinstance(value, bool) and variable.kind == "Boolean" and value not in (0, 1))
-            or (variable.kind in ("Integer", "Enumeration") and not float(value).is_integer())
-            or variable.kind == "String"
-            or not math.isfinite(value)
-        )
-        if wrong:
-            raise CouplingError(f"{end} cannot be set to {value!r}: it is of the type {variable.kind}.")
         units = (*self.structure.units, *self.declared[end.component].description.units)
         conversion = between(
             setting.unit, units, variable.unit, self.declared[end.component].description.units
@@ -294,7 +285,17 @@ class Wiring:
                 f"{end} is given in {setting.unit!r}, but it is in {variable.unit!r}, and there is no "
                 "conversion between the two."
             )
-        return conversion.to_fmu(float(value))
+        number = composed(conversion, Conversion(setting.factor, setting.offset)).to_fmu(float(value))
+        wrong = (
+            (isinstance(value, bool) and variable.kind != "Boolean")
+            or (not isinstance(value, bool) and variable.kind == "Boolean" and value not in (0, 1))
+            or (variable.kind in ("Integer", "Enumeration") and not number.is_integer())
+            or variable.kind == "String"
+            or not math.isfinite(number)
+        )
+        if wrong:
+            raise CouplingError(f"{end} cannot be set to {value!r}: it is of the type {variable.kind}.")
+        return number
 
 
 def composed(first: Conversion, second: Conversion) -> Conversion:

@@ -2,13 +2,14 @@
 
 import os
 import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from fmu_asset.archive.fmu_file import plain_folder
 from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.experiment import every_output
 from fmu_asset.coupling.schedule import loop_sentence
-from fmu_asset.coupling.structure import Endpoint
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import Binding, Header, Vector
 from fmu_asset.door.units import between
@@ -39,7 +40,7 @@ class SspCheck:
     connections, parameters : int
         How many there are.
     loops : tuple of str
-        Algebraic loops; a system with one is sound, but needs iterations.
+        Algebraic loops; a system with one is sound, but `ssp simulate` needs to be told how to break it.
     """
 
     path: Path
@@ -55,8 +56,14 @@ class SspCheck:
         return not self.problems
 
 
-def join_ssp(system: SspSystem) -> Wiring:
+def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
     """Join a system that was read, and check that its connectors are those of its FMUs.
+
+    Parameters
+    ----------
+    system : SspSystem
+    delayed : iterable of str
+        Ends whose connections are delayed by a step, whatever the file says.
 
     Raises
     ------
@@ -65,7 +72,7 @@ def join_ssp(system: SspSystem) -> Wiring:
     CouplingError, FmuFileError, FmuUnsupportedError
         If the system does not fit its FMUs.
     """
-    wiring = Wiring(system.structure)
+    wiring = Wiring(system.structure.delayed(delayed))
     definitions = system.structure.units
     for end, declared in system.declared.items():
         variable = wiring.variable(end)
@@ -125,21 +132,16 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
 
 def _trial(wiring: Wiring) -> list[str]:
     """Make one step with the start values, and read what can be read."""
-    if wiring.schedule.loops:
-        return []
-    names = [
-        f"{component}.{variable.name}"
-        for component, declared in wiring.declared.items()
-        for variable in declared.variables.values()
-        if variable.causality == "output" and variable.kind != "String"
-    ]
-    observation = {}
-    for name in names:
-        end: Endpoint = wiring.structure.locate(name)
-        observation[name] = Vector(variables=(name,), unit=wiring.variable(end).unit or "1")
-    binding = Binding(binding=Header(name="check", step_size=1.0), observation=observation)
-    try:
-        with CoupledAsset(wiring, binding) as asset:
+    binding = Binding(
+        binding=Header(name="check", step_size=1.0),
+        observation={
+            name: Vector(variables=(name,), unit=unit) for name, unit in every_output(wiring).items()
+        },
+    )
+    try:  # with an algebraic loop, too: whether it may be simulated is the user's choice
+        with CoupledAsset(
+            wiring, binding, algorithm="jacobi" if wiring.schedule.loops else "gauss_seidel"
+        ) as asset:
             asset.step()
     except FmuError as error:
         return [str(error)]

@@ -31,6 +31,8 @@ _NUMBERS_OF_2 = {
 }
 _LEFT_OUT_OF_2 = ("MetaData", "Signature")
 
+_HOLD_COMMON = ("Units", "Enumerations", "Annotations", "MappingEntry")
+"""Elements of parameter sets and mappings below which the common namespace begins."""
 _SCHEMAS = {
     "ssd": "SystemStructureDescription.xsd",
     "ssv": "SystemStructureParameterValues.xsd",
@@ -99,6 +101,8 @@ class SspPackage:
             What it must be.
         """
         root = parse_xml(self.read(name), f"{name} in {self.path}")
+        if not root.tag.startswith("{"):
+            _put_into_namespace(root, kind)
         if str(root.get("version", "")).startswith("2."):
             in_words_of_1(root, f"{name} in {self.path}")
         validate(root, kind, f"{name} in {self.path}")
@@ -158,6 +162,14 @@ def in_words_of_1(root: Any, where: str) -> None:
                 f"{where} is of SSP 2.0 and has {missing} (line {element.sourceline}), which is not "
                 "supported; leave it out, or use what SSP 1.0 has."
             )
+
+
+def _put_into_namespace(element: Any, kind: str) -> None:
+    """Give the namespaces of SSP 1.0 to a document that some tools write without any."""
+    inner = "ssc" if element.tag in _HOLD_COMMON else kind
+    element.tag = tag(kind, element.tag)
+    for child in element.iterchildren(etree.Element):
+        _put_into_namespace(child, inner)
 
 
 def validate(root: Any, kind: str, where: str) -> None:

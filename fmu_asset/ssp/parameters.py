@@ -1,7 +1,7 @@
 """Parameter sets (SSV) and mappings (SSM): read into plain values by target name."""
 
-from dataclasses import dataclass
-from math import isfinite
+from dataclasses import dataclass, replace
+from math import isclose, isfinite
 from typing import Any, NamedTuple
 
 from fmu_asset.archive.fmu_file import UnitInfo
@@ -52,6 +52,13 @@ def read_units(element: Any) -> tuple[UnitInfo, ...]:
     return tuple(found)
 
 
+def alike(one: UnitInfo, other: UnitInfo) -> bool:
+    """Return whether two definitions of a unit say the same, to the digits in which they are written."""
+    return one.exponents == other.exponents and all(
+        isclose(a, b, rel_tol=1e-9) for a, b in ((one.factor, other.factor), (one.offset, other.offset))
+    )
+
+
 def read_bindings(element: Any, package: SspPackage, where: str) -> list[ParameterBinding]:
     """Return the parameter bindings of a component or system.
 
@@ -82,7 +89,7 @@ def _read_binding(element: Any, package: SspPackage, where: str) -> ParameterBin
             raise SspError(f"{what} in {package.path} gives {name!r} twice; keep one of the two.")
         values[name] = _value(parameter, f"{what} in {package.path}")
     mapping = element.find(tag("ssd", "ParameterMapping"))
-    if mapping is not None:
+    if mapping is not None and (mapping.get("source") or len(mapping)):  # an empty one maps nothing
         if mapping.get("type", _MAPPING_TYPE) != _MAPPING_TYPE:
             raise SspError(f"{what} in {package.path} has a mapping of the type {mapping.get('type')!r}.")
         entries = _content(mapping, None, "ssm", "ParameterMapping", package, f"the mapping of {what}")
@@ -192,8 +199,8 @@ def _mapped(values: dict[str, Setting], entries: list[_Entry], where: str) -> di
         if (entry.factor, entry.offset) != (1.0, 0.0):
             if isinstance(setting.value, bool | str):
                 raise SspError(f"{where} scales {entry.source!r}, which is no number.")
-            setting = Setting(entry.factor * setting.value + entry.offset, setting.unit)
+            setting = replace(setting, factor=entry.factor, offset=entry.offset)
         if not entry.convert_units:
-            setting = Setting(setting.value, None)
+            setting = replace(setting, unit=None)
         found[entry.target] = setting
     return found

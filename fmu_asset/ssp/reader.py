@@ -6,7 +6,6 @@ Of SSP 2.0 the same is read; see `package.in_words_of_1`.
 """
 
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from reporting.files import atomic_write_bytes
 
 from .flatten import flat_connections, flat_settings
 from .package import NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
-from .parameters import flag, read_bindings, read_transformation, read_units
+from .parameters import alike, flag, read_bindings, read_transformation, read_units
 from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree
 
 _INTERFACES: dict[str, Interface | None] = {
@@ -206,7 +205,8 @@ def _annotation(element: Any) -> Any:
 
 
 def _connection(tree: Tree, element: Any, path: ElementPath, children: set[str]) -> None:
-    ends = []
+    ends: list[Node] = []
+    gives: list[bool] = []
     for side in ("start", "end"):
         owner = element.get(f"{side}Element")
         connector = str(element.get(f"{side}Connector"))
@@ -216,15 +216,16 @@ def _connection(tree: Tree, element: Any, path: ElementPath, children: set[str])
         declared = tree.connectors.get(node)
         if declared is None:
             raise tree.error(f"a connection names the connector {str(node)!r}, which is not declared.")
-        # Seen from inside, an input of the system is where values come from.
-        gives = (declared.kind in INWARD) == (not owner)
-        if gives != (side == "start"):
-            raise tree.error(
-                f"a connection {'begins' if side == 'start' else 'ends'} at {str(node)!r}, which is of the "
-                f"kind {declared.kind}; connections go from outputs to inputs."
-            )
         ends.append(node)
-    source, target = ends
+        # Seen from inside, an input of the system is where values come from.
+        gives.append((declared.kind in INWARD) == (not owner))
+    if gives[0] == gives[1]:
+        raise tree.error(
+            f"a connection joins {str(ends[0])!r} and {str(ends[1])!r}, which both "
+            f"{'give' if gives[0] else 'take'} a value; connect what gives one to what takes one."
+        )
+    # The kinds of the connectors say which way a value goes; "start" and "end" do not (SSP 1.0, section 5.3).
+    source, target = ends if gives[0] else reversed(ends)
     if target in tree.edges:
         raise tree.error(
             f"{str(target)!r} has two sources, {str(tree.edges[target].source)!r} and {str(source)!r}; keep "
@@ -242,8 +243,7 @@ def _bind(tree: Tree, element: Any, path: ElementPath) -> None:
     own: dict[Node, Setting] = {}
     for values, units in read_bindings(element, tree.package, where):
         for unit in units:
-            known = tree.units.setdefault(unit.name, unit)
-            if known != unit:
+            if not alike(unit, tree.units.setdefault(unit.name, unit)):
                 raise tree.error(f"the unit {unit.name!r} is defined in two ways.")
         for name, setting in values.items():
             for node in _nodes_of(tree, name, path, where):
@@ -286,12 +286,9 @@ def _names(tree: Tree) -> dict[ElementPath, str]:
 
 
 def _extract(tree: Tree, folder: Path) -> dict[str, Path]:
-    """Write each FMU once, under a plain name; return the files by their names in the archive."""
-    files: dict[str, Path] = {}
-    for source, *_ in tree.components.values():
-        if source not in files:
-            stem = re.sub(r"[^A-Za-z0-9_\-]", "_", Path(source).stem)
-            target = folder / f"{len(files) + 1}-{stem}.fmu"
-            atomic_write_bytes(target, tree.package.read(source))
-            files[source] = target
+    """Write each FMU once, under its name in the archive; return the files by these names."""
+    files = {source: folder / source for source, *_ in tree.components.values()}
+    for source, target in files.items():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write_bytes(target, tree.package.read(source))
     return files

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -161,12 +162,25 @@ def loop_of(linear_fmu: Path, gain: float):  # type: ignore[no-untyped-def]
 
 
 def test_an_algebraic_loop_is_reported(linear_fmu: Path) -> None:
-    for algorithm in ("gauss_seidel", "jacobi"):
-        with pytest.raises(AlgebraicLoopError) as caught:
-            CoupledAsset(loop_of(linear_fmu, 0.5), watch("left.y1"), algorithm=algorithm)
-        sentence = str(caught.value)
-        assert "left.y1 -> right.u1 -> right.y1 -> left.u1" in sentence
-        assert "delay one of its connections, or allow iterations" in sentence
+    with pytest.raises(AlgebraicLoopError) as caught:
+        CoupledAsset(loop_of(linear_fmu, 0.5), watch("left.y1"))
+    sentence = str(caught.value)
+    assert "left.y1 -> right.u1 -> right.y1 -> left.u1" in sentence
+    assert "delay one of its connections, allow iterations, or take the algorithm jacobi" in sentence
+
+
+def test_a_loop_is_broken_by_a_delay_and_by_jacobi(linear_fmu: Path) -> None:
+    """y = 0.5 u + 1, u of the last step; u = 2 - 0.3 y, y of this step, but of the last one by Jacobi."""
+    loop = loop_of(linear_fmu, 0.5)
+    for structure, algorithm, lag in ((loop.delayed(["left.u1"]), "gauss_seidel", 0), (loop, "jacobi", 1)):
+        with CoupledAsset(
+            structure, watch("left.y1", "right.y1"), algorithm=algorithm, isolated=False
+        ) as asset:
+            seen = [asset.observe().values, *(asset.step().values for _ in range(5))]
+        for (before_y, before_u), (y, u) in itertools.pairwise(seen):
+            np.testing.assert_allclose([y, u], [1.0 + 0.5 * before_u, 2.0 - 0.3 * (before_y if lag else y)])
+    with pytest.raises(CouplingError, match=r"ends at left\.u2.*connections end at right\.u1, left\.u1"):
+        loop.delayed(["left.u2"])
 
 
 @pytest.mark.parametrize("algorithm", ["gauss_seidel", "jacobi"])

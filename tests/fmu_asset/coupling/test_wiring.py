@@ -149,9 +149,9 @@ def test_units_of_connections_are_converted(base: SystemStructure) -> None:
     assert wiring.feeds[0].conversion == (1.0, 0.0)
     assert wiring.outward["seen"].conversion == (2.0, 0.5)
     assert wiring.units["seen"] == "m"
-    # The transformation is made in the unit of the source, the conversion after it.
+    # The value is converted first, and transformed in the unit of the target.
     scaled = Wiring(replace(base, connections=(link("damage.z1", "percent", factor=0.5, offset=0.1),)))
-    assert scaled.outward["percent"].conversion == (50.0, 10.0)
+    assert scaled.outward["percent"].conversion == (50.0, 0.1)
     plain = Wiring(replace(base, connections=(link("damage.z1", "percent", convert_units=False),)))
     assert plain.outward["percent"].conversion == (1.0, 0.0)
 

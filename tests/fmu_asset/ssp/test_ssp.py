@@ -389,7 +389,7 @@ def theirs(fmus: dict[str, Path], tmp_path: Path) -> Pack:
 def test_nested_systems_parameters_and_mappings(theirs: Pack, tmp_path: Path) -> None:
     wiring = join_ssp(read_ssp(theirs(), tmp_path / "fmus"))
     assert [c.name for c in wiring.structure.components] == ["structure.wing", "damage"]
-    # The outer system's set goes before the component's; a value is scaled, then converted in unit.
+    # The outer system's set goes before the component's; a value is converted in unit, then scaled.
     assert wiring.settings["structure.wing"] == {
         "young_modulus_factor": pytest.approx(0.96), "mass.servo": 0.2,
     }  # fmt: skip
@@ -425,6 +425,46 @@ def test_nested_systems_parameters_and_mappings(theirs: Pack, tmp_path: Path) ->
     assert [name for name, _ in check.components] == ["damage", "structure.wing"]
 
 
+def test_start_and_end_of_a_connection_are_not_its_direction(theirs: Pack, tmp_path: Path) -> None:
+    """SSP 1.0, section 5.3: the kinds of the connectors say where a value goes."""
+    turned = re.sub(
+        r"(start|end)(?=Element=|Connector=)", lambda m: {"start": "end", "end": "start"}[m[1]], NESTED
+    )
+    assert turned != NESTED
+    structures = [
+        join_ssp(read_ssp(theirs(ssd=ssd), tmp_path / str(n))).structure
+        for n, ssd in enumerate((NESTED, turned))
+    ]
+    assert structures[0].connections == structures[1].connections
+
+
+@pytest.mark.parametrize(
+    ("files", "ssd"),
+    [
+        ({"resources/top.ssv": re.sub(r"ssv:|ssc:|xmlns:\w+=\"[^\"]+\"", "", SET)}, NESTED),
+        ({"resources/top.ssm": re.sub(r"ssm:|ssc:|xmlns:\w+=\"[^\"]+\"", "", MAPPING)}, NESTED),
+        ({"resources/top.ssv": SET.replace('factor="0.01"', 'factor="0.010000000000001"')}, NESTED),
+        ({}, NESTED.replace("</ssd:ParameterValues>", "</ssd:ParameterValues><ssd:ParameterMapping/>")),
+    ],
+    ids=["a set without namespace", "a mapping without namespace", "a unit twice alike", "an empty mapping"],
+)
+def test_what_other_tools_write_is_read(
+    theirs: Pack, tmp_path: Path, files: dict[str, str | bytes], ssd: str
+) -> None:
+    read = join_ssp(read_ssp(theirs(files=files, ssd=ssd), tmp_path / "theirs"))
+    assert read.settings == join_ssp(read_ssp(theirs(), tmp_path / "plain")).settings
+
+
+def test_a_mapped_value_is_converted_before_it_is_transformed(theirs: Pack, tmp_path: Path) -> None:
+    """SSP 1.0, GTransformationChoice: target = factor * source + offset, the source in the target's unit."""
+    mapping = MAPPING.replace(
+        'target="damage.initial.z1"/>',
+        'target="damage.initial.z1"><ssc:LinearTransformation factor="0.5" offset="0.1"/></ssm:MappingEntry>',
+    )
+    wiring = join_ssp(read_ssp(theirs(files={"resources/top.ssm": mapping}), tmp_path / "fmus"))
+    assert wiring.settings["damage"]["initial.z1"] == pytest.approx(0.5 * 0.4 + 0.1)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -434,7 +474,7 @@ def test_nested_systems_parameters_and_mappings(theirs: Pack, tmp_path: Path) ->
          r"names the connector 'structure\.wing\.health\.z2', which is not declared"),
         (('startElement="damage" startConnector="z1" endConnector="loss"',
           'startElement="damage" startConnector="load_factor" endConnector="loss"'),
-         r"begins at 'damage\.load_factor', which is of the kind input"),
+         r"joins 'damage\.load_factor' and 'loss', which both take a value"),
         (('startElement="structure" startConnector="tip" endConnector="tip"',
           'startElement="structure" startConnector="tip" endConnector="loss"'),
          "'loss' has two sources, 'damage.z1' and 'structure.tip'"),
@@ -553,7 +593,7 @@ def test_archives_that_are_unsafe_or_damaged(theirs: Pack, tmp_path: Path) -> No
 
 def test_an_fmu_that_is_none_is_refused(theirs: Pack) -> None:
     (sentence,) = check_ssp(theirs(files={"resources/wing.fmu": b"no FMU"})).problems
-    assert "not a sound FMU archive" in sentence
+    assert "resources/wing.fmu is not a sound FMU archive" in sentence
 
 
 def test_an_algebraic_loop_is_reported(theirs: Pack) -> None:
