@@ -181,13 +181,16 @@ def info(
     json: terminal.Json = False,
 ) -> None:
     """Say what an FMU is: version, capabilities, variables with units and ranges."""
-    from fmu_asset.archive.fmu_file import describe_fmu, read_fmu
+    from fmu_asset.archive.fmu_file import describe_fmu, inspect_fmu
     from uav_twin.console_table import console_table
 
-    record = describe_fmu(read_fmu(file))
+    description, obstacle = inspect_fmu(file)
+    record = describe_fmu(description)
     if json:
-        terminal.print_json({"file": str(file)} | record)
+        terminal.print_json({"file": str(file)} | record | {"obstacle": obstacle})
         return
+    if obstacle:
+        terminal.say(f"It cannot be flown here: {obstacle}")
     console = terminal.console()
     console.print(str(file), soft_wrap=True)
     facts = [

@@ -27,6 +27,7 @@ __all__ = [
     "VariableInfo",
     "describe_fmu",
     "extract_fmu",
+    "inspect_fmu",
     "plain_folder",
     "read_fmu",
 ]
@@ -46,6 +47,24 @@ _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -> FmuDescription:
     """Check an FMU file and return what it declares, without extracting it.
 
+    Parameters and errors are those of `inspect_fmu`.
+
+    Raises
+    ------
+    FmuUnsupportedError
+        Also if it has no binary for this platform.
+    """
+    description, obstacle = inspect_fmu(path, interface)
+    if obstacle:
+        raise FmuUnsupportedError(obstacle)
+    return description
+
+
+def inspect_fmu(
+    path: str | os.PathLike[str], interface: Interface | None = None
+) -> tuple[FmuDescription, str]:
+    """Check an FMU file of any platform; return what it declares, and why it cannot be flown here.
+
     Parameters
     ----------
     path : path-like
@@ -53,13 +72,18 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
     interface : {"co-simulation", "model-exchange"}, optional
         How it is to be run; co-simulation where it offers that.
 
+    Returns
+    -------
+    tuple of FmuDescription and str
+        The sentence is empty where there is a binary for this platform.
+
     Raises
     ------
     FmuFileError
         If the file is missing, no archive, damaged, unsafe, or its model description cannot be read.
     FmuUnsupportedError
-        If it is not of FMI 1, 2 or 3, offers neither co-simulation nor model exchange (or not the one that is
-        asked for), or has no binary for this platform.
+        If it is not of FMI 1, 2 or 3, or offers neither co-simulation nor model exchange (or not the one that
+        is asked for).
     """
     file = Path(path)
     size, sha256 = _size_and_hash(file)
@@ -92,13 +116,13 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
         )
     here = platform_tuple if description.major_version == 3 else fmi_platform
     binary = f"binaries/{here}/{description.model_identifier}{sharedLibraryExtension}"
-    if binary not in names:
-        there = ", ".join(platforms) or "none"
-        raise FmuUnsupportedError(
-            f"{file} has no binary for this platform ({binary} is not in it; binaries there: {there}); "
-            f"export it for {here}."
-        )
-    return description
+    if binary in names:
+        return description, ""
+    there = ", ".join(platforms) or "none"
+    return description, (
+        f"{file} has no binary for this platform ({binary} is not in it; binaries there: {there}); "
+        f"export it for {here}."
+    )
 
 
 def _offered(file: Path, declared: Any, wanted: Interface | None) -> Interface:

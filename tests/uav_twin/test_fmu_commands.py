@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -85,3 +86,21 @@ def test_names_of_an_fmu_are_whole_in_a_pipe_and_on_a_narrow_terminal(foreign_fm
             assert name in "".join(line.split(" ", 2)[1] for line in shown.splitlines() if " " in line)
         if columns:
             assert max(map(len, shown.splitlines()[1:])) <= 80
+
+
+def test_an_fmu_for_another_platform_is_described_and_said_not_to_fly(
+    foreign_fmu: Any, tmp_path: Path
+) -> None:
+    here, elsewhere = foreign_fmu("ball2"), tmp_path / "elsewhere.fmu"
+    with zipfile.ZipFile(here) as old, zipfile.ZipFile(elsewhere, "w") as new:
+        for name in old.namelist():
+            new.writestr(name.replace("linux64", "win64").replace(".so", ".dll"), old.read(name))
+    record, other = (json.loads(call("info", fmu, "--json").stdout) for fmu in (here, elsewhere))
+    assert record["obstacle"] == ""
+    assert "no binary for this platform" in other["obstacle"]
+    assert "win64" in other["obstacle"]
+    assert other["variables"] == record["variables"]
+    shown = call("info", elsewhere)
+    assert shown.returncode == 0
+    assert "It cannot be flown here: " in shown.stdout
+    assert call("simulate", elsewhere, "--stop-time", "1").returncode == 1
