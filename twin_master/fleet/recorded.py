@@ -9,7 +9,8 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT, Flights
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import Fed, file_feed
-from twin_master.watch.intake import Intake, RejectedFile
+from twin_master.watch.growing import Place
+from twin_master.watch.intake import Intake, LiveFeed, RejectedFile
 
 __all__ = ["assimilated", "read_recording"]
 
@@ -22,22 +23,17 @@ def read_recording(path: Path, scenario: Scenario) -> tuple[Fed, ...]:
     MissionInputError
         It cannot be read, or is of another asset.
     """
-    return tuple(file_feed(path, scenario).messages(0))
+    return tuple(file_feed(path, scenario).messages(None))
 
 
-class _Recorded:
+class _Recorded(LiveFeed):
     """Messages as a feed."""
-
-    replayable = True
 
     def __init__(self, messages: Sequence[Fed]) -> None:
         self._messages = messages
 
-    def beginning(self, count: int) -> str:
-        return ""
-
-    def messages(self, after: int) -> Iterator[Fed]:
-        return iter(self._messages[after:])
+    def messages(self, place: Place | None) -> Iterator[Fed]:
+        return iter(self._messages)
 
 
 def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Flights:

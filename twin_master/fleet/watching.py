@@ -28,7 +28,8 @@ from twin_master.scenario.schema import Scenario
 from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import Fed, file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.intake import Feed
+from twin_master.watch.growing import Place
+from twin_master.watch.intake import Feed, LiveFeed
 from twin_master.watch.keeping import Keeper
 from twin_master.watch.message import MessageReader
 from twin_master.watch.mqtt import Session, broker_of, is_broker, placed
@@ -382,19 +383,14 @@ class _Files:
             return False
 
 
-class _Inbox:
+class _Inbox(LiveFeed):
     """What a broker sent of one asset."""
-
-    replayable = False
 
     def __init__(self, scenario: Scenario) -> None:
         self._reader = MessageReader(scenario)
         self.came: deque[bytes] = deque()
 
-    def beginning(self, count: int) -> str:
-        return ""
-
-    def messages(self, after: int) -> Iterator[Fed]:
+    def messages(self, place: Place | None) -> Iterator[Fed]:
         while True:
             yield placed(self._reader, self.came.popleft()) if self.came else (None, "")
 

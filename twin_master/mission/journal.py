@@ -83,7 +83,8 @@ class JournalFile:
         self._flush_seconds = flush_seconds
         self._flushed = time.monotonic()
         header = line_of({"config_hash": config_hash})
-        size = max((end for _, end in read_lines(path, config_hash)), default=0)
+        next(read_lines(path, config_hash), None)
+        size = next((end for _, _, end in records_backwards(path)), 0)
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
         self._size = size
         os.truncate(self._descriptor, size)
@@ -216,41 +217,49 @@ def read_records(path: Path, config_hash: str | None = None) -> Iterator[tuple[d
             yield record_of(path, number, text), end
 
 
-def whole_records(path: Path) -> Iterator[tuple[int, dict[str, Any] | None]]:
-    """Return number, from 1, and record of each line of a journal, None in the place of a damaged one.
-
-    Every line has a hash of its own, so that one that was damaged says nothing about those behind it. The
-    last line is left out where it was cut off by a kill.
-    """
-    with path.open("rb") as file:
-        for number, line in enumerate(file, start=1):
-            if not line.endswith(b"\n"):
-                return
-            record = json.loads(line[_DIGEST + 1 :]) if _is_whole(line) else None
-            yield number, record if isinstance(record, dict) else None
+def whole_record(line: bytes) -> dict[str, Any] | None:
+    """Return the record of a line, None of a damaged one: each has a hash of its own."""
+    record = json.loads(line[_DIGEST + 1 :]) if _is_whole(line) else None
+    return record if isinstance(record, dict) else None
 
 
-def records_backwards(path: Path) -> Iterator[dict[str, Any]]:
-    """Return the records of the whole lines of a journal, the last one first; none where there is no journal.
+def records_backwards(path: Path, end: int | None = None) -> Iterator[tuple[dict[str, Any], int, int]]:
+    """Return the record of each line with where it begins and ends in bytes, the last one first.
 
-    It is read no further than it is asked.
+    The header is the last of them. A journal that does not exist has no lines. It is read, and checked, no
+    further than it is asked.
+
+    Parameters
+    ----------
+    path : Path
+    end : int, optional
+        Of a line, in bytes: those behind it are left out.
+
+    Raises
+    ------
+    NotResumableError
+        A line was changed or is damaged.
     """
     if not path.exists():
         return
     with path.open("rb") as file:
-        begin, rest = file.seek(0, os.SEEK_END), b""
+        size = file.seek(0, os.SEEK_END)
+        begin = after = size if end is None else end
+        rest = b""
         while begin:
-            size = min(begin, _PIECE)
-            begin -= size
+            piece = min(begin, _PIECE)
+            begin -= piece
             file.seek(begin)
-            first, *lines = (file.read(size) + rest).splitlines(keepends=True)
-            if begin:
-                rest = first
-            else:
-                lines.insert(0, first)
+            first, *lines = (file.read(piece) + rest).splitlines(keepends=True)
+            rest, lines = (first, lines) if begin else (b"", [first, *lines])
             for line in reversed(lines):
-                if line.endswith(b"\n") and _is_whole(line):
-                    yield json.loads(line[_DIGEST + 1 :])
+                after -= len(line)
+                record = whole_record(line) if line.endswith(b"\n") else None
+                if record is not None:
+                    yield record, after, after + len(line)
+                elif line.endswith(b"\n") or after + len(line) < size:  # else cut off by a kill
+                    for number, (text, _) in enumerate(read_lines(path, None)):  # which says where
+                        record_of(path, number, text)
 
 
 def records_behind(path: Path, end: int) -> Iterator[dict[str, Any]]:

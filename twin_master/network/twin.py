@@ -4,7 +4,7 @@ It holds no asset and no truth.
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -323,8 +323,19 @@ class Twin:
 
     def save_state(self) -> bytes:
         """Return all that the twin has seen and keeps, for `restore_state`."""
-        arrays: dict[str, NDArray[Any]] = {"turns": np.array([self._turns, self._proposed])}
-        for place, seen in enumerate(self._seen):
+        return self._packed(self._turns, self._seen)
+
+    def settled(self) -> tuple[int, bytes] | None:
+        """Return the last turn that cannot be revised any more, and the state behind it, for `restore_state`.
+
+        All later turns follow from it; None before there is such a turn.
+        """
+        turn = self.first_kept - 1
+        return None if turn < 0 else (turn, self._packed(turn + 1, [self._seen[0]]))
+
+    def _packed(self, turns: int, kept: Iterable[_Seen]) -> bytes:
+        arrays: dict[str, NDArray[Any]] = {"turns": np.array([turns, self._proposed])}
+        for place, seen in enumerate(kept):
             arrays[f"{place}/observation"] = seen.observation
             arrays[f"{place}/control"] = np.array(seen.estimate.control_index)
             arrays |= {f"{place}/carried/{name}": value for name, value in seen.estimate.arrays.items()}

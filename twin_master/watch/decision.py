@@ -44,7 +44,7 @@ def last_decision(path: Path, scenario: Scenario, model: GraphicalModel) -> dict
     A kill may have left it untold, and nobody knows: it has `told_again`.
     """
     last: dict[str, Any] | None = None
-    for line in records_backwards(path):
+    for line, *_ in records_backwards(path):
         if last is None and "filtered" in line:
             last = line
         if last is None or line.get("observation_turn") != last["turn"] or "observed" not in line:

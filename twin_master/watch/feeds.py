@@ -1,13 +1,14 @@
 """Messages from files, recorded or growing, from standard input, and from a program."""
 
 import csv
+import io
 import json
 import math
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from hashlib import sha256
-from itertools import islice
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,9 +18,10 @@ import xarray as xr
 from reporting.errors import DamagedFileError
 from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_records
+from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.intake import MISSING
+from twin_master.watch.growing import GrowingFile, Place, found, rotated
+from twin_master.watch.intake import MISSING, LiveFeed
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
 Fed = tuple[Message | Refused | None, str]
@@ -28,9 +30,26 @@ Fed = tuple[Message | Refused | None, str]
 _LOST = ("", "nan", "null", "none")
 _TURN_COLUMNS = ("turn", "step")
 _OTHERS = ("turn", "time", "control")
+_PIECE = 65_536
+_FIRST = 8
+"""First steps by which a file of steps is known again."""
+_CUT = "{} was cut at byte {}, and no copy is beside it: what stood behind that and was not read yet is lost"
 
 
-class CsvFeed:
+class _FileFeed:
+    """Lines of a file."""
+
+    replayable = True
+    place: Place | None = None
+    _path: Path
+    _follow = False
+
+    def holds(self, place: Place) -> bool:
+        """Return whether a place is in the file; where it is followed, also under its name of today."""
+        return found(self._path, place, follow=self._follow) is not None
+
+
+class CsvFeed(_FileFeed):
     """A CSV file with a header: `turn` (or `step`) or `time`, `control`, and sensors by their names.
 
     Parameters
@@ -39,7 +58,8 @@ class CsvFeed:
     scenario : Scenario
         What its columns may be called.
     follow : bool
-        Its end is not the last: more may come.
+        Its end is not the last: more may come, also in a file that takes its place. That one has a header of
+        its own, or the same columns.
 
     Raises
     ------
@@ -47,17 +67,28 @@ class CsvFeed:
         It cannot be read, or a column is neither of these.
     """
 
-    replayable = True
-
     def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
         self._path = path
         self._follow = follow
         self._reader = MessageReader(scenario)
-        try:
-            with path.open("rb") as file:
-                names = _cells(file.readline(LARGEST_MESSAGE))
-        except (OSError, ValueError) as error:
-            raise MissionInputError(f"{path} cannot be read as CSV: {error}.") from None
+        # A file that was begun a moment ago may have no header yet.
+        self._read_header(path, *(reversed(rotated(path)) if follow else ()))
+
+    def _read_header(self, *files: Path) -> None:
+        """Take the columns of the first of these files that has a header; the error is that of the first."""
+        errors = []
+        for path in files:
+            try:
+                with path.open("rb") as file:
+                    return self._take_columns(_cells(file.readline(LARGEST_MESSAGE)))
+            except (OSError, ValueError) as error:
+                errors.append(MissionInputError(f"{path} cannot be read as CSV: {error}."))
+            except MissionInputError as error:
+                errors.append(error)
+        raise errors[0] from None
+
+    def _take_columns(self, names: list[str]) -> None:
+        path = self._path
         if not any(names):
             raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
         if names[0].startswith("{"):
@@ -65,38 +96,44 @@ class CsvFeed:
                 f"{path} holds JSON lines, and a file of observations is CSV or NetCDF: hand them over by "
                 f"standard input, `--observations - < {path}`."
             )
-        self._names = ["turn" if name in _TURN_COLUMNS else name for name in names]
-        sensors = [place for place, name in enumerate(self._names) if name not in _OTHERS and name[:1] != "_"]
+        called = ["turn" if name in _TURN_COLUMNS else name for name in names]
+        sensors = [place for place, name in enumerate(called) if name not in _OTHERS and name[:1] != "_"]
         try:
-            columns = [self._reader.column(self._names[place]) for place in sensors]
+            columns = [self._reader.column(called[place]) for place in sensors]
         except Refused as refusal:
             raise MissionInputError(
                 f"{path}: the column {refusal}; others are `turn`, `time` and `control`."
             ) from None
-        self._sensors = sensors
-        self._index = np.array([sensor for sensor, _ in columns], dtype=np.int64)
-        self._factor = np.array([factor for _, factor in columns], dtype=np.float64)
-        twice = len({*self._index.tolist()}) < len(columns) or any(
-            self._names.count(name) > 1 for name in _OTHERS
-        )
-        if twice:
+        index = [sensor for sensor, _ in columns]
+        if len({*index}) < len(columns) or any(called.count(name) > 1 for name in _OTHERS):
             raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
+        self._names, self._sensors = called, sensors
+        self._index = np.array(index, dtype=np.int64)
+        self._factor = np.array([factor for _, factor in columns], dtype=np.float64)
 
-    def beginning(self, count: int) -> str:
-        """Return the hash of the header and the first `count` rows."""
-        return _hash_of_lines(self._path, 1 + count)
-
-    def messages(self, after: int) -> Iterator[Fed]:
-        """Return the rows behind the first `after` of them."""
-        with self._path.open("rb") as file:
-            number = 0
+    def messages(self, place: Place | None) -> Iterator[Fed]:
+        """Return the rows behind a place."""
+        with suppress(MissionInputError):
+            self._read_header(found(self._path, place, follow=self._follow) or self._path)
+        stream, before = GrowingFile(self._path, place, follow=self._follow), 0
+        with io.BufferedReader(stream, _PIECE) as file:
             for line in _lines(file, follow=self._follow):
                 if line is None:
                     yield None, ""
                     continue
-                if number > after:
+                if stream.cut:
+                    yield Refused(_CUT.format(self._path.name, stream.cut)), ""
+                    stream.cut = 0
+                first, before = stream.begins(before), file.tell()
+                self.place = stream.place(before)
+                if not (first and self._is_header(line)):
                     yield self._message(line), shown(line)
-                number += 1
+
+    def _is_header(self, line: bytes | Refused) -> bool:
+        with suppress(MissionInputError, ValueError):
+            self._take_columns(_cells(line) if isinstance(line, bytes) else [])
+            return True
+        return False
 
     def _message(self, line: bytes | Refused) -> Message | Refused:
         if isinstance(line, Refused):
@@ -147,6 +184,7 @@ class RunFeed:
     """
 
     replayable = True
+    place: Place | None = None
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
         role = scenario.observation.role
@@ -171,18 +209,23 @@ class RunFeed:
                 f"expected, and `observed/{role}` has the shape {self._values.shape}."
             )
 
-    def beginning(self, count: int) -> str:
-        """Return the hash of the first `count` steps."""
-        return sha256(self._turn[:count].tobytes() + self._values[:count].tobytes()).hexdigest()
+    def _place(self, read: int) -> Place:
+        first = self._turn[: min(read, _FIRST)].tobytes() + self._values[: min(read, _FIRST)].tobytes()
+        return {"beginning": sha256(first).hexdigest(), "read": read}
 
-    def messages(self, after: int) -> Iterator[Fed]:
-        """Return the steps behind the first `after` of them."""
-        for row in range(after, len(self._values)):
+    def holds(self, place: Place) -> bool:
+        """Return whether its first steps are those of a place."""
+        return self._place(place["read"]) == place
+
+    def messages(self, place: Place | None) -> Iterator[Fed]:
+        """Return the steps behind a place."""
+        for row in range(place["read"] if place else 0, len(self._values)):
+            self.place = self._place(row + 1)
             control = None if self._control is None else int(self._control[row])
             yield Message(self._values[row].copy(), int(self._turn[row]), None, control), f"row {row}"
 
 
-class FolderFeed:
+class FolderFeed(_FileFeed):
     """The journal of another run or watch, of whatever version: its observations as they came.
 
     A line that was damaged is refused, and those behind it are read on.
@@ -193,28 +236,24 @@ class FolderFeed:
         The folder holds no journal.
     """
 
-    replayable = True
-
     def __init__(self, folder: Path, scenario: Scenario) -> None:
         self._path = folder / JOURNAL_NAME
         self._scenario = scenario
         if not self._path.is_file():
             raise MissionInputError(f"{folder} holds no journal of a run or a watch ({JOURNAL_NAME}).")
 
-    def beginning(self, count: int) -> str:
-        """Return the hash of the first lines, which have `count` observations or a few less."""
-        return _hash_of_lines(self._path, 1 + count)
-
-    def messages(self, after: int) -> Iterator[Fed]:
-        """Return the observations behind the first `after` of them."""
-        lines = (line for line in whole_records(self._path) if line[1] is None or _came(line[1]))
-        for count, (number, record) in enumerate(lines, start=1):
-            if count <= after:
-                continue
-            if record is None:
-                yield Refused(f"line {number} of {self._path.name} was changed or is damaged"), ""
-            else:
-                yield self._message(record), f"line {number}"
+    def messages(self, place: Place | None) -> Iterator[Fed]:
+        """Return the observations behind a place."""
+        stream = GrowingFile(self._path, place)
+        with io.BufferedReader(stream, _PIECE) as file:
+            while (line := file.readline()).endswith(b"\n"):
+                record, self.place = whole_record(line), stream.place(file.tell())
+                if record is None:
+                    with self._path.open("rb") as journal:
+                        number = journal.read(self.place["read"]).count(b"\n")
+                    yield Refused(f"line {number} of {self._path.name} was changed or is damaged"), ""
+                elif _came(record):
+                    yield self._message(record), f"turn {record.get('turn')}"
 
     def _message(self, record: Mapping[str, Any]) -> Message | Refused:
         try:
@@ -228,40 +267,28 @@ class FolderFeed:
         return Message(observed, turn, None, control)
 
 
-class JsonLinesFeed:
+class JsonLinesFeed(LiveFeed):
     """JSON objects, one a line, from a stream such as standard input."""
-
-    replayable = False
 
     def __init__(self, scenario: Scenario, stream: IO[bytes] | None = None) -> None:
         self._reader = MessageReader(scenario)
         self._stream = stream
 
-    def beginning(self, count: int) -> str:
-        """Return nothing: a stream goes on where it is."""
-        return ""
-
-    def messages(self, after: int) -> Iterator[Fed]:
+    def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return what comes."""
         for line in _lines(self._stream or sys.stdin.buffer):
             if line is not None:
                 yield parsed(self._reader, line), shown(line)
 
 
-class MappingFeed:
+class MappingFeed(LiveFeed):
     """Messages of a program, as mappings; arrays of numbers may stand where JSON has lists."""
-
-    replayable = False
 
     def __init__(self, messages: Iterable[Mapping[str, Any]], scenario: Scenario) -> None:
         self._reader = MessageReader(scenario)
         self._messages = messages
 
-    def beginning(self, count: int) -> str:
-        """Return nothing: what comes goes on where it is."""
-        return ""
-
-    def messages(self, after: int) -> Iterator[Fed]:
+    def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return what comes."""
         for message in self._messages:
             line = json.dumps(message, default=_plain).encode()
@@ -352,14 +379,6 @@ def _came(record: Mapping[str, Any]) -> bool:
     given = record.get("intake", {}).get("given", "")
     predicted = given.endswith(str(MISSING)) and record.get("observation_turn") == record.get("turn")
     return "observed" in record and not predicted
-
-
-def _hash_of_lines(path: Path, count: int) -> str:
-    found = sha256()
-    with path.open("rb") as file:
-        for line in islice(_lines(file), count):
-            found.update(line if isinstance(line, bytes) else b"")
-    return found.hexdigest()
 
 
 def _cells(line: bytes) -> list[str]:

@@ -1,10 +1,11 @@
 """A watch: its folder, begun or taken up again, its loop, and what it leaves."""
 
-import base64
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
     open_journal,
-    read_records,
+    read_lines,
     records_backwards,
 )
 from twin_master.mission.kept_knowledge import keep_knowledge, share_knowledge
@@ -39,7 +40,7 @@ from twin_master.store.summary import Figure, control_changes, noticed, summaris
 from twin_master.store.writing import store_mission, write_summary
 from twin_master.watch.decision import decision_of
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
-from twin_master.watch.keeping import Keeper
+from twin_master.watch.keeping import Keeper, Standing
 from twin_master.watch.replay import BelievedModel, Replayed, replay
 from twin_master.watch.stopping import Stopping
 from twin_master.watch.teaching import Search, Teaching, Tutor, both_patches, check_teachable
@@ -93,7 +94,6 @@ class Watch:
         self._patches: list[Path | None] = [Path(own) if own else None]  # of these models
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
-        self._adopted: tuple[dict[str, Any], ...] = ()
         self._take_up()
         if like is not None and len(self.models) == len(like.models) == 1:
             share_knowledge(like.folder, folder)
@@ -111,14 +111,20 @@ class Watch:
         return BelievedModel(0, knowledge)
 
     def _take_up(self) -> None:
-        """Believe the patches that were adopted, as the journal says."""
-        for record, _ in read_records(self._path, self._hash):
-            if "model" in record:
-                model = record["model"]
-                self._adopted = (*self._adopted, model)
-                file = self.folder / model["patch"]
-                self._patches.append(file)
-                self.models.append(patched_model(self.scenario, file, model["from_turn"], self._progress))
+        """Take in the journal, and believe the patches that were adopted, as far as that is not done yet."""
+        next(read_lines(self._path, self._hash), None)  # it is that of this configuration
+        notice = self.scenario.notice
+        self.standing = Standing(Teaching(1.0 if notice is None else notice.threshold))
+        self.standing.read(self._path)
+        for model in self.standing.adopted[len(self.models) - 1 :]:
+            file = self.folder / model["patch"]
+            self._patches.append(file)
+            self.models.append(patched_model(self.scenario, file, model["from_turn"], self._progress))
+
+    def write(self, journal: JournalFile, record: Mapping[str, Any]) -> None:
+        """Add a line to the journal, and take it in."""
+        journal.append(record)
+        self.standing.take(record)
 
     def run(
         self, feed: Feed, decide: Callable[[Mapping[str, Any]], None], *, turns: int | None = None,
@@ -157,15 +163,20 @@ class Watch:
         rejected = RejectedFile(self.folder / REJECTED_NAME)
         intake = Intake(self.scenario, feed, rejected)
         with open_journal(self.folder, self._hash, FLUSH_SECONDS if feed.replayable else 0.0) as journal:
+            self._take_up()
             if patched is not None:
                 self._patch(journal, patched)
-            found = self._replayed(None)
+            found = self._replayed()
             intake.restore(None if found.last is None else found.last["intake"])
             if found.last is not None:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            yield journal, Keeper(journal, intake, found.twin)
+            write = partial(self.write, journal)
+            yield (
+                journal,
+                Keeper(write, intake, found.twin, lambda twin: self.standing.snapshot(twin, journal.size)),
+            )
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
         """Yield what the operator is told of each turn, once it is written down, until the source ends."""
@@ -190,11 +201,7 @@ class Watch:
         self, journal: JournalFile, keep: "Keeper", search: Search, source: Stopping, *, wait: bool
     ) -> Tutor:
         check_teachable(self.scenario)
-        assert self.scenario.notice is not None
-        teaching = Teaching(self.scenario.notice.threshold)
-        for record, _ in read_records(self._path, self._hash):
-            teaching.take(record)
-        pupil = _Pupil(self, journal, keep, teaching, Judge(wait=wait))
+        teaching, pupil = self.standing.teaching, _Pupil(self, journal, keep, Judge(wait=wait))
         step = self.scenario.mission.step_name
         return Tutor(pupil, teaching, search, step, wait=wait, asked_to_end=lambda: source.asked)
 
@@ -205,11 +212,12 @@ class Watch:
         believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= from_turn]
         patch = both_patches(self._patches[max(believed)], file)
         models = tuple(self.models)
-        return Trial(self._path, self._hash, journal.size, self.scenario, models, patch, from_turn, compared)
+        return Trial(self._path, journal.size, self.scenario, models, patch, from_turn, compared)
 
-    def _replayed(self, first_turn: int | None, *, lag: bool = True) -> Replayed:
-        kept = self.scenario.watch.lag if lag else None
-        return replay(self._path, self._hash, self.models, kept, first_turn=first_turn)
+    def _replayed(self, first_turn: int | None = None) -> Replayed:
+        """Return the twin, or with all that it keeps from a turn on."""
+        lag = self.scenario.watch.lag if first_turn is None else None
+        return replay(self._path, self.models, lag, first_turn=first_turn)
 
     def _patch(self, journal: JournalFile, patched: Patched) -> None:
         """Believe a patch that is given from a turn on."""
@@ -222,10 +230,8 @@ class Watch:
             journal, judged(self.trial(journal, patched.file, patched.from_turn), self._progress), None
         )
 
-    def adopt(
-        self, journal: JournalFile, outcome: Outcome, notice: Mapping[str, Any] | None
-    ) -> tuple[dict[str, Any], Twin]:
-        """Believe a patched model; return the line of the journal, and the twin that goes on."""
+    def adopt(self, journal: JournalFile, outcome: Outcome, notice: Mapping[str, Any] | None) -> Twin:
+        """Believe a patched model; return the twin that goes on."""
         name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
         atomic_write_bytes(self.folder / name, outcome.trial.patch)
         twin, alarms = outcome.twin()
@@ -239,12 +245,10 @@ class Watch:
         line = {
             "turn": twin.turns - 1,
             "next_control": twin.proposed_control,
-            "intake": next(records_backwards(self._path))["intake"],
+            "intake": next(records_backwards(self._path))[0]["intake"],
             "model": model,
-            "twin_state": base64.b64encode(twin.save_state()).decode("ascii"),
         }
-        journal.append(line)
-        self._adopted = (*self._adopted, model)
+        self.write(journal, line | self.standing.snapshot(twin, journal.size))
         keep_knowledge(self.folder, outcome.model.knowledge)
         self._progress.note(
             f"The patched model is believed from {self.scenario.mission.step_name} {first} on: "
@@ -255,12 +259,12 @@ class Watch:
             )
             + "."
         )
-        return line, twin
+        return twin
 
     def _turns(self) -> int:
         """Return how many turns were watched."""
         lines = records_backwards(self._path)
-        return next((int(line["turn"]) + 1 for line in lines if {"filtered", "model"} & {*line}), 0)
+        return next((int(line["turn"]) + 1 for line, *_ in lines if {"filtered", "model"} & {*line}), 0)
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
@@ -269,7 +273,7 @@ class Watch:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
         first = max(0, turns - last)
-        found = self._replayed(first, lag=False)
+        found = self._replayed(first)
         flight = found.beliefs.flight(found.twin, None, first_turn=found.first_turn)
         flight = replace(flight, notices=self.told(first))
         knowledge, mission = self.models[-1].knowledge, self.scenario.mission
@@ -293,10 +297,10 @@ class Watch:
             "asset": WATCHED,
             "twin_model": origin.model,
         }
-        if self._adopted:
+        if self.standing.adopted:
             attributes |= {
-                "model_patch": self._adopted[-1]["patch"],
-                "model_patch_from_step": self._adopted[-1]["from_turn"],
+                "model_patch": self.standing.adopted[-1]["patch"],
+                "model_patch_from_step": self.standing.adopted[-1]["from_turn"],
             }
         if knowledge.draws.record is not None:
             text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
@@ -323,11 +327,11 @@ class Watch:
     def told(self, first: int) -> tuple[tuple[int, Notice], ...]:
         """Return what the operator was told in the turns from `first` on, each sentence once."""
         told: dict[str, tuple[int, Notice]] = {}
-        for record, _ in read_records(self._path, self._hash):
-            if record["turn"] >= first:
-                for notice in record.get("notices", ()):
-                    found = {**notice, "sensors": tuple(notice["sensors"])}
-                    told.setdefault(notice["sentence"], (record["turn"], Notice(**found)))
+        lines = takewhile(lambda line: line[0].get("turn", -1) >= first, records_backwards(self._path))
+        for record in reversed([record for record, *_ in lines if "notices" in record]):
+            for notice in record["notices"]:
+                found = {**notice, "sensors": tuple(notice["sensors"])}
+                told.setdefault(notice["sentence"], (record["turn"], Notice(**found)))
         return tuple(told.values())
 
     def _figures(self, counts: Counts, turns: int) -> tuple[Figure, ...]:
@@ -339,7 +343,7 @@ class Watch:
             Figure("duplicates", "messages that said nothing new", counts.duplicates),
             Figure("rejected", f"messages refused ({REJECTED_NAME})", counts.rejected),
         ]
-        for model in self._adopted:
+        for model in self.standing.adopted:
             for when in ("before", "after"):
                 figures.append(
                     Figure(
@@ -358,25 +362,20 @@ WATCHED = "watched asset"
 class _Pupil:
     """A watch that is taught, see `teaching.Pupil`."""
 
-    def __init__(
-        self, watch: Watch, journal: JournalFile, keep: Keeper, teaching: Teaching, judge: Judge
-    ) -> None:
+    def __init__(self, watch: Watch, journal: JournalFile, keep: Keeper, judge: Judge) -> None:
         self.folder, self._watch, self._journal = watch.folder, watch, journal
-        self._keep, self._teaching, self._judge = keep, teaching, judge
+        self._keep, self._judge = keep, judge
 
     def write(self, record: Mapping[str, Any]) -> None:
         twin = self._keep.twin
         state = {"next_control": twin.proposed_control, "intake": self._keep.intake.state()}
-        line = {"turn": twin.turns - 1, **state, **record}
-        self._journal.append(line)
-        self._teaching.take(line)
+        self._keep.write({"turn": twin.turns - 1, **state, **record})
 
     def outcome(self, file: Path, from_turn: int, compared: tuple[int, int]) -> Outcome | None:
         return self._judge.outcome(lambda: self._watch.trial(self._journal, file, from_turn, compared))
 
     def adopt(self, outcome: Outcome, notice: Mapping[str, Any]) -> None:
-        line, self._keep.twin = self._watch.adopt(self._journal, outcome, notice)
-        self._teaching.take(line)
+        self._keep.twin = self._watch.adopt(self._journal, outcome, notice)
 
     def end(self) -> None:
         self._judge.end()

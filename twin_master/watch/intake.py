@@ -16,6 +16,7 @@ from twin_master.mission.loop import Reading
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
+from twin_master.watch.growing import Place
 from twin_master.watch.message import Message, Refused
 
 Float = NDArray[np.float64]
@@ -23,8 +24,6 @@ Float = NDArray[np.float64]
 REJECTED_NAME = "rejected.jsonl"
 REJECTED_KEPT = 10_000
 """Refused messages that are written down; further ones are counted only, so that a flood fills no disk."""
-RECOGNISED_BY = 8
-"""First messages of a source by which it is recognised when a watch is taken up again."""
 _TEXT_KEPT = 200
 MISSING, _ASSUMED, _GIVEN = 0, 1, 2
 """Of a turn: not received; received; received with its control."""
@@ -35,15 +34,28 @@ class Feed(Protocol):
 
     replayable: bool
     """Whether it begins anew with every process, so that what was read before is read again."""
+    place: Place | None
+    """Where it stands behind the message that it gave last."""
 
-    def beginning(self, count: int) -> str:
-        """Return what tells its first `count` messages from those of another source."""
+    def holds(self, place: Place) -> bool:
+        """Return whether a place is one of it, and not of another source."""
 
-    def messages(self, after: int) -> Iterator[tuple[Message | Refused | None, str]]:
-        """Return the messages behind the first `after` of them, each with the begin of its text.
+    def messages(self, place: Place | None) -> Iterator[tuple[Message | Refused | None, str]]:
+        """Return the messages behind a place, or all of them, each with the begin of its text.
 
         None in the place of a message: nothing more has come yet.
         """
+
+
+class LiveFeed:
+    """A feed that is not read twice: it goes on where it is."""
+
+    replayable = False
+    place: Place | None = None
+
+    def holds(self, place: Place) -> bool:
+        """Return that nothing is read again."""
+        return False
 
 
 @dataclass
@@ -78,16 +90,12 @@ class RejectedFile:
         """Forget what was refused behind a number of messages that will be read again, and what was cut."""
         if self.path is None or not self.path.exists():
             return
-        lines = []
-        for line in self.path.read_text(encoding="utf-8").splitlines():
-            try:
-                record = json.loads(line)
-            except json.JSONDecodeError:
-                break  # cut off by a kill
-            if record["message"] <= received:
-                lines.append(line + "\n")
-        atomic_write_text(self.path, "".join(lines))
+        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
         self.kept = len(lines)
+        while self.kept and not _stays(lines[self.kept - 1], received):
+            self.kept -= 1
+        if self.kept < len(lines):
+            atomic_write_text(self.path, "".join(lines[: self.kept]))
 
     def add(self, message: int, reason: str, text: str) -> None:
         """Write down a refused message, its number from 1."""
@@ -100,6 +108,14 @@ class RejectedFile:
                 file.write(json.dumps(record, ensure_ascii=True) + "\n")
         except OSError as error:
             raise write_error(error, self.path) from error
+
+
+def _stays(line: str, received: int) -> bool:
+    """Return whether a line of `rejected.jsonl` is whole, and of one of the first messages."""
+    try:
+        return bool(json.loads(line)["message"] <= received)
+    except json.JSONDecodeError:
+        return False  # cut off by a kill
 
 
 class Intake:
@@ -134,8 +150,8 @@ class Intake:
         self._feed = feed
         self._rejected = rejected
         self._messages: Iterator[tuple[Message | Refused | None, str]] | None = None
-        self._read = 0  # messages of this feed, in this process and before
-        self._beginning = (0, "")
+        self._place: Place | None = None  # behind the last message, and behind the one before it
+        self._before_last: Place | None = None
         self._pending: deque[tuple[int, Reading, int]] = deque()
         self._given: deque[int] = deque(maxlen=scenario.watch.lag + 1)
         self._origin: float | None = None
@@ -151,14 +167,11 @@ class Intake:
         # The message behind a gap is read again, until its own turn is written down.
         waiting = bool(self._pending)
         counts = vars(self.counts) | {"received": self.counts.received - waiting}
-        read = self._read - waiting
-        if self._beginning[0] != min(read, RECOGNISED_BY):
-            self._beginning = min(read, RECOGNISED_BY), self._feed.beginning(min(read, RECOGNISED_BY))
         return {
             "counts": counts,
             "given": "".join(map(str, self._given)),
             "origin": self._origin,
-            "source": {"beginning": self._beginning[1], "read": read},
+            "source": self._before_last if waiting else self._place,
         } | ({} if self._first is None else {"first_timed": self._first})
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
@@ -171,15 +184,14 @@ class Intake:
             self.counts = Counts(**state["counts"])
             self._origin, self._first = state["origin"], state.get("first_timed")
             self._given.extend(map(int, state["given"]))
-            read = int(state["source"]["read"])
-            again &= state["source"]["beginning"] == self._feed.beginning(min(read, RECOGNISED_BY))
-            self._read = read if again else 0
+            again &= state["source"] is not None and self._feed.holds(state["source"])
+            self._place = state["source"] if again else None
         self._rejected.go_back(self.counts.received if again else LARGEST_SEED)
 
     def read(self, twin: Twin) -> Reading | None:
         """Return the next reading, see `Source.read`; None also where nothing has come yet."""
         if self._messages is None:
-            self._messages = self._feed.messages(self._read)
+            self._messages = self._feed.messages(self._place)
         while not self._pending:
             came = next(self._messages, None)
             self.ended = came is None
@@ -187,7 +199,7 @@ class Intake:
             if message is None:
                 return None
             self.counts.received += 1
-            self._read += 1
+            self._before_last, self._place = self._place, self._feed.place
             try:
                 if isinstance(message, Refused):
                     raise message

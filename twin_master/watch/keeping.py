@@ -1,14 +1,81 @@
-"""A turn of a watch as a line of its journal."""
+"""A turn of a watch as a line of its journal, and what follows from all of its lines."""
 
 import base64
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from twin_master.mission.journal import JournalFile, belief_record, plain
+from twin_master.mission.journal import belief_record, damaged, plain, read_lines, records_backwards
 from twin_master.mission.loop import Reading
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.watch.intake import Intake
-from twin_master.watch.replay import SNAPSHOT_TURNS
-from twin_master.watch.teaching import Tutor
+from twin_master.watch.teaching import Teaching, Tutor
+
+SNAPSHOT_TURNS = 32
+"""Turns between two lines that also hold the state of the twin and what follows from all lines before."""
+
+CHECKED = 250_000
+"""Bytes at the end of a journal that are read at least, so that damage there is found."""
+
+
+@dataclass
+class Standing:
+    """What follows from all lines of a journal so far.
+
+    A line now and then holds it, so that the journal is read back to there alone, however long it is.
+
+    Attributes
+    ----------
+    teaching : Teaching
+    adopted : list of dict
+        The models that were adopted, as the journal has them.
+    """
+
+    teaching: Teaching
+    adopted: list[dict[str, Any]] = field(default_factory=list)
+
+    def take(self, record: Mapping[str, Any]) -> None:
+        """Take in a line."""
+        self.adopted += [record["model"]] if "model" in record else []
+        self.teaching.take(record)
+
+    def snapshot(self, twin: Twin, begin: int) -> dict[str, Any]:
+        """Return what a line holds that begins at so many bytes."""
+        standing = {"begin": begin, "adopted": self.adopted, "teaching": self.teaching.state()}
+        settled = twin.settled()
+        if settled is None:
+            return {"standing": standing}
+        state = base64.b64encode(zlib.compress(settled[1], 1)).decode("ascii")
+        return {"standing": standing, "settled": {"turn": settled[0], "state": state}}
+
+    def read(self, path: Path) -> None:
+        """Take in a journal, from the last line that holds all before it.
+
+        Raises
+        ------
+        NotResumableError
+            It was changed or is damaged.
+        """
+        behind: list[dict[str, Any]] = []
+        before: dict[str, Any] | None = None
+        length = 0
+        for record, begin, end in records_backwards(path):
+            length = length or end
+            if length - begin > CHECKED and before is not None:
+                break
+            if begin and before is None:
+                behind.append(record)
+                before = record.get("standing")
+                if before is not None and before["begin"] != begin:
+                    number = sum(after <= begin for _, after in read_lines(path, None))
+                    raise damaged(path, number, "lines before it are missing, or not its own")
+        if before is not None:
+            self.adopted = list(before["adopted"])
+            self.teaching.restore(before["teaching"])
+        for record in reversed(behind):
+            self.take(record)
 
 
 class Keeper:
@@ -16,11 +83,14 @@ class Keeper:
 
     Parameters
     ----------
-    journal : JournalFile
+    write : callable
+        Adds a line to the journal.
     intake : Intake
         Of the readings.
     twin : Twin
         That is watched with; another one where it was taught.
+    snapshot : callable
+        Returns what a line now and then holds of those before it.
 
     Attributes
     ----------
@@ -30,8 +100,11 @@ class Keeper:
         Notices that the last line has beside those of its turn.
     """
 
-    def __init__(self, journal: JournalFile, intake: Intake, twin: Twin) -> None:
-        self._journal, self.intake, self.twin = journal, intake, twin
+    def __init__(
+        self, write: Callable[[Mapping[str, Any]], None], intake: Intake, twin: Twin,
+        snapshot: Callable[[Twin], Mapping[str, Any]],
+    ) -> None:  # fmt: skip
+        self.write, self.intake, self.twin, self._snapshot = write, intake, twin, snapshot
         self.tutor: Tutor | None = None
         self.told: list[dict[str, Any]] = []
 
@@ -47,12 +120,10 @@ class Keeper:
             "intake": self.intake.state(),
         }
         if turn.turn % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1 and reading.revises is None:
-            record["twin_state"] = base64.b64encode(self.twin.save_state()).decode("ascii")
+            record |= self._snapshot(self.twin)
         record |= belief_record(turn)
         if self.tutor is not None:
             self.told = list(self.tutor.teaching.untold)
             if self.told:
                 record["notices"] = record.get("notices", []) + self.told
-        self._journal.append(record)
-        if self.tutor is not None:
-            self.tutor.teaching.take(record)
+        self.write(record)

@@ -19,6 +19,8 @@ from urllib.parse import unquote, urlsplit
 from twin_master.errors import MissionInputError
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import Fed, parsed, shown
+from twin_master.watch.growing import Place
+from twin_master.watch.intake import LiveFeed
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
 PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
@@ -221,10 +223,8 @@ class Session:
         self._client.disconnect()
 
 
-class MqttFeed:
+class MqttFeed(LiveFeed):
     """The observations of the topic of one asset; see `Session` for the parameters, and for errors."""
-
-    replayable = False
 
     def __init__(self, broker: Broker, scenario: Scenario, folder: Path, note: Callable[[str], None]) -> None:
         self._topic = broker.topic
@@ -232,11 +232,7 @@ class MqttFeed:
         self._session = Session(broker, scenario.mission.name, folder, note)
         self.close = self._session.close
 
-    def beginning(self, count: int) -> str:
-        """Return nothing: the broker knows what was acknowledged."""
-        return ""
-
-    def messages(self, after: int) -> Iterator[Fed]:
+    def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return what comes, without end; a message is acknowledged when the next one is asked for."""
         for message in self._session.messages(0.1):
             if message is not None:

@@ -1,19 +1,22 @@
 """The journal of a watch, read back: the twin as it was, to the last bit, and the turns that are stored."""
 
 import base64
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from twin_master.errors import NotResumableError
-from twin_master.mission.journal import array_of, damaged, read_records
+from twin_master.mission.journal import array_of, damaged, read_lines, records_backwards
 from twin_master.mission.loop import Beliefs
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.twin import Twin
 
-SNAPSHOT_TURNS = 1000
-"""Turns between two lines that also hold the state of the twin, so that not all turns are filtered again."""
+Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -54,73 +57,59 @@ class Replayed:
     last: dict[str, Any] | None = None
 
 
-@dataclass
-class _Tail:
-    """What lies behind a snapshot in the journal."""
-
-    turn: int = -1
-    state: bytes | None = None
-    seen: dict[int, tuple[Any, int]] = field(default_factory=dict)
-
-
 def replay(
-    path: Path,
-    config_hash: str,
-    models: Sequence[BelievedModel],
-    lag: int | None,
-    *,
-    first_turn: int | None,
-    end: int | None = None,
-) -> Replayed:
+    path: Path, models: Sequence[BelievedModel], lag: int | None, *, first_turn: int | None = None,
+    end: int | None = None, question: BelievedModel | None = None,
+) -> Replayed:  # fmt: skip
     """Filter the end of a watch again, what came late in its place.
+
+    The journal is read from its end to the last state of the twin that lies before what is wanted.
 
     Parameters
     ----------
     path : Path
         The journal.
-    config_hash : str
-        Of the configuration that it belongs to.
     models : sequence of BelievedModel
-        The model of the beginning, and those that were adopted later, by their turns. More than the journal
-        knows of are a question: what would be believed with them.
+        The model of the beginning, and those that were adopted later.
     lag : int or None
         Of the twin.
-    first_turn : int or None
-        The first turn whose belief is wanted; None for the twin alone, from the last snapshot.
+    first_turn : int, optional
+        The first turn whose belief is wanted; if left out the twin alone, from the last state.
     end : int, optional
         Bytes of the journal that are read; all of it if left out.
+    question : BelievedModel, optional
+        What would be believed with one model more, from its turn on.
 
     Raises
     ------
     NotResumableError
         The journal was changed or is damaged, or decided otherwise.
     """
-    tail, last, adopted = _Tail(), None, 0
-    for number, (record, place) in enumerate(read_records(path, config_hash), start=1):
-        if end is not None and place > end:
-            break
+    wanted = [] if first_turn is None else [first_turn]
+    wanted += [] if question is None else [question.from_turn]
+    seen: dict[int, tuple[Float, int]] = {}
+    settled, last = (-1, b""), None
+    for record, begin, _ in records_backwards(path, end):
         try:
+            if not begin or int(record["turn"]) <= settled[0]:
+                break
+            last = last or record
+            if settled[0] < 0 and "settled" in record:
+                turn, state = int(record["settled"]["turn"]), record["settled"]["state"]
+                # Only one before what is wanted, and before all models that are adopted behind it.
+                if all(turn < other for other in wanted):
+                    settled = turn, zlib.decompress(base64.b64decode(state))
             if "model" in record:
-                adopted += 1
-            elif "verdict" not in record:
-                seen = array_of(record["observed"]), int(record["control_index"])
-                tail.seen[int(record["observation_turn"])] = seen
-            if "twin_state" in record:
-                # Only one that lies before what is wanted, and before all models that are adopted behind it.
-                wanted = [model.from_turn for model in models[adopted + 1 :]]
-                wanted += [] if first_turn is None else [first_turn]
-                if all(int(record["turn"]) < turn for turn in wanted):
-                    tail = _Tail(int(record["turn"]), base64.b64decode(record["twin_state"]))
-            last = record
-        except (KeyError, TypeError, ValueError) as error:
+                wanted.append(int(record["model"]["from_turn"]))
+            elif "observed" in record:
+                observed = array_of(record["observed"]), int(record["control_index"])
+                seen.setdefault(int(record["observation_turn"]), observed)
+        except (KeyError, TypeError, ValueError, zlib.error) as error:
+            number = sum(after <= begin for _, after in read_lines(path, None))
             raise damaged(path, number, f"it has another layout, {error}") from error
-    found = _filtered(tail, models, lag)
+    found = _filtered(settled, seen, [*models, *([question] if question else [])], lag)
     found.last = last
-    if (
-        last is not None
-        and adopted + 1 == len(models)
-        and last["next_control"] != found.twin.proposed_control
-    ):
+    if last is not None and question is None and last["next_control"] != found.twin.proposed_control:
         raise NotResumableError(
             f"the journal decided otherwise after turn {last['turn']} than this version does: begin "
             f"another watch, in another folder, with `--observations {path.parent}`."
@@ -128,27 +117,30 @@ def replay(
     return found
 
 
-def _filtered(tail: _Tail, given: Sequence[BelievedModel], lag: int | None) -> Replayed:
+def _filtered(
+    settled: tuple[int, bytes], seen: Mapping[int, tuple[Float, int]], given: Sequence[BelievedModel],
+    lag: int | None,
+) -> Replayed:  # fmt: skip
     # A model that was adopted from an earlier turn on than one before it takes its place altogether.
     models = [
         model
         for index, model in enumerate(given)
         if all(later.from_turn > model.from_turn for later in given[index + 1 :])
     ]
-    at = max(index for index, model in enumerate(models) if not index or model.from_turn <= max(tail.turn, 0))
+    at = max(
+        index for index, model in enumerate(models) if not index or model.from_turn <= max(settled[0], 0)
+    )
     twin = models[at].knowledge.twin(lag=lag)
-    if tail.state is not None:
-        twin.restore_state(tail.state)
-    for turn in sorted(turn for turn in tail.seen if turn < twin.turns):
-        twin.revise(turn, *tail.seen[turn])
+    if settled[1]:
+        twin.restore_state(settled[1])
     sensors = models[at].knowledge.scenario.observation.count
     found = Replayed(twin, Beliefs(sensors), first_turn=twin.turns)
-    while twin.turns in tail.seen:
+    while twin.turns in seen:
         if at + 1 < len(models) and models[at + 1].from_turn <= twin.turns:
             at += 1
             following = models[at].knowledge.twin(lag=lag)
             following.restore_state(twin.save_state())
             twin = found.twin = following
-        observed, control = tail.seen[twin.turns]
+        observed, control = seen[twin.turns]
         found.beliefs.add(observed, twin.turn(observed, control))
     return found

@@ -99,6 +99,15 @@ class Teaching:
     _ask_at: int = 0
     _since: int = 0
 
+    def state(self) -> dict[str, Any]:
+        """Return what is needed to go on, as JSON."""
+        return vars(self) | {"question": self.question and vars(self.question)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state."""
+        question = state["question"]
+        vars(self).update(state, question=question and Question(**question))
+
     def take(self, record: Mapping[str, Any]) -> None:
         """Take in a line of the journal."""
         if "model" in record:

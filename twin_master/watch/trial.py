@@ -45,8 +45,6 @@ class Trial:
     Attributes
     ----------
     journal : Path
-    config_hash : str
-        Of the configuration that it belongs to.
     end : int
         Bytes of it that are read.
     scenario : Scenario
@@ -61,7 +59,6 @@ class Trial:
     """
 
     journal: Path
-    config_hash: str
     end: int
     scenario: Scenario
     models: tuple[BelievedModel, ...]
@@ -151,15 +148,11 @@ def judged(trial: Trial, progress: Progress | None = None) -> Outcome:
     wanted = min(first, begin) if count else first
     before, after = (
         replay(
-            trial.journal,
-            trial.config_hash,
-            models,
-            trial.scenario.watch.lag,
-            first_turn=wanted,
-            end=trial.end,
+            trial.journal, trial.models, trial.scenario.watch.lag, first_turn=wanted, end=trial.end,
+            question=question,
         )
-        for models in (trial.models, (*trial.models, model))
-    )
+        for question in (None, model)
+    )  # fmt: skip
     evidence = [
         sum(found.beliefs.log_evidence[begin - found.first_turn :][:count]) for found in (before, after)
     ]

@@ -7,6 +7,7 @@ import json
 import random
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -290,7 +291,7 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
     path.write_text("﻿step,control," + names + "\r\n" + "\r\n".join(rows), encoding="utf-8")
 
     def messages() -> Iterator[feeds.Fed]:
-        return feeds.CsvFeed(path, knowledge.scenario).messages(0)
+        return feeds.CsvFeed(path, knowledge.scenario).messages(None)
 
     found = [fed[0] for fed in messages()]
     assert len(found) == TURNS
@@ -303,20 +304,22 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
             lost = np.isnan(fed.observed)
             assert lost.sum() == {7: 1, 9: 24}.get(turn, 0)
             np.testing.assert_allclose(fed.observed[~lost], strains[turn][~lost], rtol=1e-15)
-    assert len(list(feeds.CsvFeed(path, knowledge.scenario).messages(50))) == 10
+    feed = feeds.CsvFeed(path, knowledge.scenario)
+    assert len(list(islice(feed.messages(None), 50))) == 50
+    assert len(list(feeds.CsvFeed(path, knowledge.scenario).messages(feed.place))) == TURNS - 50
     path.write_text("time,strain_2,strain_1_microstrain\n0.5,0.6,5\n,1e-4,inf\n,nan,5\n", encoding="utf-8")
-    units, infinite, fine = (fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(0))
+    units, infinite, fine = (fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(None))
     assert "`strain_2` would be a strain of 0.6" in str(units)
     assert "`strain_1_microstrain` is not finite" in str(infinite)
     assert isinstance(fine, Message)
     np.testing.assert_allclose(fine.observed[:2], [5e-6, np.nan], rtol=1e-15)
     path.write_text("turn,_rain,strain_1\n12.0,wet,1e-4\n12.5,wet,1e-4\n", encoding="utf-8")
-    whole, half = (fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(0))
+    whole, half = (fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(None))
     assert isinstance(whole, Message)
     assert (whole.turn, whole.observed[0]) == (12, 1e-4)
     assert "no number" in str(half)
     path.write_bytes(b'strain_1\n"' + b"x" * 200_000 + b'"\na\r"b\n\xff\n')
-    assert all(isinstance(fed[0], Refused) for fed in feeds.CsvFeed(path, knowledge.scenario).messages(0))
+    assert all(isinstance(fed[0], Refused) for fed in feeds.CsvFeed(path, knowledge.scenario).messages(None))
     for twice in ("strain_1,strain_1_1", "turn,step,strain_1"):
         path.write_text(f"{twice}\n", encoding="utf-8")
         with pytest.raises(Exception, match="two columns say the same"):
