@@ -127,7 +127,7 @@ def _heading(watched: "FleetWatch") -> str:
 
     assets = watched.assets.values()
     turns = sum(asset.keep.twin.turns for asset in assets)
-    alarms = sum(len(asset.alarms) for asset in assets)
+    alarms = sum(asset.alarm_count for asset in assets)
     refused = sum(asset.keep.intake.counts.rejected for asset in assets)
     told = [counted(len(assets), "asset"), counted(turns, "turn"), counted(alarms, "alarm")]
     told += [f"{counted(refused, 'message')} refused"] * (refused > 0)
@@ -140,7 +140,7 @@ def worst_first(assets: "list[WatchedAsset]") -> "list[WatchedAsset]":
 
     def badness(asset: "WatchedAsset") -> tuple[int, float]:
         health = (asset.decision or {"health": {}})["health"]
-        return len(asset.alarms), sum(known["mean"] for known in health.values())
+        return asset.alarm_count, sum(known["mean"] for known in health.values())
 
     return sorted(assets, key=badness, reverse=True)
 
@@ -167,7 +167,7 @@ def _table(watched: "FleetWatch") -> "Table":
                 continue
             scale, unit = printed_state(known["unit"])
             cells.append(f"{scale * known['mean']:.3g} ± {scale * known['standard_deviation']:.2g} {unit}")
-        alarms = str(len(asset.alarms) or "")
+        alarms = str(asset.alarm_count or "")
         table.add_row(
             asset.name, str(decision["turn"]), decision["control"], *cells, decision["next_control"], alarms
         )

@@ -107,23 +107,33 @@ class WatchedAsset:
     decision : dict or None
         The last one.
     alarms : set of str
-        What the operator was told, each sentence once.
+        What the operator was told since it was taken up, each sentence once.
+    alarms_before : int
+        How many sentences there were before.
     """
 
     def __init__(
-        self, name: str, watch: Watch, keep: Keeper, tell: Callable[[Mapping[str, Any]], None]
-    ) -> None:
+        self, name: str, watch: Watch, keep: Keeper, tell: Callable[[Mapping[str, Any]], None],
+        before: AssetRecord | None = None,
+    ) -> None:  # fmt: skip
         self.name, self.watch, self.keep, self.tell = name, watch, keep, tell
         model = watch.models[-1].knowledge.model
         self.decision = last_decision(watch.folder / JOURNAL_NAME, watch.scenario, model)
-        self.alarms = {notice.sentence for _, notice in watch.told(0)} if self.decision else set()
+        first = before.last.turn + 1 if before is not None and before.last is not None else 0
+        self.alarms_before = before.alarms if before is not None and first else 0
+        self.alarms = {notice.sentence for _, notice in watch.told(first)} if self.decision else set()
+
+    @property
+    def alarm_count(self) -> int:
+        """How many sentences the operator was told."""
+        return self.alarms_before + len(self.alarms)
 
     def record(self) -> AssetRecord:
         """Return how it stands, for the view."""
         last = None
         if self.decision is not None:
             last = TurnRecord.model_validate({key: self.decision.get(key) for key in TurnRecord.model_fields})
-        return AssetRecord(last=last, alarms=len(self.alarms), refused=self.keep.intake.counts.rejected)
+        return AssetRecord(last=last, alarms=self.alarm_count, refused=self.keep.intake.counts.rejected)
 
 
 class FleetWatch:
@@ -252,14 +262,15 @@ class FleetWatch:
                     )
                 closing.callback(os.close, lock)
                 _, keep = closing.enter_context(watch.begun(source))
-                asset = WatchedAsset(key, watch, keep, publish or (lambda _decision: None))
+                told = self._told_before.get(key)
+                asset = WatchedAsset(key, watch, keep, publish or (lambda _decision: None), told)
             except IN_FLIGHT as error:
                 self._lost(key, error)
                 return None
             self.closing.push(closing.pop_all())
         self._like.setdefault(group.name, watch)
         self.assets[key] = asset
-        last, told = asset.decision, self._told_before.get(key)
+        last = asset.decision
         before = told.last.turn if told is not None and told.last is not None else -1
         if last is not None and before < last["turn"]:  # a kill may have left it untold
             self._decided(asset, last)

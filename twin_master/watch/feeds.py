@@ -30,7 +30,6 @@ Fed = tuple[Message | Refused | None, str]
 _LOST = ("", "nan", "null", "none")
 _TURN_COLUMNS = ("turn", "step")
 _OTHERS = ("turn", "time", "control")
-_PIECE = 65_536
 _FIRST = 8
 """First steps by which a file of steps is known again."""
 _CUT = "{} was cut at byte {}, and no copy is beside it: what stood behind that and was not read yet is lost"
@@ -116,7 +115,7 @@ class CsvFeed(_FileFeed):
         with suppress(MissionInputError):
             self._read_header(found(self._path, place, follow=self._follow) or self._path)
         stream, before = GrowingFile(self._path, place, follow=self._follow), 0
-        with io.BufferedReader(stream, _PIECE) as file:
+        with io.BufferedReader(stream) as file:
             for line in _lines(file, follow=self._follow):
                 if line is None:
                     yield None, ""
@@ -245,7 +244,7 @@ class FolderFeed(_FileFeed):
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the observations behind a place."""
         stream = GrowingFile(self._path, place)
-        with io.BufferedReader(stream, _PIECE) as file:
+        with io.BufferedReader(stream) as file:
             while (line := file.readline()).endswith(b"\n"):
                 record, self.place = whole_record(line), stream.place(file.tell())
                 if record is None:

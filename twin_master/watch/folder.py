@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -121,11 +120,6 @@ class Watch:
             self._patches.append(file)
             self.models.append(patched_model(self.scenario, file, model["from_turn"], self._progress))
 
-    def write(self, journal: JournalFile, record: Mapping[str, Any]) -> None:
-        """Add a line to the journal, and take it in."""
-        journal.append(record)
-        self.standing.take(record)
-
     def run(
         self, feed: Feed, decide: Callable[[Mapping[str, Any]], None], *, turns: int | None = None,
         patched: Patched | None = None, search: Search | None = None,
@@ -172,11 +166,7 @@ class Watch:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            write = partial(self.write, journal)
-            yield (
-                journal,
-                Keeper(write, intake, found.twin, lambda twin: self.standing.snapshot(twin, journal.size)),
-            )
+            yield journal, Keeper(journal, intake, found.twin, self.standing)
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
         """Yield what the operator is told of each turn, once it is written down, until the source ends."""
@@ -248,7 +238,8 @@ class Watch:
             "intake": next(records_backwards(self._path))[0]["intake"],
             "model": model,
         }
-        self.write(journal, line | self.standing.snapshot(twin, journal.size))
+        journal.append(line | self.standing.snapshot(twin, journal.size))
+        self.standing.take(line)
         keep_knowledge(self.folder, outcome.model.knowledge)
         self._progress.note(
             f"The patched model is believed from {self.scenario.mission.step_name} {first} on: "

@@ -91,7 +91,7 @@ class GrowingFile(io.RawIOBase):
         super().__init__()
         self._path, self._follow = path, follow
         self._length, self.cut = 0, 0
-        self._whole, self._torn = True, False
+        self._whole, self._torn, self._copied = True, False, False
         self._pieces: deque[_Piece] = deque()
         self._open(found(path, place, follow=follow) or path, place)
 
@@ -102,7 +102,6 @@ class GrowingFile(io.RawIOBase):
         beginning = self._file.read(min(position, _LONGEST))
         self._file.seek(position)
         self._pieces.append(_Piece(self._length, position - self._torn, _beginning(beginning)))
-        self._copied = False
 
     def readable(self) -> bool:
         """Return that it can be read."""
@@ -119,20 +118,16 @@ class GrowingFile(io.RawIOBase):
             self._length += 1
             return 1
         count = self._file.readinto(buffer) or 0
-        if self._follow and self._was_cut(count):
+        if self._follow and self._was_cut():
             place = self._place(self._pieces[-1], self._length)
             copy = found(self._path, place, follow=True)
             self.cut = 0 if copy else place["read"]
-            self._go_on(copy or self._path, place)
-            self._copied = copy is not None
-            return self.readinto(buffer)
+            return self._go_on(copy or self._path, buffer, copied=copy is not None)
         following = self._following() if self._follow and not count else None
         if following is not None:
             count = self._file.readinto(buffer) or 0  # the last that its writer has left
             if not count:
-                self._torn = not (self._whole or self._copied)
-                self._go_on(following, self._place(self._pieces[-1], self._length))
-                return self.readinto(buffer)
+                return self._go_on(following, buffer)
         if count:
             self._whole = buffer[count - 1] == ord("\n")
             self._length += count
@@ -141,16 +136,13 @@ class GrowingFile(io.RawIOBase):
                 piece.beginning = _beginning(piece.beginning + bytes(buffer[:count]))
         return count
 
-    def _was_cut(self, count: int) -> bool:
-        """Return whether the file is another one than was read so far, up to `count` bytes read just now."""
+    def _was_cut(self) -> bool:
+        """Return whether the file is not any more what was read of it, also where it has grown again."""
         at, beginning = self._file.tell(), self._pieces[-1].beginning
-        cut = os.fstat(self._file.fileno()).st_size < at
-        if cut or not count:
-            return cut
         self._file.seek(0)
         same = self._file.read(len(beginning)) == beginning
         self._file.seek(at)
-        return not same
+        return not same or os.fstat(self._file.fileno()).st_size < at
 
     def _following(self) -> Path | None:
         """Return the file to go on with, once it holds something; None where this one still has its name."""
@@ -164,9 +156,13 @@ class GrowingFile(io.RawIOBase):
             return next((file for file in behind if file.stat().st_size), None)
         return None
 
-    def _go_on(self, file: Path, place: Place) -> None:
+    def _go_on(self, file: Path, buffer: Any, *, copied: bool = False) -> int:
+        """Read on in another file; a line goes on only into a copy, and from there into what was cut."""
+        self._torn = not (self._whole or self._copied or copied)
         self._file.close()
-        self._open(file, place)
+        self._open(file, self._place(self._pieces[-1], self._length))
+        self._copied = copied
+        return self.readinto(buffer)
 
     def begins(self, offset: int) -> bool:
         """Return whether a file begins at a byte of the stream."""

@@ -2,12 +2,19 @@
 
 import base64
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from twin_master.mission.journal import belief_record, damaged, plain, read_lines, records_backwards
+from twin_master.mission.journal import (
+    JournalFile,
+    belief_record,
+    damaged,
+    plain,
+    read_lines,
+    records_backwards,
+)
 from twin_master.mission.loop import Reading
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.watch.intake import Intake
@@ -83,14 +90,13 @@ class Keeper:
 
     Parameters
     ----------
-    write : callable
-        Adds a line to the journal.
+    journal : JournalFile
     intake : Intake
         Of the readings.
     twin : Twin
         That is watched with; another one where it was taught.
-    snapshot : callable
-        Returns what a line now and then holds of those before it.
+    standing : Standing
+        After all lines of the journal.
 
     Attributes
     ----------
@@ -100,11 +106,8 @@ class Keeper:
         Notices that the last line has beside those of its turn.
     """
 
-    def __init__(
-        self, write: Callable[[Mapping[str, Any]], None], intake: Intake, twin: Twin,
-        snapshot: Callable[[Twin], Mapping[str, Any]],
-    ) -> None:  # fmt: skip
-        self.write, self.intake, self.twin, self._snapshot = write, intake, twin, snapshot
+    def __init__(self, journal: JournalFile, intake: Intake, twin: Twin, standing: Standing) -> None:
+        self._journal, self.intake, self.twin, self._standing = journal, intake, twin, standing
         self.tutor: Tutor | None = None
         self.told: list[dict[str, Any]] = []
 
@@ -120,10 +123,15 @@ class Keeper:
             "intake": self.intake.state(),
         }
         if turn.turn % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1 and reading.revises is None:
-            record |= self._snapshot(self.twin)
+            record |= self._standing.snapshot(self.twin, self._journal.size)
         record |= belief_record(turn)
         if self.tutor is not None:
             self.told = list(self.tutor.teaching.untold)
             if self.told:
                 record["notices"] = record.get("notices", []) + self.told
         self.write(record)
+
+    def write(self, record: Mapping[str, Any]) -> None:
+        """Add a line to the journal, and take it in."""
+        self._journal.append(record)
+        self._standing.take(record)

@@ -23,7 +23,7 @@ from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import begun, write_csv
 from twin_master.errors import MissionInputError, NotResumableError
-from twin_master.mission.journal import JOURNAL_NAME, line_of, read_records
+from twin_master.mission.journal import JOURNAL_NAME, line_of, read_records, whole_record
 from twin_master.mission.loop import Flight
 from twin_master.network.estimator import ExactFilter
 from twin_master.scenario.reading import LoadedScenario, load_scenario
@@ -218,12 +218,49 @@ def test_a_long_watch_goes_on_from_its_snapshot(
     monkeypatch.setattr(ExactFilter, "turn", counting(seen, ExactFilter.turn))
     for turns in (18, 40, None):
         counts = watch.run(CsvFeed(path, watch.scenario), lambda _decision: None, turns=turns)
-    assert len(seen) == 50 + (17 - 2) + (39 - 18)  # each once, and those behind the last that is settled again
+    assert len(seen) == 50 + (17 - 2) + (39 - 18)  # each once, and those behind what is settled
     watch.store(counts, last=20, report=False)
     run = uav_twin.open_run(tmp_path / "watch")
     np.testing.assert_array_equal(run["filtered"]["step"].values, np.arange(30, 50))
     np.testing.assert_array_equal(run["filtered"]["probability"].values, mission.filtered[30:])
     np.testing.assert_array_equal(run["smoothed"]["probability"].values, mission.smoothed[30:])
+
+
+def test_a_watch_is_taken_up_from_the_end_of_its_journal(
+    base: Watch, mission: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
+    monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 8)
+    monkeypatch.setattr("twin_master.watch.keeping.CHECKED", 1)
+    observed, controls = np.tile(mission.observed, (4, 1)), np.tile(mission.control_index, 4)
+    feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, controls), base.scenario)
+    watch, journal = begun(base, tmp_path / "watch"), tmp_path / "watch" / JOURNAL_NAME
+    counts, read = [], list[int]()
+    for turns in (60, 100, 196):  # as many turns behind the last snapshot
+        watch.run(feed, lambda _decision: None, turns=turns)
+        with monkeypatch.context() as patched:
+            patched.setattr("twin_master.mission.journal.whole_record", counting(read, whole_record))
+            last_decision(journal, watch.scenario, watch.models[0].knowledge.model)
+            watch.run(feed, lambda _decision: None, turns=turns)
+        counts.append(len(read))
+        read.clear()
+    assert counts[0] == counts[1] == counts[2] < 60
+    lines = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(b"".join([*lines[:3], lines[3].replace(b'"turn": 2}', b'"turn": 1}'), *lines[4:]]))
+    watch.run(feed, lambda _decision: None, turns=198)
+    with pytest.raises(NotResumableError, match=r"line 4 .*the 3 before it are whole"):
+        watch.told(0)
+    for wrong, said in (
+        (lines[:3] + lines[4:], r"line 192 .*lines before it are missing"),
+        (
+            [*lines[:-2], lines[-2].replace(b'"turn": ', b'"turn": 1'), lines[-1]],
+            "line 196 .*and 1 behind it",
+        ),
+    ):
+        journal.write_bytes(b"".join(wrong))
+        with pytest.raises(NotResumableError, match=said):
+            watch.run(feed, lambda _decision: None)
+        assert journal.read_bytes() == b"".join(wrong)
 
 
 def counting(seen: list[int], inner: Callable[..., object]) -> Callable[..., object]:

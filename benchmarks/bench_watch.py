@@ -1,0 +1,84 @@
+"""A watch that is taken up after one turn and after 20,000, up to its next decision."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measurement import Measurement
+from reporting.progress import SilentProgress
+from twin_master.assets.resolution import Overrides
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.scenario.reading import load_scenario
+from twin_master.watch.decision import last_decision
+from twin_master.watch.feeds import file_feed
+from twin_master.watch.folder import Watch
+from twin_master.watch.opening import begin_watch, resume_watch
+
+TURNS = 20_000
+REPETITIONS = 7
+SCENARIO = "level_turns"
+
+
+class _Told(Exception):  # noqa: N818 - ends a watch behind its first decision
+    pass
+
+
+def record(watch: Watch, path: Path, turns: int) -> None:
+    """Write what a sound wing shows, with noise."""
+    scenario = watch.scenario
+    values = watch.models[0].knowledge.sensor_model.value_per_draw[:, 0, 1].mean(axis=0)
+    rng, count = np.random.default_rng(1), scenario.observation.count
+    with path.open("w") as file:
+        file.write("turn,control," + ",".join(f"strain_{number + 1}" for number in range(count)) + "\n")
+        for turn in range(turns):
+            row = values + rng.normal(0.0, 1.2e-4, count)
+            file.write(f"{turn},{scenario.control_names[1]}," + ",".join(map(repr, row.tolist())) + "\n")
+
+
+def taken_up(folder: Path, log: Path) -> tuple[float, float]:
+    """Return seconds of the processor up to the next decision, and those without preparing the model."""
+
+    def told(_decision: Mapping[str, object]) -> None:
+        raise _Told
+
+    journal = folder / JOURNAL_NAME
+    size, begin = journal.stat().st_size, time.process_time()
+    watch, lock = resume_watch(folder, None, SilentProgress())
+    prepared = time.process_time()
+    try:
+        last_decision(journal, watch.scenario, watch.models[-1].knowledge.model)
+        watch.run(file_feed(log, watch.scenario, follow=True), told)
+    except _Told:
+        end = time.process_time()
+    os.close(lock)
+    os.truncate(journal, size)
+    return end - begin, end - prepared
+
+
+def run() -> list[Measurement]:
+    """Measure both."""
+    with tempfile.TemporaryDirectory() as name:
+        place, seconds = Path(name), {}
+        log = place / "log.csv"
+        for turns in (1, TURNS):
+            folder = place / str(turns)
+            loaded = load_scenario(SCENARIO)
+            watch, lock = begin_watch(loaded, folder, Overrides(), SilentProgress(), replace_run=False)
+            if not log.exists():
+                record(watch, log, TURNS + 1)
+            watch.run(file_feed(log, watch.scenario), lambda _decision: None, turns=turns)
+            os.close(lock)
+            seconds[turns] = np.median([taken_up(folder, log) for _ in range(REPETITIONS)], axis=0)
+    return [
+        Measurement(
+            f"a watch taken up after {TURNS} turns{what}", float(seconds[TURNS][kind]), "s", None,
+            "after one", float(seconds[1][kind]),
+        )
+        for kind, what in enumerate(("", ", behind the model"))
+    ]  # fmt: skip

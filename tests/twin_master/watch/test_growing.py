@@ -1,0 +1,215 @@
+"""Logs that grow while they are read, rotated by logrotate and by hand: no row is lost or read twice."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.twin_master.watch.watches import begun, lines, write_csv
+from twin_master.mission.loop import Flight
+from twin_master.watch.feeds import CsvFeed
+from twin_master.watch.folder import Watch
+from twin_master.watch.intake import Counts
+from twin_master.watch.message import Message, Refused
+
+pytestmark = pytest.mark.xdist_group("watches")
+
+HEADER = "turn,strain_1,strain_2\n"
+LOGROTATE = shutil.which("logrotate", path="/usr/sbin:" + os.environ["PATH"])
+Rotation = Callable[[Path], None]
+
+
+def row(turn: int) -> str:
+    return f"{turn},{turn + 1}e-5,1e-4\n"
+
+
+def append(path: Path, text: str) -> None:
+    with path.open("a") as file:
+        file.write(text)
+
+
+def logrotate(*directives: str) -> Rotation:
+    """Return what rotates a log by the real logrotate."""
+
+    def rotate(path: Path) -> None:
+        config, state = path.with_name("logrotate.conf"), path.with_name("logrotate.state")
+        text = "\n".join(["rotate 9", "nomail", *directives])
+        config.write_text(f"{path} {{\n{text}\n}}\n")
+        config.chmod(0o644)
+        subprocess.run(
+            [str(LOGROTATE), "--force", "--state", str(state), str(config)], check=True, capture_output=True
+        )
+
+    return rotate
+
+
+def renamed(path: Path) -> None:
+    """Rename a log and begin another one, as `logging.handlers` does."""
+    for number in range(8, 0, -1):
+        older = path.with_name(f"{path.name}.{number}")
+        if older.exists():
+            older.rename(path.with_name(f"{path.name}.{number + 1}"))
+    path.rename(path.with_name(f"{path.name}.1"))
+    path.touch()
+
+
+def dated(path: Path) -> None:
+    """Rename a log by the date, as logrotate does with `dateext`; the next one comes later."""
+    days = len(list(path.parent.glob("log.csv-*")))
+    path.rename(path.with_name(f"log.csv-{20260501 + days}"))
+
+
+def moved(path: Path) -> None:
+    """Rename a log into another folder."""
+    (path.parent / "old").mkdir(exist_ok=True)
+    path.rename(path.parent / "old" / "log")
+
+
+def copied(path: Path) -> None:
+    shutil.copy(path, path.with_name(f"{path.name}.1"))
+    os.truncate(path, 0)
+
+
+ROTATIONS: dict[str, Rotation] = {
+    "create": logrotate("create"),
+    "dated": dated,
+    "absent": logrotate("nocreate"),
+    "copytruncate": logrotate("copytruncate"),
+    "python": renamed,
+    "moved": moved,
+    "copied": copied,
+}
+
+
+def new(messages: Iterator[tuple[Message | Refused | None, str]]) -> list[int | str]:
+    """Return the turns that have come, and in the place of what was refused its text."""
+    came = takewhile(lambda fed: fed[0] is not None, messages)
+    return [fed.turn if isinstance(fed, Message) and fed.turn is not None else text for fed, text in came]
+
+
+@pytest.mark.parametrize("header", [HEADER, ""], ids=["header", "no header"])
+@pytest.mark.parametrize("rotation", ROTATIONS)
+def test_no_row_is_lost_in_a_rotation(base: Watch, tmp_path: Path, rotation: str, header: str) -> None:
+    path, rotate, cut = tmp_path / "log.csv", ROTATIONS[rotation], rotation in ("copytruncate", "copied")
+    path.write_text(HEADER + row(0) + row(1))
+    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+    assert new(messages) == [0, 1]
+    append(path, row(2) + row(3)[:4])  # not read before it is rotated
+    if cut:
+        rotate(path)
+        append(path, row(3)[4:] + row(4))  # its writer has it open, and knows nothing of it
+    else:
+        with path.open("a") as writer:
+            rotate(path)
+            assert new(messages) == [2]
+            writer.write(row(3)[4:])  # until its writer opens the new one
+        append(path, header + row(4))
+    assert new(messages) == ([2, 3, 4] if cut else [3, 4])
+    for turn in (5, 7):
+        append(path, row(turn))
+        rotate(path)
+        append(path, header + row(turn + 1))
+        assert new(messages) == [turn, turn + 1]
+
+
+def test_several_rotations_between_two_looks(base: Watch, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(HEADER + row(0))
+    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+    assert new(messages) == [0]
+    for turn in (1, 2, 3):
+        append(path, row(turn))
+        renamed(path)
+        os.utime(path.with_name("log.csv.1"), (turn, turn))  # coarse clocks give all of them the same time
+    append(path, HEADER.replace("strain_1,strain_2", "strain_2,strain_1") + row(4))
+    assert new(messages) == [1, 2, 3, 4]
+
+
+def test_columns_of_a_new_file_are_read_again(base: Watch, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(HEADER + row(0))
+    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+    assert new(messages) == [0]
+    renamed(path)
+    append(path, "strain_2,step\n1e-4,1\n")
+    message, _ = next(messages)
+    assert isinstance(message, Message)
+    assert (message.turn, message.observed[1], np.isnan(message.observed[0])) == (1, 1e-4, True)
+
+
+def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file(
+    base: Watch, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(HEADER)
+    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+    for character in row(0)[:-1]:
+        append(path, character)
+        assert new(messages) == []
+    append(path, "\n" + "1,2e")
+    assert new(messages) == [0]
+    renamed(path)
+    append(path, row(1) + row(2))  # without a header: it must not be taken for the rest of the row
+    assert new(messages) == ["1,2e", 1, 2]
+
+
+def test_a_cut_without_a_copy_is_told(base: Watch, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(HEADER + row(0) + row(1))
+    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+    assert new(messages) == [0, 1]
+    size = path.stat().st_size
+    path.write_text(HEADER + "".join(map(row, range(2, 9))))  # longer than before: it is known by its rows
+    refused, _ = next(messages)
+    assert str(refused) == (
+        f"log.csv was cut at byte {size}, and no copy is beside it: what stood behind that and was not read "
+        "yet is lost"
+    )
+    assert new(messages) == list(range(2, 9))
+
+
+def test_a_copy_in_the_place_of_a_log_is_read_on(base: Watch, tmp_path: Path) -> None:
+    """As rsync does it: another file, which begins with the same rows."""
+    path = tmp_path / "log.csv"
+    path.write_text(HEADER + row(0) + row(1))
+    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+    assert new(messages) == [0, 1]
+    (tmp_path / "fresh").write_text(path.read_text() + row(2))
+    (tmp_path / "fresh").rename(path)
+    assert new(messages) == [2]
+
+
+@pytest.mark.parametrize("rotation", ["create", "copytruncate"])
+def test_a_watch_that_was_down_takes_up_a_rotated_log(
+    base: Watch, mission: Flight, tmp_path: Path, rotation: str
+) -> None:
+    recorded = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
+    never = begun(base, tmp_path / "never")
+    watched(never, CsvFeed(recorded, never.scenario), 50)
+    header, *rows = recorded.read_text().splitlines(keepends=True)
+    path, watch = tmp_path / "log.csv", begun(base, tmp_path / "watch")
+    path.write_text(header)
+    for turn, text in enumerate(rows):
+        if turn in (15, 30, 33):
+            ROTATIONS[rotation](path)
+            append(path, header)
+        append(path, text)
+        if turn in (13, 17, 20, 29, 49):  # else it is down
+            counts = watched(watch, CsvFeed(path, watch.scenario, follow=True), turn + 1 - turn % 4)
+    assert (counts.received, counts.missing, counts.duplicates, counts.rejected) == (49, 0, 0, 0)
+    for one, other in zip(lines(never), lines(watch), strict=False):
+        for record in (one, other):
+            del record["intake"]["source"]
+            record.pop("standing", None)
+        assert one == other
+
+
+def watched(watch: Watch, feed: CsvFeed, turns: int) -> Counts:
+    return watch.run(feed, lambda _decision: None, turns=turns)
