@@ -1,8 +1,10 @@
-"""A watch that is taken up after one turn and after 20,000, up to its next decision."""
+"""A watch that is taken up after few turns and after 20,000, up to its next decision."""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -61,24 +63,37 @@ def taken_up(folder: Path, log: Path) -> tuple[float, float]:
     return end - begin, end - prepared
 
 
+def in_a_process(folder: Path, log: Path) -> list[float]:
+    """Return the seconds of the processor that a new process takes, and of these what `taken_up` tells."""
+    command = [sys.executable, "-m", "benchmarks.bench_watch", str(folder), str(log)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return [float(word) for word in done.stdout.split()]
+
+
 def run() -> list[Measurement]:
-    """Measure both."""
+    """Measure after one turn, after as many as are filtered again, and after years."""
     with tempfile.TemporaryDirectory() as name:
         place, seconds = Path(name), {}
         log = place / "log.csv"
-        for turns in (1, TURNS):
+        for turns in (1, 99, TURNS + 19):  # 32 turns between two lines with all that is needed
             folder = place / str(turns)
             loaded = load_scenario(SCENARIO)
             watch, lock = begin_watch(loaded, folder, Overrides(), SilentProgress(), replace_run=False)
             if not log.exists():
-                record(watch, log, TURNS + 1)
+                record(watch, log, TURNS + 20)
             watch.run(file_feed(log, watch.scenario), lambda _decision: None, turns=turns)
             os.close(lock)
-            seconds[turns] = np.median([taken_up(folder, log) for _ in range(REPETITIONS)], axis=0)
+            seconds[turns] = np.median([in_a_process(folder, log) for _ in range(REPETITIONS)], axis=0)
     return [
         Measurement(
-            f"a watch taken up after {TURNS} turns{what}", float(seconds[TURNS][kind]), "s", None,
-            "after one", float(seconds[1][kind]),
+            f"a watch taken up after {TURNS + 19} turns{what}", float(seconds[TURNS + 19][kind]), "s", None,
+            f"after {turns}", float(seconds[turns][kind]),
         )
-        for kind, what in enumerate(("", ", behind the model"))
+        for turns in (1, 99)
+        for kind, what in ((0, ", all of its process"), (2, ", what depends on the journal"))
     ]  # fmt: skip
+
+
+if __name__ == "__main__":
+    without, behind = taken_up(Path(sys.argv[1]), Path(sys.argv[2]))
+    print(time.process_time(), without, behind)

@@ -20,7 +20,7 @@ RECOGNISED_BY = 9
 """First lines of a file by which it is known again, also under another name."""
 _LONGEST = 1_000_000
 """Bytes of these at most."""
-_ENDING = re.compile(r"\.\d[\d_-]*|-\d{8}[\d-]*")
+_NUMBER, _DATE = re.compile(r"\.\d{1,6}"), re.compile(r"[.-]\d{4}-?\d\d-?\d\d[\d_-]*")
 
 
 def rotated(path: Path) -> list[Path]:
@@ -30,8 +30,11 @@ def rotated(path: Path) -> list[Path]:
     `log.csv.1`, `log.csv-20260501`, `log.csv.2026-05-01_12`.
     """
     beside = path.parent.glob(f"{escape(path.name)}[.-]*")
-    older = [file for file in beside if _ENDING.fullmatch(file.name.removeprefix(path.name))]
-    return sorted(older, key=lambda file: file.stat().st_mtime_ns)
+    endings = [file.name.removeprefix(path.name) for file in beside]
+    numbers = [ending for ending in endings if _NUMBER.fullmatch(ending)]
+    dates = [ending for ending in endings if _DATE.fullmatch(ending)]
+    ordered = sorted(dates) + sorted(numbers, key=lambda ending: -int(ending[1:]))
+    return [path.with_name(path.name + ending) for ending in ordered]
 
 
 def found(path: Path, place: Place | None, *, follow: bool) -> Path | None:
@@ -150,11 +153,15 @@ class GrowingFile(io.RawIOBase):
             here = os.fstat(self._file.fileno())
             if os.path.samestat(here, self._path.stat()):
                 return None
-            files = [*rotated(self._path), self._path]
-            own = [number for number, file in enumerate(files) if os.path.samestat(here, file.stat())]
-            behind = files[own[0] + 1 :] if own else [self._path]
-            return next((file for file in behind if file.stat().st_size), None)
+            listed, again = self._listed(), self._listed()
+            own = [number for number, inode in enumerate(listed.values()) if inode == here.st_ino]
+            behind = [*listed][own[0] + 1 :] if own else [self._path]
+            coming = next((file for file in behind if file.stat().st_size), None)
+            return coming if listed == again == self._listed() else None
         return None
+
+    def _listed(self) -> dict[Path, int]:
+        return {file: file.stat().st_ino for file in (*rotated(self._path), self._path)}
 
     def _go_on(self, file: Path, buffer: Any, *, copied: bool = False) -> int:
         """Read on in another file; a line goes on only into a copy, and from there into what was cut."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from itertools import takewhile
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -127,9 +130,32 @@ def test_several_rotations_between_two_looks(base: Watch, tmp_path: Path) -> Non
     for turn in (1, 2, 3):
         append(path, row(turn))
         renamed(path)
-        os.utime(path.with_name("log.csv.1"), (turn, turn))  # coarse clocks give all of them the same time
     append(path, HEADER.replace("strain_1,strain_2", "strain_2,strain_1") + row(4))
     assert new(messages) == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("way", ["logging", "copytruncate"])
+def test_a_writer_that_does_not_wait_for_its_reader(base: Watch, tmp_path: Path, way: str) -> None:
+    path, turns = tmp_path / "log.csv", 4000
+    path.write_text(HEADER)
+    handler = RotatingFileHandler(path, maxBytes=2000 if way == "logging" else 0, backupCount=1000)
+    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+
+    def write() -> None:
+        for turn in range(turns):
+            if way == "copytruncate" and turn % 500 == 250:  # between copy and cut nobody may write
+                ROTATIONS[way](path)
+            handler.emit(logging.makeLogRecord({"msg": row(turn).strip()}))
+        handler.close()
+
+    writer = Thread(target=write)
+    writer.start()
+    found: list[int | str] = []
+    while writer.is_alive():
+        found += new(messages)
+    writer.join()
+    assert found + new(messages) == list(range(turns))
+    assert len(list(tmp_path.glob("log.csv.*"))) >= (30 if way == "logging" else 8)
 
 
 def test_columns_of_a_new_file_are_read_again(base: Watch, tmp_path: Path) -> None:
