@@ -1,14 +1,20 @@
-"""Folders for extracted FMUs and their workers: where they are made, and how they are removed."""
+"""Folders for extracted FMUs and their workers: where they are made, and how they are removed.
+
+None lies in a folder that others can write into: each has a parent of its own, which only its user may enter.
+"""
 
 import os
 import re
+import signal
 import tempfile
+import time
 from contextlib import suppress
 from pathlib import Path
 
 from .errors import FmuFileError
 
 _tidied: set[Path] = set()
+_ROUNDS = 100
 _PLAIN_PATH = re.compile(r"[A-Za-z0-9/_.\-]+")
 
 
@@ -24,11 +30,14 @@ def plain_folder() -> Path:
         If no such folder can be made.
     """
     candidates = [tempfile.gettempdir(), "/tmp", "/var/tmp", "/dev/shm"]
-    for parent in candidates:
-        path = Path(parent)
+    for name in candidates:
+        path = Path(name)
         if _PLAIN_PATH.fullmatch(str(path.absolute())) and path.is_dir() and os.access(path, os.W_OK):
             _remove_leftovers(path)
-            return Path(tempfile.mkdtemp(prefix=f"{_prefix()}{os.getpid()}-", dir=path)).absolute()
+            parent = tempfile.mkdtemp(prefix=f"{_prefix()}{os.getpid()}-", dir=path)
+            folder = Path(parent, "own").absolute()
+            folder.mkdir(0o700)
+            return folder
     raise FmuFileError(
         f"FMUs need a writable folder for temporary files with a plain ASCII path, but none of "
         f"{', '.join(candidates)} is one; set TMPDIR."
@@ -44,6 +53,7 @@ def _remove_leftovers(parent: Path) -> None:
         number = folder.name.removeprefix(_prefix()).partition("-")[0]
         with suppress(OSError):
             if number.isdigit() and folder.lstat().st_uid == os.getuid() and not _runs(int(number)):
+                end_processes(folder)
                 remove_folder(folder)
 
 
@@ -63,6 +73,27 @@ def _runs(number: int) -> bool:
     except (PermissionError, OverflowError):
         return True
     return True
+
+
+def end_processes(folder: str | os.PathLike[str]) -> None:
+    """End the processes whose folder for temporary files was in this one when their program began.
+
+    A process has that of its parent, in whatever group or session it hides and whoever has ended before it.
+    """
+    mark, found, rounds = f"\0TMPDIR={os.fspath(folder)}".encode(), True, 0
+    while found and rounds < _ROUNDS:
+        found, rounds = False, rounds + 1
+        for name in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208 - here and below, strings
+            with suppress(OSError):
+                handle = os.pidfd_open(int(name))  # it stands for no other process, whoever has the number
+                try:
+                    with open(f"/proc/{name}/environ", "rb") as file:  # noqa: PTH123
+                        if mark in b"\0" + file.read():
+                            signal.pidfd_send_signal(handle, signal.SIGKILL)
+                            found = True
+                finally:
+                    os.close(handle)
+        time.sleep(0.01 * found)
 
 
 def remove_folder(folder: str | os.PathLike[str]) -> None:
@@ -89,5 +120,8 @@ def remove_folder(folder: str | os.PathLike[str]) -> None:
         if here != top:
             with suppress(OSError):
                 os.rmdir(here)  # noqa: PTH106
+    parent = os.path.dirname(top)  # noqa: PTH120
     with suppress(OSError):
         os.rmdir(top)  # noqa: PTH106
+        if os.path.basename(parent).startswith(_prefix()):  # noqa: PTH119
+            os.rmdir(parent)  # noqa: PTH106

@@ -51,6 +51,7 @@ _LARGEST_PATTERN = 100_000
 _Text = Annotated[str, Field(min_length=1)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_Texts = Annotated[tuple[_Text, ...], Field(strict=False)]
 
 
 class Scalar(Section):
@@ -177,11 +178,20 @@ class WorkerLimits(Section):
         Wall clock for one step, and for loading and initialisation [s].
     memory : float or None
         Resident memory [MiB].
+    sandbox : bool
+        Whether the system keeps the FMU from the user's files, from programs and from the network.
+    read, write, ports, programs
+        What it may touch all the same; see `Grants` of the worker.
     """
 
     step_time: _Positive | None = None
     load_time: _Positive | None = None
     memory: _Positive | None = None
+    sandbox: bool = True
+    read: _Texts = ()
+    write: _Texts = ()
+    ports: Annotated[tuple[Annotated[int, Field(ge=1, le=65535)], ...], Field(strict=False)] = ()
+    programs: bool = False
 
 
 class Header(Section):

@@ -1,10 +1,12 @@
 """Where the instance of an asset lives: the extracted FMU, and the worker process or this one."""
 
+import logging
 import math
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.extraction import Extraction
@@ -14,9 +16,13 @@ from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance, forget_modules
 from fmu_asset.instances.plan import Plan
 from fmu_asset.worker.client import Limits, WorkerInstance
+from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 
 from .binding import Binding
 from .restart import Instance, ResetTrial, Start, outputs_of
+
+_logger = logging.getLogger(__name__)
+_said: set[str] = set()
 
 
 class Housing:
@@ -140,6 +146,7 @@ class Housing:
     def _open(self, plan: Plan) -> Instance:
         if not self._isolated:
             return open_instance(plan)
+        _say_sandbox(self._description.path, self._limits.sandbox, plan.folder)
         scratch = plain_folder()
         try:
             return WorkerInstance(plan, scratch, limits=self._limits)
@@ -158,6 +165,33 @@ def _release(instance: Instance, extraction: Extraction) -> None:
     if isinstance(instance, FmuInstance):
         forget_modules(str(extraction.folder))
     extraction.release()
+
+
+def _say_sandbox(path: Path, grants: Grants | None, shared: str) -> None:
+    """Say once where FMUs, or where this one, are not kept from the user's files.
+
+    Raises
+    ------
+    FmuInputError
+        If what is granted does not exist.
+    """
+    if grants is not None and (missing := missing_path(grants, shared)):
+        raise FmuInputError(
+            f"The table [limits] of the binding of {path} grants {missing!r}, which does not exist; correct "
+            "the path."
+        )
+    if grants is None:
+        said = f"{path}: its binding turns the sandbox off, so that it has all rights of its user."
+    elif not landlock_version():
+        said = (
+            "This kernel has no Landlock (Linux 5.13 or later), so that FMUs have all rights of their user; "
+            "fly what is not trusted in a container."
+        )
+    else:
+        return
+    if said not in _said:
+        _said.add(said)
+        _logger.warning(said)
 
 
 def limits_of(
@@ -180,4 +214,5 @@ def limits_of(
         step_time=step_timeout or own.step_time or default.step_time,
         load_time=load_timeout or own.load_time or default.load_time,
         memory=memory_limit or own.memory or default.memory,
+        sandbox=Grants(own.read, own.write, own.ports, own.programs) if own.sandbox else None,
     )

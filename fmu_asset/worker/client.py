@@ -6,7 +6,7 @@ import json
 import select
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from fmu_asset import errors
@@ -30,6 +30,7 @@ from .protocol import (
     send,
     separated,
 )
+from .sandbox import Grants
 
 _MEBIBYTE = 1024**2
 _STEP = int(Operation.STEP)
@@ -57,11 +58,14 @@ class Limits:
         Wall clock for loading, instantiation, initialisation and reset [s].
     memory : float
         Resident memory [MiB].
+    sandbox : Grants or None
+        What it may touch beyond what every FMU may; None for all that its user may.
     """
 
     step_time: float = 60.0
     load_time: float = 60.0
     memory: float = 4096.0
+    sandbox: Grants | None = field(default_factory=Grants)
 
 
 class WorkerInstance:
@@ -103,7 +107,7 @@ class WorkerInstance:
         self._lost = False
         # An exception between question and answer, such as an interruption, leaves the two out of step.
         self._busy = False
-        self._process = WorkerProcess(scratch, plan.folder)
+        self._process = WorkerProcess(scratch, plan.folder, limits.sandbox)
         self._out, self._in = self._process.outgoing, self._process.incoming
         self._next_glance = 0.0
         self._first_wait = 1000.0 * min(limits.step_time, _GLANCE)

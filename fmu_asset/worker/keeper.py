@@ -16,7 +16,7 @@ from typing import NoReturn
 
 from fmu_asset.folders import remove_folder
 
-from .protocol import WORKER_NUMBER
+from .protocol import OWN_FAILURE, WORKER_NUMBER
 
 _GRACE = 2.0
 """Seconds in which a worker without a twin ends by itself."""
@@ -24,7 +24,7 @@ _LONGEST_END = 5.0
 _DEATH_SIGNAL, _CHILD_SUBREAPER = 1, 36  # of prctl(2)
 
 
-def keep(incoming: int, outgoing: int, scratch: str, shared: str) -> NoReturn:
+def keep(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -> NoReturn:
     """Start the worker, await its end or the twin's, clear up, and end as the worker did.
 
     Parameters
@@ -33,6 +33,8 @@ def keep(incoming: int, outgoing: int, scratch: str, shared: str) -> NoReturn:
         The worker's ends of the pipes.
     scratch, shared : str
         Folder of the worker, and of the extracted FMU; the twin removes them unless it is dead.
+    grants : str
+        `Grants` of the sandbox as JSON; an empty text for none.
     """
     import resource
 
@@ -64,10 +66,7 @@ def keep(incoming: int, outgoing: int, scratch: str, shared: str) -> NoReturn:
         prctl(_DEATH_SIGNAL, int(signal.SIGKILL), 0, 0, 0)
         if os.getppid() != keeper:
             os._exit(0)
-        # Here, so that the keeper has nothing of it.
-        from .server import serve
-
-        serve(incoming, outgoing)
+        _work(incoming, outgoing, scratch, shared, grants)
     signal.signal(signal.SIGTERM, end_now)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     os.write(outgoing, WORKER_NUMBER.pack(worker))
@@ -83,6 +82,27 @@ def keep(incoming: int, outgoing: int, scratch: str, shared: str) -> NoReturn:
             signal.signal(number, signal.SIG_DFL)
         os.kill(keeper, number)
     os._exit(os.waitstatus_to_exitcode(status) % 256)
+
+
+def _work(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -> NoReturn:
+    """Be the worker; it is confined before a library has made a thread, which would not be."""
+    # Here, so that the keeper has nothing of it.
+    try:
+        confined = False
+        if grants:
+            import json
+
+            from .sandbox import Grants, confine
+
+            confined = confine(Grants(**json.loads(grants)), scratch, shared)
+        from .server import serve
+
+        serve(incoming, outgoing, confined=confined)
+    except BaseException:  # noqa: BLE001 - the twin reads the last words in worker.log
+        import traceback
+
+        traceback.print_exc()
+    os._exit(OWN_FAILURE)
 
 
 def _await_end(worker: int, incoming: int, woken: int) -> tuple[bool, int]:
@@ -130,12 +150,15 @@ def _end_descendants() -> None:
                 continue
         except ChildProcessError:
             return
-        for child in _children():
+        for child, group in _children():
             os.kill(child, signal.SIGKILL)
+            if group != os.getpgrp():  # at once, so that nobody in it can have a child meanwhile
+                os.killpg(group, signal.SIGKILL)
         time.sleep(0.002)
 
 
-def _children() -> list[int]:
+def _children() -> list[tuple[int, int]]:
+    """Return the keeper's children with their process groups."""
     keeper, found = os.getpid(), []
     for name in os.listdir("/proc"):  # noqa: PTH208 - pathlib would be loaded for this alone
         if name.isdigit():
@@ -145,7 +168,7 @@ def _children() -> list[int]:
             except OSError:
                 continue
             if int(fields[1]) == keeper:
-                found.append(int(name))
+                found.append((int(name), int(fields[2])))
     return found
 
 

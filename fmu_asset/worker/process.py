@@ -1,16 +1,20 @@
 """A worker process as the twin starts, watches and ends it."""
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 from fmu_asset.errors import FmuWorkerError
+from fmu_asset.folders import end_processes
 
 from .protocol import OWN_FAILURE, PIPES_GONE, WORKER_NUMBER, receive
+from .sandbox import Grants, landlock_version
 
 CLOSE_LIMIT = 2.0
 """Seconds that a worker has to end by itself."""
@@ -25,7 +29,8 @@ _MEANINGS = {
     "SIGXFSZ": "the FMU wrote more than 2 GiB to one file",
     "SIGKILL": "somebody killed it, or the system ran out of memory",
 }
-_REMEDY = "Reset the asset, or resume the run, to go on; if it happens again, the FMU is at fault."
+_REMEDY = "Reset the asset, or resume the run, to go on; if it happens again, the FMU is at fault"
+_CONFINED = ", or needs what its sandbox does not grant ([limits] of its binding)"
 
 
 class WorkerProcess:
@@ -37,6 +42,8 @@ class WorkerProcess:
         Scratch folder: the working directory, and where its output goes.
     shared : str
         Folder of the extracted FMU.
+    grants : Grants or None
+        What it may touch beyond what every FMU may; None for no sandbox.
 
     Attributes
     ----------
@@ -51,8 +58,9 @@ class WorkerProcess:
         If it cannot be started.
     """
 
-    def __init__(self, folder: Path, shared: str) -> None:
+    def __init__(self, folder: Path, shared: str, grants: Grants | None) -> None:
         self._folder = folder
+        self._remark = _CONFINED if grants is not None and landlock_version() else ""
         their_in, self.outgoing = os.pipe()
         self.incoming, their_out = os.pipe()
         root = str(Path(__file__).parents[2])
@@ -62,8 +70,9 @@ class WorkerProcess:
         )
         # One thread: the matrices are small, and results do not depend on the number of cores.
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        environment["PYTHONDONTWRITEBYTECODE"] = "1"
-        arguments = [root, str(their_in), str(their_out), str(folder), shared]
+        environment |= {"PYTHONDONTWRITEBYTECODE": "1", "TMPDIR": str(folder)}
+        confined = "" if grants is None else json.dumps(asdict(grants))
+        arguments = [root, str(their_in), str(their_out), str(folder), shared, confined]
         try:
             with (folder / "worker.log").open("wb") as log:
                 self._process = subprocess.Popen(
@@ -100,6 +109,8 @@ class WorkerProcess:
             except subprocess.TimeoutExpired:  # the worker dies with its keeper
                 self._process.kill()
                 self._process.wait()
+            if self._process.returncode == -signal.SIGKILL:  # of the worker, or of the keeper before its work
+                end_processes(self._folder)
 
     def end(self, limit: float) -> None:
         """Wait for its end, and kill what is left then."""
@@ -131,7 +142,7 @@ class WorkerProcess:
         else:
             how = f"ended with exit status {code}: the FMU's code ended its own process"
         return FmuWorkerError(
-            f"During {what} the worker process of the FMU {how}. {_REMEDY}", self._last_words()
+            f"During {what} the worker process of the FMU {how}. {_REMEDY}{self._remark}.", self._last_words()
         )
 
     def _await_end(self, limit: float) -> bool:

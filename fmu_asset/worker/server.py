@@ -1,5 +1,6 @@
 """The worker's side: it imports fmpy, and of the project `errors`, `instances` and this folder only."""
 
+import ctypes
 import errno
 import faulthandler
 import os
@@ -48,13 +49,23 @@ _STEP, _RUN, _OPEN, _RENEW, _CLOSE, _LOG = (
 )
 
 
-def serve(incoming: int, outgoing: int) -> NoReturn:
+_NOT_GRANTED = (
+    " The system refused it something (Permission denied), as its sandbox does: what it needs can be granted "
+    "by `read`, `write`, `ports` or `programs` in the table [limits] of its binding."
+)
+_locate_errno = ctypes.CDLL(None).__errno_location
+_locate_errno.restype = ctypes.c_void_p
+
+
+def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
     """Answer requests until the pipe closes, and end.
 
     Parameters
     ----------
     incoming, outgoing : int
         File descriptors of the pipes.
+    confined : bool
+        Whether this process is in a sandbox, so that a failure may come from it.
     """
     # The twin decides what an interruption means; the worker ends when its pipe closes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -62,7 +73,7 @@ def serve(incoming: int, outgoing: int) -> NoReturn:
     restrict()
     asked = False
     try:
-        asked, instance = _answer_requests(incoming, outgoing)
+        asked, instance = _answer_requests(incoming, outgoing, confined=confined)
         if instance is not None:
             instance.close()
     except BrokenPipeError:
@@ -77,7 +88,7 @@ def serve(incoming: int, outgoing: int) -> NoReturn:
     os._exit(0 if asked else DESERTED)
 
 
-def _answer_requests(incoming: int, outgoing: int) -> tuple[bool, FmuInstance | None]:
+def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[bool, FmuInstance | None]:
     """Answer requests; return whether the end was asked for, and the instance that is still open."""
     asked, own_number = False, os.getpid()
     instance: FmuInstance | None = None
@@ -85,6 +96,7 @@ def _answer_requests(incoming: int, outgoing: int) -> tuple[bool, FmuInstance | 
     header = bytearray(HEADER.size)
     header_view = memoryview(header)
     reply_header = bytearray(HEADER.size)
+    system_error = ctypes.c_int.from_address(_locate_errno())  # what a call of the FMU leaves in `errno`
     request = reply = memoryview(b"")
     poll = select.poll()
     poll.register(incoming, select.POLLIN | select.POLLHUP)
@@ -98,7 +110,7 @@ def _answer_requests(incoming: int, outgoing: int) -> tuple[bool, FmuInstance | 
                 payload: bytes | memoryview = reply
             else:
                 content = bytearray(length)
-                asked = operation == _CLOSE
+                asked, system_error.value = operation == _CLOSE, 0
                 if not receive(incoming, memoryview(content)) or asked:
                     break
                 if operation == _OPEN:
@@ -116,9 +128,11 @@ def _answer_requests(incoming: int, outgoing: int) -> tuple[bool, FmuInstance | 
             logged = instance is not None and instance.has_log and operation != _LOG
             HEADER.pack_into(reply_header, 0, RESULT, logged, number, len(payload))
         except FmuError as error:
+            refused = system_error.value in (errno.EACCES, errno.EPERM) or "ermission denied" in str(error)
+            sentence = error.sentence + _NOT_GRANTED * (confined and refused)
             lost = instance is None or instance.lost
             time = "" if error.time is None else repr(error.time)
-            payload = joined(type(error).__name__, "lost" * lost, time, error.sentence, *error.messages)
+            payload = joined(type(error).__name__, "lost" * lost, time, sentence, *error.messages)
             HEADER.pack_into(reply_header, 0, FAILURE, 0, number, len(payload))
         if os.getpid() != own_number:
             os._exit(0)  # a copy that the FMU has made of this process

@@ -1,0 +1,207 @@
+"""What an FMU may touch: its own folder, what Python and the system's libraries are made of, and no socket.
+
+FMUs are native code with the rights of their user. Two things that any process may do to itself, and that
+all its children inherit, take rights away: Landlock (landlock(7)) those to files, programs, TCP ports and
+signals, and a filter of system calls (seccomp(2)) those that Landlock leaves: sockets of all other kinds,
+through which a service of the user would do what the FMU may not, and changes of the rights of files.
+"""
+
+import ctypes
+import os
+import platform
+import stat
+import struct
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from errno import EACCES
+from functools import cache
+
+# <linux/landlock.h>; the numbers of the system calls are those of every processor.
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
+_BENEATH, _PORT = 1, 2
+_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_FOLDER, _TRUNCATE, _DEVICE = (1 << k for k in (0, 1, 2, 3, 14, 15))
+_READ = _READ_FILE | _READ_FOLDER
+_ALL = (1 << 16) - 1
+_FILE = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _DEVICE
+_BIND, _CONNECT = 1, 2
+_SOCKETS_AND_SIGNALS = 3
+_NO_NEW_PRIVILEGES, _SET_FILTER = 38, 22  # of prctl(2)
+
+_SYSTEM = (
+    "/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/opt", "/nix/store", "/gnu/store",
+    *(f"/etc/{name}" for name in (
+        "alternatives", "fonts", "gai.conf", "group", "host.conf", "hosts", "ld.so.cache", "ld.so.conf",
+        "ld.so.conf.d", "locale.alias", "localtime", "machine-id", "nsswitch.conf", "os-release", "passwd",
+        "protocols", "resolv.conf", "services", "ssl/certs", "ssl/openssl.cnf", "timezone",
+    )),
+    *(f"/proc/{name}" for name in ("self", "cpuinfo", "meminfo", "stat", "version", "filesystems", "sys")),
+    "/sys/devices/system", "/sys/fs/cgroup",
+)  # fmt: skip
+_DEVICES = tuple(f"/dev/{name}" for name in ("null", "zero", "full", "random", "urandom"))
+
+
+@dataclass(frozen=True)
+class Grants:
+    """What an FMU may touch beyond what every FMU may.
+
+    Attributes
+    ----------
+    read, write : tuple of str
+        Files and folders with all that is in them: absolute, of a home (`~`), or in the FMU's own folder.
+    ports : tuple of int
+        TCP ports to which it may connect, on any host; names of hosts are looked up then, too.
+    programs : bool
+        Whether it may start the programs that it can read; they are as confined as it is.
+    """
+
+    read: tuple[str, ...] = ()
+    write: tuple[str, ...] = ()
+    ports: tuple[int, ...] = ()
+    programs: bool = False
+
+
+@cache
+def landlock_version() -> int:
+    """Return the version of the kernel's Landlock; 0 where there is none, or where a container hides it."""
+    return max(int(_libc().syscall(_CREATE_RULESET, None, 0, 1)), 0)
+
+
+def confine(grants: Grants, own: str, shared: str) -> bool:
+    """Take from this process, for good, what an FMU does not need; return False where there is no Landlock.
+
+    Parameters
+    ----------
+    grants : Grants
+        What it may touch beyond that.
+    own : str
+        The one folder in which it may write.
+    shared : str
+        Folder or file of the FMU, which it may read.
+
+    Raises
+    ------
+    OSError
+        If the system refuses, or a granted path does not exist. The process is not confined then.
+    """
+    version = landlock_version()
+    if not version:
+        return False
+    # What a version does not know would be refused: it is left out.
+    handled = _ALL >> (3, 2, 1, 1)[version - 1] if version < 5 else _ALL
+    program = _EXECUTE if grants.programs else 0
+    attributes = struct.pack(
+        "QQQ", handled, _BIND | _CONNECT if version > 3 else 0, _SOCKETS_AND_SIGNALS if version > 5 else 0
+    )
+    rules = _done(_libc().syscall(_CREATE_RULESET, attributes, len(attributes), 0))
+    everything = _ALL & ~_EXECUTE
+    for paths, access in (
+        ((*_SYSTEM, *_paths_of_python(), shared), _READ | program),
+        ((*_DEVICES, own), everything | program),
+        ([_located(path, shared) for path in grants.read], _READ | program),
+        ([_located(path, shared) for path in grants.write], everything | program),
+    ):
+        _allow(rules, paths, access & handled)
+    for port in grants.ports if version > 3 else ():
+        rule = struct.pack("QQ", _CONNECT, port)
+        _done(_libc().syscall(_ADD_RULE, rules, _PORT, rule, 0))
+    _done(_libc().prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0))
+    _done(_libc().syscall(_RESTRICT_SELF, rules, 0))
+    os.close(rules)
+    _filter_calls(tcp=bool(grants.ports))
+    return True
+
+
+def missing_path(grants: Grants, shared: str) -> str:
+    """Return the first path that is granted and does not exist; an empty text if all do."""
+    given = (*grants.read, *grants.write)
+    return next((path for path in given if not os.path.exists(_located(path, shared))), "")  # noqa: PTH110
+
+
+@cache
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def _done(result: int) -> int:
+    if result < 0:
+        raise OSError(ctypes.get_errno(), f"the sandbox: {os.strerror(ctypes.get_errno())}")
+    return result
+
+
+def _located(path: str, shared: str) -> str:
+    return os.path.join(shared, os.path.expanduser(path))  # noqa: PTH111, PTH118 - pathlib would be loaded
+
+
+def _paths_of_python() -> Iterator[str]:
+    """Yield where Python finds modules and libraries; never a folder that the user's own lies in."""
+    home = os.path.realpath(os.path.expanduser("~"))  # noqa: PTH111
+    libraries = os.environ.get("LD_LIBRARY_PATH", "").split(":")
+    for path in {sys.prefix, sys.base_prefix, *sys.path, *libraries}:
+        if path and os.path.commonpath((home, os.path.realpath(path))) != os.path.realpath(path):
+            yield path
+
+
+def _allow(rules: int, paths: Iterable[str], access: int) -> None:
+    for path in paths:
+        try:
+            descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        except OSError:
+            continue
+        is_folder = stat.S_ISDIR(os.fstat(descriptor).st_mode)
+        rule = struct.pack("=Qi", access if is_folder else access & _FILE, descriptor)
+        _done(_libc().syscall(_ADD_RULE, rules, _BENEATH, rule, 0))
+        os.close(descriptor)
+
+
+# ---------------------------------------------------------------------- system calls
+
+_LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06  # of the packet filter, <linux/bpf_common.h>
+_NUMBER, _PROCESSOR, _FIRST_ARGUMENT, _THIRD_ARGUMENT = 0, 4, 16, 32  # of `seccomp_data`, in bytes
+_GRANTED, _ERROR = 0x7FFF0000, 0x50000
+_OTHER_NUMBERS = 0x40000000  # of the same calls, for another size of pointers
+_INTERNET, _PLAIN_PROTOCOLS = (2, 10), (0, 6, 17)  # IPv4 and IPv6; TCP, and UDP for the names of hosts
+
+# By processor: its number, that of socket(), calls that are refused (io_uring, by which sockets could be
+# made all the same, and the user's keys), and calls that return OK and do nothing: the rights, owners,
+# times and attributes of files, whoever's they are; those who copy a file change them without need.
+_CALLS = {
+    "x86_64": (
+        0xC000003E, 41, (248, 249, 250, 425),
+        (90, 91, 92, 93, 94, 132, 188, 189, 190, 197, 198, 199, 235, 260, 261, 268, 280, 452, 463, 466),
+    ),
+    "aarch64": (
+        0xC00000B7, 198, (217, 218, 219, 425), (5, 6, 7, 14, 15, 16, 52, 53, 54, 55, 88, 452, 463, 466),
+    ),
+}  # fmt: skip
+
+
+def _filter_calls(*, tcp: bool) -> None:
+    """Refuse sockets, but for those of the internet where a port is granted, which Landlock then watches."""
+    if platform.machine() not in _CALLS:
+        return
+    processor, socket, refused, idle = _CALLS[platform.machine()]
+    granted, denied, done = (
+        struct.pack("HBBI", _RETURN, 0, 0, value) for value in (_GRANTED, _ERROR | EACCES, _ERROR)
+    )
+
+    def load(place: int) -> bytes:
+        return struct.pack("HBBI", _LOAD, 0, 0, place)
+
+    def where(test: int, value: int, then: bytes, *, otherwise: bool = False) -> bytes:
+        return struct.pack("HBBI", test, int(otherwise), int(not otherwise), value) + then
+
+    code = load(_PROCESSOR) + where(_EQUAL, processor, denied, otherwise=True) + load(_NUMBER)
+    code += where(_AT_LEAST, _OTHER_NUMBERS, denied)
+    code += b"".join(where(_EQUAL, number, denied) for number in refused)
+    code += b"".join(where(_EQUAL, number, done) for number in idle)
+    code += where(_EQUAL, socket, granted, otherwise=True)
+    if tcp:
+        code += load(_FIRST_ARGUMENT) + struct.pack("HBBI", _EQUAL, 2, 0, _INTERNET[0])
+        code += where(_EQUAL, _INTERNET[1], denied, otherwise=True) + load(_THIRD_ARGUMENT)
+        # Others, such as multipath TCP, Landlock does not watch.
+        code += b"".join(where(_EQUAL, number, granted) for number in _PLAIN_PROTOCOLS)
+    code += denied
+    content = ctypes.create_string_buffer(code, len(code))
+    filter_ = ctypes.create_string_buffer(struct.pack("HxxxxxxQ", len(code) // 8, ctypes.addressof(content)))
+    _done(_libc().prctl(_SET_FILTER, 2, filter_, 0, 0))
