@@ -5,6 +5,7 @@ from collections import deque
 from typing import Any, NoReturn, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from fmu_asset.archive.declared import FmuDescription, describe_fmu
 from fmu_asset.archive.fmu_file import read_fmu
@@ -244,14 +245,8 @@ class OpenedFmu(SteppedAsset):
             request[-self._lines :] = request[2 : 2 + self._lines]
         start = Start(self._start_time, self._step_size, self._settings, request, with_inputs)
         try:
-            instance = self._housing.instance
-            if renewed and instance is not None:
-                start.make(instance)
-            else:
-                instance = self._housing.start(start)
-            self._request = memoryview(instance.request).cast("B").cast("d")
-            self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
-            self._reader = Reader(self._exchange.outputs, self._reply)
+            instance = self._housing.start(start, renewed=renewed)
+            self._adopt(instance)
         except FmuError as error:
             self.close()
             self._fail(error, "the start")
@@ -259,6 +254,19 @@ class OpenedFmu(SteppedAsset):
         self._record = []
         self._start_inputs = bytes(instance.request)[16:] if with_inputs else b""
         self._phase = "ready"
+
+    def _adopt(self, instance: Instance) -> None:
+        self._request = memoryview(instance.request).cast("B").cast("d")
+        self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
+        self._reader = Reader(self._exchange.outputs, self._reply)
+
+    def _stand_in(self, request: bytes, reply: npt.NDArray[np.float64]) -> Instance | None:
+        """Return what takes an instance's place if its first step shows that it was not at its start."""
+        other = self._housing.contradicted(request, reply)
+        if other is not None:
+            self._adopt(other)
+            self._request.cast("B")[:] = request
+        return other
 
     def _opened(self) -> Instance:
         """Return the instance, which is opened by its first use but never started again unasked."""

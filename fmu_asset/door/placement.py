@@ -8,6 +8,9 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.extraction import Extraction
 from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
@@ -19,7 +22,7 @@ from fmu_asset.worker.client import Limits, WorkerInstance
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 
 from .binding import Binding
-from .restart import Instance, ResetTrial, Start, outputs_of
+from .restart import FirstStep, Instance, ResetTrial, Start, Way
 
 _logger = logging.getLogger(__name__)
 _said: set[str] = set()
@@ -53,6 +56,8 @@ class Housing:
         self._release: Callable[[], object] = lambda: None
         self.instance: Instance | None = None
         self.reset_trial = ResetTrial()
+        self._way = Way.LOADING
+        self._start: Start | None = None
 
     def sibling(self) -> "Housing":
         """Return an empty housing beside this one, which shares the extracted FMU as long as it is in use."""
@@ -60,8 +65,15 @@ class Housing:
         other._extraction, other.reset_trial = self._extraction, self.reset_trial
         return other
 
-    def start(self, start: Start) -> Instance:
+    def start(self, start: Start, *, renewed: bool = False) -> Instance:
         """Return an instance at its start; never one that a fatal error has touched.
+
+        Parameters
+        ----------
+        start : Start
+            The start.
+        renewed : bool
+            Whether the instance has just been made by `renew`.
 
         Raises
         ------
@@ -70,13 +82,40 @@ class Housing:
         """
         instance = self.instance
         if instance is None or instance.lost:
-            instance = self._another()
+            instance, self._way = self._another(), Way.LOADING
+        elif renewed:
+            self._way = Way.RENEWAL
         else:
-            if self.reset_trial.works is None:
-                self._try_reset(instance, start)
             instance = self._restarted()
+        self._start = start
         start.make(instance)
         return instance
+
+    def contradicted(self, request: bytes, reply: npt.NDArray[np.float64]) -> Instance | None:
+        """Return another instance at its start if a flight's first step is not that of a new instance.
+
+        Parameters
+        ----------
+        request : bytes
+            What the step was asked; it is compared if that is what the new instance was asked.
+        reply : (n,) ndarray
+            The outputs after it.
+
+        Raises
+        ------
+        FmuError
+            If the other one cannot be started.
+        """
+        trial, start = self.reset_trial, self._start
+        if start is None or trial.chaotic or self._only_one:
+            return None
+        if trial.first is None:
+            trial.first = FirstStep(start, request, np.array(reply))
+        elif (start, request) == (trial.first.start, trial.first.request) and not trial.agrees(
+            self._description.path, self._way, reply
+        ):
+            return self.start(start)
+        return None
 
     def renew(self) -> Instance:
         """Free the instance and return another one, in the same process.
@@ -91,34 +130,38 @@ class Housing:
             return self.instance
         return self._another()
 
+    @property
+    def _only_one(self) -> bool:
+        """Whether there can be no instance beside this one, nor after it, so that nothing can be compared."""
+        return self._description.once_per_process and not self._isolated
+
     def _restarted(self) -> Instance:
-        """Return an instance as after its instantiation, by a reset where that is believed."""
-        if self.instance is not None and self.reset_trial.works:
-            with suppress(FmuCallError):
-                self.instance.reset()
-                return self.instance
+        """Return an instance as after its instantiation, by the fastest way that is seen to work."""
+        trial = self.reset_trial
+        ways: list[tuple[Way, Callable[[], Instance]]] = [(Way.RESET, self._reset)]
         if self._isolated and not self._description.once_per_process:
+            ways.append((Way.RENEWAL, self.renew))
+        for self._way, again in ways:
+            unproved = self._way == Way.RESET and trial.first is None and not self._only_one
+            if self._way < trial.way or unproved:
+                continue
             with suppress(FmuError):  # a worker that does not survive it is replaced
-                return self.renew()
+                instance = again()
+                if trial.first is None:
+                    return instance
+                if trial.agrees(self._description.path, self._way, trial.first.again(instance)):
+                    return again()
+        self._way = Way.LOADING
         return self._another()
 
-    def _try_reset(self, instance: Instance, start: Start) -> None:
-        """Find out whether the reset works, from an instance that was flown."""
-        if self._description.once_per_process and not self._isolated:
-            self.reset_trial.works = True  # there is nothing to compare it with
-            return
+    def _reset(self) -> Instance:
+        assert self.instance is not None
         try:
-            flown = outputs_of(instance)
-            try:
-                instance.reset()
-            except FmuCallError:
-                self.reset_trial.refused()
-                return
-            again = start.first_outputs(instance)
-            fresh = start.first_outputs(self._restarted())
-        except FmuError:
-            return  # what fails here tells nothing of the reset; the start itself says what is wrong
-        self.reset_trial.judge(self._description.path, flown, again, fresh)
+            self.instance.reset()
+        except FmuCallError:
+            self.reset_trial.refused()
+            raise
+        return self.instance
 
     def _another(self) -> Instance:
         """Return an instance made from the file, in a worker of its own if there are workers."""
@@ -146,7 +189,12 @@ class Housing:
     def _open(self, plan: Plan) -> Instance:
         if not self._isolated:
             return open_instance(plan)
-        _say_sandbox(self._description.path, self._limits.sandbox, plan.folder)
+        grants = self._limits.sandbox
+        if grants is not None and (missing := missing_path(grants, plan.folder)):
+            raise FmuInputError(
+                f"The table [limits] of the binding grants {missing!r}, which does not exist; correct it."
+            )
+        say_sandbox(self._description.path, grants)
         scratch = plain_folder()
         try:
             return WorkerInstance(plan, scratch, limits=self._limits)
@@ -167,19 +215,8 @@ def _release(instance: Instance, extraction: Extraction) -> None:
     extraction.release()
 
 
-def _say_sandbox(path: Path, grants: Grants | None, shared: str) -> None:
-    """Say once where FMUs, or where this one, are not kept from the user's files.
-
-    Raises
-    ------
-    FmuInputError
-        If what is granted does not exist.
-    """
-    if grants is not None and (missing := missing_path(grants, shared)):
-        raise FmuInputError(
-            f"The table [limits] of the binding of {path} grants {missing!r}, which does not exist; correct "
-            "the path."
-        )
+def say_sandbox(path: Path, grants: Grants | None) -> None:
+    """Say once that FMUs, or that this one, are not kept from the user's files, where that is so."""
     if grants is None:
         said = f"{path}: its binding turns the sandbox off, so that it has all rights of its user."
     elif not landlock_version():

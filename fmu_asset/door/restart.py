@@ -1,12 +1,15 @@
-"""Back to the start: by the FMU's own reset where it is seen to work, else by another instance.
+"""Back to the start: by the FMU's own reset where every start shows that it is as good as a new instance.
 
-Some FMUs return OK from their reset and go on from where they were. What an instance shows after its first
-reset is therefore compared with what another one shows at the same start.
+Some FMUs return OK from their reset and go on from where they were, or keep a clock that shows later only.
+The first step of the first instance is therefore kept. At every later start that step is
+made again, and where the flight itself begins with it, it is compared once more: the first difference turns
+to the next way of starting for good, a new instance in the same process and then a new process.
 """
 
 import logging
 from array import array
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +22,6 @@ from fmu_asset.worker.client import WorkerInstance
 Instance = FmuInstance | WorkerInstance
 
 _logger = logging.getLogger(__name__)
-_said: set[Path] = set()
 
 
 @dataclass(frozen=True)
@@ -55,19 +57,39 @@ class Start:
         memoryview(instance.request).cast("B").cast("d")[:] = array("d", self.request)
         instance.initialise(self.time, self.settings, with_inputs=self.with_inputs)
 
-    def first_outputs(self, instance: Instance) -> npt.NDArray[np.float64]:
-        """Initialise an instance, make a step, and return the outputs (2, n) before and after it."""
-        self.make(instance)
-        before = outputs_of(instance)
-        instance.request[0], instance.request[1] = self.time, self.step_size
+
+class Way(IntEnum):
+    """How an instance is brought back to its start, the fastest first."""
+
+    RESET = 0
+    RENEWAL = 1
+    LOADING = 2
+
+
+@dataclass(frozen=True)
+class FirstStep:
+    """The first step of a flight.
+
+    Attributes
+    ----------
+    start : Start
+        How the instance was started.
+    request : bytes
+        The request block of the step.
+    reply : (n,) ndarray
+        The outputs after it.
+    """
+
+    start: Start
+    request: bytes
+    reply: npt.NDArray[np.float64]
+
+    def again(self, instance: Instance) -> npt.NDArray[np.float64]:
+        """Return the outputs (n,) of an instance that is started and asked alike."""
+        self.start.make(instance)
+        memoryview(instance.request).cast("B")[:] = self.request
         instance.step()
-        return np.array([before, instance.reply])
-
-
-def outputs_of(instance: Instance) -> npt.NDArray[np.float64]:
-    """Return the outputs (n,) of this moment."""
-    instance.read()
-    return np.array(instance.reply)
+        return np.array(instance.reply)
 
 
 class ResetTrial:
@@ -81,46 +103,63 @@ class ResetTrial:
         What is wrong with it, one sentence; empty as long as nothing is known to be.
     lies : bool
         Whether it returns OK and does nothing of use.
+    way : Way
+        The fastest way to start again that has shown no difference.
+    first : FirstStep or None
+        Of the first instance; None as long as it has made none.
+    chaotic : bool
+        Whether not even two loaded instances begin alike, so that nothing can be compared.
     """
 
     def __init__(self) -> None:
         self.works: bool | None = None
         self.fault = ""
-        self.lies = False
+        self.lies = self.chaotic = False
+        self.way = Way.RESET
+        self.first: FirstStep | None = None
 
     def refused(self) -> None:
         """Remember that the FMU has no reset."""
-        self.works, self.fault = False, "It cannot be reset; every start takes a new instance."
+        self.works, self.way = False, Way.RENEWAL
+        self.fault = "It cannot be reset; every start takes a new instance."
 
-    def judge(
-        self,
-        path: Path,
-        flown: npt.NDArray[np.float64],
-        again: npt.NDArray[np.float64],
-        fresh: npt.NDArray[np.float64],
-    ) -> None:
-        """Compare the starts after a reset and of a new instance, and say it once if they differ.
+    def agrees(self, path: Path, way: Way, reply: npt.NDArray[np.float64]) -> bool:
+        """Return whether a start can be believed; if not, say it once and turn to the next way for good.
 
         Parameters
         ----------
         path : Path
             The FMU.
-        flown : (n,) ndarray
-            Outputs before the reset. Where they are those of the start, nothing can be seen of the reset.
-        again, fresh : (2, n) ndarray
-            Outputs at the start and a step later, after the reset and of a new instance.
+        way : Way
+            How it was started.
+        reply : (n,) ndarray
+            Outputs after the first step, which was asked as that of `first`.
         """
-        different = ~((again == fresh) | (np.isnan(again) & np.isnan(fresh)))
-        if different.any():
-            at = np.flatnonzero(different)[0]
-            self.works, self.lies = False, True
-            self.fault = (
-                "Its reset returns OK and does not bring it back to its start (an output is "
-                f"{again.flat[at]:.9g} where that of a new instance is {fresh.flat[at]:.9g}); every start "
-                "takes a new instance instead."
-            )
-            if path not in _said:
-                _logger.warning("%s: %s", path, self.fault)
-                _said.add(path)
-        elif not np.array_equal(flown, fresh[0], equal_nan=True):
-            self.works = True
+        assert self.first is not None
+        true = self.first.reply
+        different = ~((reply == true) | (np.isnan(reply) & np.isnan(true)))
+        if not different.any():
+            if way == Way.RESET:
+                self.works = True
+            return True
+        if way == Way.LOADING:
+            self.chaotic, self.first, self.way = True, None, Way.RENEWAL
+            return True
+        at = np.flatnonzero(different)[0]
+        self.works, self.lies, self.way = False, True, Way(way + 1)
+        what, instead = _FAULTS[way]
+        self.fault = (
+            f"{what} (an output is {reply[at]:.9g} where that of a new instance is {true[at]:.9g}); "
+            f"every start takes a new {instead} instead."
+        )
+        if (path, way) not in _said:
+            _logger.warning("%s: %s", path, self.fault)
+            _said.add((path, way))
+        return False
+
+
+_said: set[tuple[Path, Way]] = set()
+_FAULTS = {
+    Way.RESET: ("Its reset returns OK and does not bring it back to its start", "instance"),
+    Way.RENEWAL: ("Another instance in the same process does not begin as the first one did", "process"),
+}

@@ -91,8 +91,10 @@ class FmiAsset(OpenedFmu):
             request[0] = begin
             request[1] = self._step_size
             instance.step()
+            while not self._index and (other := self._stand_in(request.tobytes(), self._reply)) is not None:
+                other.step()
         except FmuError as error:
-            request.cast("B")[:] = before
+            self._request.cast("B")[:] = before
             self._fail(error, f"step {self._index} from t = {begin:g} s")
         self._index += 1
         if self._recording:
@@ -158,7 +160,7 @@ class FmiAsset(OpenedFmu):
             As `step`; the message says at which step. A worker that dies or takes too long reports every 20
             ms: the step named may be a little early.
         """
-        instance = self._opened()
+        self._opened()
         roles = {"control": control, "health": health, "load": load, "port": port}
         rows = request_rows(self._exchange, np.array(self._request), roles, steps)
         index = np.arange(self._index, self._index + len(rows) + 1)
@@ -172,7 +174,7 @@ class FmiAsset(OpenedFmu):
         with (progress or SilentProgress()).stage("Simulating", total=len(rows), unit="steps") as stage:
             begin = self._index
             for series in blocks(rows, replies):
-                ended = self._run(instance, series, stage)
+                ended = self._run(series, stage)
                 if ended is not None:
                     made = self._index - begin
                     if ended.time is not None and ended.time > moments[made]:
@@ -184,7 +186,7 @@ class FmiAsset(OpenedFmu):
         sentence = "" if ended is None else ended.sentence
         return ObservationHistory.of(self._exchange.outputs, moments[1:], replies, sentence)
 
-    def _run(self, instance: Instance, series: Series, stage: Stage) -> FmuEndedError | None:
+    def _run(self, series: Series, stage: Stage) -> FmuEndedError | None:
         """Make a block of steps; whatever happens, the asset is where the last complete one has left it.
 
         Return how the FMU has ended its simulation, if it has.
@@ -198,10 +200,19 @@ class FmiAsset(OpenedFmu):
             shown = series.done
 
         failure: FmuError | None = None
+        instance: Instance | None = self._opened()
         try:
-            instance.run(series, report)
-        except FmuError as error:
-            failure = error
+            while instance is not None:
+                failure = None
+                try:
+                    instance.run(series, report)
+                except FmuError as error:
+                    failure = error
+                instance = None
+                if not begin and series.done:
+                    first = np.frombuffer(series.replies[: series.reply_size])
+                    instance = self._stand_in(bytes(series.requests[:width]), first)
+                    series.done *= instance is None
         finally:
             made = bytes(series.requests[: series.done * width])
             self._index += series.done

@@ -8,7 +8,6 @@ through which a service of the user would do what the FMU may not, and changes o
 
 import ctypes
 import os
-import platform
 import stat
 import struct
 import sys
@@ -82,7 +81,7 @@ def confine(grants: Grants, own: str, shared: str) -> bool:
     Raises
     ------
     OSError
-        If the system refuses, or a granted path does not exist. The process is not confined then.
+        If the system refuses; the process is not to go on then.
     """
     version = landlock_version()
     if not version:
@@ -178,9 +177,9 @@ _CALLS = {
 
 def _filter_calls(*, tcp: bool) -> None:
     """Refuse sockets, but for those of the internet where a port is granted, which Landlock then watches."""
-    if platform.machine() not in _CALLS:
+    if os.uname().machine not in _CALLS:
         return
-    processor, socket, refused, idle = _CALLS[platform.machine()]
+    processor, socket, refused, idle = _CALLS[os.uname().machine]
     granted, denied, done = (
         struct.pack("HBBI", _RETURN, 0, 0, value) for value in (_GRANTED, _ERROR | EACCES, _ERROR)
     )

@@ -128,7 +128,7 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
             logged = instance is not None and instance.has_log and operation != _LOG
             HEADER.pack_into(reply_header, 0, RESULT, logged, number, len(payload))
         except FmuError as error:
-            refused = system_error.value in (errno.EACCES, errno.EPERM) or "ermission denied" in str(error)
+            refused = system_error.value == errno.EACCES or "ermission denied" in str(error)
             sentence = error.sentence + _NOT_GRANTED * (confined and refused)
             lost = instance is None or instance.lost
             time = "" if error.time is None else repr(error.time)

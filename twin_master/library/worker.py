@@ -6,22 +6,27 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO
 
+from fmu_asset.door.binding import load_binding
+from fmu_asset.door.placement import limits_of
 from fmu_asset.errors import FmuError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.folders import end_processes, plain_folder, remove_folder
+from fmu_asset.worker.sandbox import confine
 from twin_master.errors import TwinMasterError
 from twin_master.library.grid import Float, GridSampler, SamplingGrid
 
 _START_LIMIT = 120.0
 _PROGRAM = (
     "import sys; sys.path.append(sys.argv[1]); from twin_master.library.worker import serve; "
-    "serve(int(sys.argv[2]), sys.argv[3])"
+    "serve(int(sys.argv[2]), *sys.argv[3:])"
 )
 
 
-def serve(descriptor: int, grid: str) -> None:
+def serve(descriptor: int, grid: str, folder: str) -> None:
     """Answer requests for blocks, (number, first, last), until the other side closes.
 
     Parameters
@@ -30,6 +35,8 @@ def serve(descriptor: int, grid: str) -> None:
         File descriptor of the connection.
     grid : str
         The grid as text.
+    folder : str
+        Folder of this process, the one in which it may write.
     """
     connection = Connection(descriptor)
     sampler: GridSampler | None = None
@@ -38,7 +45,7 @@ def serve(descriptor: int, grid: str) -> None:
             number, first, last = connection.recv()
             try:
                 if sampler is None:
-                    sampler = GridSampler(SamplingGrid.from_json(grid))
+                    sampler = _confined_sampler(SamplingGrid.from_json(grid), folder)
                 connection.send((number, sampler.block(first, last)))
             except (FmuError, TwinMasterError) as error:
                 connection.send((number, error))
@@ -49,6 +56,15 @@ def serve(descriptor: int, grid: str) -> None:
     sys.stderr.flush()
     # Without the interpreter's shutdown, which third-party libraries may not survive.
     os._exit(0)
+
+
+def _confined_sampler(grid: SamplingGrid, folder: str) -> GridSampler:
+    """Return a sampler in this process, which from now on may do what a worker of this FMU may."""
+    granted = limits_of(load_binding(grid.binding), None, None, None).sandbox
+    if granted is not None:
+        files = (str(Path(grid.fmu).absolute()), str(Path(grid.binding).absolute()))
+        confine(replace(granted, read=files + granted.read), folder, folder)
+    return GridSampler(grid)
 
 
 class SamplingProcess:
@@ -74,12 +90,23 @@ class SamplingProcess:
         self._grid = grid
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - it is closed with the process
         self._pending: list[tuple[int, int]] = []
+        self._folder = plain_folder()
         ours, theirs = socket.socketpair()
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        environment["TMPDIR"] = folder = str(self._folder)
         root = str(Path(__file__).parents[2])
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-c", _PROGRAM, root, str(theirs.fileno()), grid.to_json()],
+                [
+                    sys.executable,
+                    "-P",
+                    "-c",
+                    _PROGRAM,
+                    root,
+                    str(theirs.fileno()),
+                    grid.to_json(),
+                    folder,
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
@@ -91,6 +118,7 @@ class SamplingProcess:
         except OSError as error:
             ours.close()
             self._log.close()
+            remove_folder(self._folder)
             raise FmuWorkerError(f"A sampling process could not be started ({error}).") from error
         finally:
             theirs.close()
@@ -167,3 +195,5 @@ class SamplingProcess:
             self._process.kill()
             self._process.wait()
         self._log.close()
+        end_processes(self._folder)
+        remove_folder(self._folder)

@@ -1,10 +1,17 @@
 /* FMI 2.0 co-simulation that misbehaves in the way that -D says, in the third step unless it does so earlier
    (and only while the file named by HOSTILE_FLAG exists, if that is set): otherwise an integrator. */
+#include <errno.h>
 #include <fcntl.h>
 #include <math.h>
+#include <netinet/in.h>
 #include <signal.h>
+#include <spawn.h>
 #include <stdio.h>
+#include <sys/prctl.h>
+#include <sys/socket.h>
 #include <sys/stat.h>
+#include <sys/un.h>
+#include <sys/wait.h>
 #include <unistd.h>
 #include "model.h"
 enum { Y, U, DAMAGE, FACTOR };
@@ -18,6 +25,34 @@ static void hang(void) { for (volatile long k = 0;; k++) {} }
 static void *volatile kept; /* so that the compiler does not leave the memory out */
 static void take(size_t size) { kept = memset(malloc(size), 1, size); }
 static void crash(void) { *(volatile int *)8 = 1; }
+
+/* What ATTEMPT may be, to the file, port or process that the environment names; below 0 if it fails. */
+#define TARGET getenv("HOSTILE_TARGET")
+static int overwrite(const char *path) { return open(path, O_WRONLY | O_TRUNC); }
+static int create(const char *path) { return open(path, O_WRONLY | O_CREAT, 0600); }
+static int look_into(const char *path) {
+    char some[8];
+    return open(path, O_RDONLY) < 0 ? -1 : read(open(path, O_RDONLY), some, 8) > 0 ? 0 : -1;
+}
+static int call(int kind, int protocol, const char *port) {
+    struct sockaddr_in there = {AF_INET, htons(atoi(port)), {htonl(INADDR_LOOPBACK)}};
+    int line = socket(AF_INET, kind, protocol);
+    if (line < 0 || connect(line, (struct sockaddr *)&there, sizeof there) < 0) return -1;
+    return send(line, "key", 3, 0);
+}
+static int call_service(const char *path) {
+    struct sockaddr_un there = {AF_UNIX};
+    int line = socket(AF_UNIX, SOCK_STREAM, 0);
+    strcpy(there.sun_path, path);
+    return line < 0 ? -1 : connect(line, (struct sockaddr *)&there, sizeof there);
+}
+static int start_program(const char *path) {
+    char *words[] = {"touch", (char *)path, NULL}, *none[] = {NULL};
+    pid_t child;
+    int status = 0;
+    errno = posix_spawn(&child, "/usr/bin/touch", NULL, NULL, words, none);
+    return errno ? -1 : waitpid(child, &status, 0);
+}
 
 #if defined CRASH_AT_LOAD
 __attribute__((constructor)) static void load(void) { crash(); }
@@ -149,6 +184,17 @@ int model_step(Model *m, double time, double size) {
 #elif defined CHATTER
     for (int k = 0; k < 100000; k++) puts("step step step step step step step step");
     fflush(stdout);
+#elif defined ATTEMPT
+    if (m->stepped > AFTER) return OK;
+    if ((ATTEMPT) < 0) {
+        char text[512];
+        snprintf(text, sizeof text, "it cannot have %s: %s", TARGET, strerror(errno));
+#ifndef SILENT
+        model_say(m, ERROR, text);
+        errno = 0;
+#endif
+        return ERROR;
+    }
 #elif defined REMOVE_FILES
     if (system("rm -rf \"$PWD\"/*") != 0) return ERROR;
 #elif defined IGNORE_SIGNALS
