@@ -146,11 +146,12 @@ class ResetTrial:
             self.chaotic, self.first, self.way = True, None, Way.RENEWAL
             return True
         at = np.flatnonzero(different)[0]
+        doubted = " Flights that began by a reset before may be wrong." * bool(self.works)
         self.works, self.lies, self.way = False, True, Way(way + 1)
         what, instead = _FAULTS[way]
         self.fault = (
             f"{what} (an output is {reply[at]:.9g} where that of a new instance is {true[at]:.9g}); "
-            f"every start takes a new {instead} instead."
+            f"every start takes a new {instead} instead.{doubted}"
         )
         if (path, way) not in _said:
             _logger.warning("%s: %s", path, self.fault)

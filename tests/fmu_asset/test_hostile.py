@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import warnings
 import zipfile
@@ -266,6 +267,76 @@ def test_a_process_that_leaves_the_group_is_ended(
         for _ in range(4):
             asset.step()
         assert len(processes(scratch)) == 3  # the keeper, the worker, and what the FMU has started
+    assert not left_behind(scratch)
+
+
+def test_processes_that_hop_are_ended(foreign_fmu: Any, described: Binding, scratch: Path) -> None:
+    with FmiAsset(foreign_fmu("hostile2", "HOP"), described) as asset:
+        for _ in range(4):
+            asset.step()
+    assert not left_behind(scratch)
+
+
+@pytest.mark.parametrize("end", ["(void)0", "hang()", "kill(getppid(),SIGKILL)"])
+def test_nothing_is_left_when_the_keeper_is_killed(
+    foreign_fmu: Any, described: Binding, scratch: Path, end: str
+) -> None:
+    """The worker has cleared its parent-death signal, and what it has started is in a session of its own."""
+    free = described.model_copy(update={"limits": described.limits.model_copy(update={"sandbox": False})})
+    with FmiAsset(foreign_fmu("hostile2", f"ESCAPE={end}"), free, step_timeout=1.0) as asset:
+        asset.step(), asset.step()
+        if end == "hang()":
+            threading.Timer(0.3, kill_keeper, [asset.worker_process_id]).start()
+            with pytest.raises(FmuTimeoutError, match=r"longer than 1 s"):
+                asset.step()
+        else:
+            asset.step()
+            if end == "(void)0":
+                kill_keeper(asset.worker_process_id)
+            assert asset.step().values[0] == 4.0
+            await_processes(scratch, 2)  # the worker, and the process that has left it
+    assert not left_behind(scratch)
+
+
+def await_processes(of: Path, count: int) -> None:
+    deadline = time.monotonic() + 20.0
+    while len(processes(of)) != count and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert len(processes(of)) == count
+
+
+def kill_keeper(worker: int | None) -> None:
+    status = Path(f"/proc/{worker}/status").read_text()
+    match = re.search(r"PPid:\s+(\d+)", status)
+    assert match is not None
+    os.kill(int(match[1]), signal.SIGKILL)
+
+
+def test_what_a_dead_twin_without_a_keeper_left_is_ended_by_the_next(foreign_fmu: Any, scratch: Path) -> None:
+    program = (
+        "import sys\n"
+        "from fmu_asset.door.binding import parse_binding\n"
+        "from fmu_asset.door.session import FmiAsset\n"
+        f"asset = FmiAsset(sys.argv[1], parse_binding({HOSTILE!r}))\n"
+        "for _ in range(2): asset.step()\n"
+        "print(asset.worker_process_id, flush=True)\n"
+        "asset.step()\n"
+    )
+    twin = subprocess.Popen(
+        [sys.executable, "-c", program, foreign_fmu("hostile2", "ESCAPE=hang()")],
+        cwd=ROOT, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert twin.stdout is not None
+    worker = int(twin.stdout.readline())
+    await_processes(scratch, 3)
+    os.kill(twin.pid, signal.SIGSTOP)
+    kill_keeper(worker)
+    os.kill(twin.pid, signal.SIGKILL)
+    twin.wait()
+    twin.stdout.close()
+    await_processes(scratch, 2)
+    program = "from fmu_asset.folders import plain_folder, remove_folder; remove_folder(plain_folder())"
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True)
     assert not left_behind(scratch)
 
 

@@ -22,6 +22,11 @@ SPRING: dict[str, Any] = {
     "control": {"push": {"variable": "force", "unit": "N"}},
     "observation": {"motion": {"variables": ["position", "velocity"], "unit": ["m", "m/s"]}},
 }
+HOSTILE: dict[str, Any] = {
+    "binding": {"name": "hostile", "step_size": 1.0},
+    "control": {"u": {"variable": "u", "unit": "m/s"}},
+    "observation": {"y": {"variables": "y", "unit": "m"}},
+}
 BINDING = """
 [binding]
 name = "spring"
@@ -91,6 +96,54 @@ def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu: An
         asset.reset()
         assert asset.reset_trial.works is True
         assert asset.step({"u": 1.0}).values[0] == seen != 0.0
+
+
+CLOCKS = [("INSTANCE_CLOCK", True), ("INSTANCE_CLOCK", False), ("process_clock", True)]
+
+
+@pytest.mark.parametrize(("clock", "isolated"), CLOCKS, ids=["instance", "in process", "process"])
+@pytest.mark.parametrize("in_one_go", [False, True], ids=["steps", "run"])
+@pytest.mark.parametrize("lengths", [(3, 7, 7), (1, 1, 1, 1, 1, 1, 1), (4, 1, 7, 1), (2, 3, 1, 6)], ids=str)
+def test_a_hidden_clock_shows_at_no_start(
+    foreign_fmu: Any,
+    clock: str,
+    isolated: bool,
+    in_one_go: bool,
+    lengths: tuple[int, ...],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The clock adds 1 from its sixth step on: where the first reset is looked at, nothing is to be seen."""
+    case = f"CASE={sum(lengths)}{len(lengths)}{isolated}{in_one_go}"  # what is wrong is said once for a file
+    fmu = foreign_fmu("hostile2", f"CLOCK={clock}", "STAYS_LOADED", case)
+
+    def flown(asset: FmiAsset, push: float, steps: int) -> list[float]:
+        asset.reset()
+        if in_one_go:
+            return asset.simulate({"u": push}, steps=steps).values[:, 0].tolist()
+        return [asset.step({"u": push}).values[0] for _ in range(steps)]
+
+    with caplog.at_level(logging.WARNING), FmiAsset(fmu, parse_binding(HOSTILE), isolated=isolated) as asset:
+        assert [flown(asset, 0.1, length)[0] for length in lengths] == [0.1] * len(lengths)
+        # A start whose first step is another one has those that are known for its proof.
+        flown(asset, 0.3, 7)
+        seen = flown(asset, 0.3, 7)
+        np.testing.assert_allclose(seen, [0.3, 0.6, 0.9, 1.2, 1.5, 2.8, 4.1], rtol=1e-12)
+        assert asset.reset_trial.works is False
+    assert "Flights that began by a reset before may be wrong" in caplog.messages[0]
+    assert len(caplog.messages) == (2 if clock == "process_clock" else 1)
+
+
+def test_what_never_starts_alike_is_not_started_in_ever_new_processes(foreign_fmu: Any) -> None:
+    fmu = foreign_fmu("hostile2", "NOT_DETERMINISTIC", "STAYS_LOADED", "CLOCK=process_clock")
+    with FmiAsset(fmu, parse_binding(HOSTILE)) as asset:
+        for _ in range(8):
+            asset.reset()
+            asset.step()
+        process = asset.worker_process_id
+        for _ in range(3):
+            asset.reset()
+            asset.step()
+        assert asset.worker_process_id == process
 
 
 def test_a_library_is_sampled_from_fresh_starts(foreign_fmu: Any, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 /* FMI 2.0 co-simulation that misbehaves in the way that -D says, in the third step unless it does so earlier
    (and only while the file named by HOSTILE_FLAG exists, if that is set): otherwise an integrator. */
+#define _GNU_SOURCE
+#include <dlfcn.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <math.h>
@@ -73,6 +75,14 @@ void *frame_instance(Model *m) {
     return m;
 }
 static double hidden; /* of the process, not of the state */
+static int process_clock;
+#ifdef STAYS_LOADED
+__attribute__((constructor)) static void stay(void) {
+    Dl_info self;
+    if (dladdr((void *)stay, &self)) dlopen(self.dli_fname, RTLD_LAZY | RTLD_NODELETE);
+}
+#endif
+#define INSTANCE_CLOCK *(int *)(m->parts[3] ? m->parts[3] : (m->parts[3] = calloc(1, sizeof(int))))
 
 int frame_get_state(Model *m, Model *copy) {
 #ifdef STATE_ERROR
@@ -110,6 +120,9 @@ int model_step(Model *m, double time, double size) {
     m->r[Y] += m->r[U] * size;
 #endif
     hidden += 1.0;
+#if defined CLOCK /* of the instance or of the process, and no reset brings it back */
+    if (++(CLOCK) > 5) m->r[Y] += 1.0;
+#endif
 #if defined STATE_HIDDEN
     m->r[Y] += 0.001 * hidden;
 #elif defined NOT_DETERMINISTIC
@@ -177,6 +190,18 @@ int model_step(Model *m, double time, double size) {
         GROUP;
         for (;;) pause();
     }
+#elif defined ESCAPE /* nobody's death ends it, nor its grandchild in another session */
+    if (m->stepped == AFTER) {
+        prctl(PR_SET_PDEATHSIG, 0);
+        if (fork() == 0) {
+            setsid();
+            if (fork() == 0) for (;;) pause();
+            _exit(0);
+        }
+        ESCAPE;
+    }
+#elif defined HOP /* ever new processes, of which each lives for a moment */
+    if (m->stepped == AFTER && fork() == 0) for (;;) if (fork() != 0) _exit(0);
 #elif defined NEST_FOLDERS
     for (int k = 0; k < 3000; k++) if (mkdir("d", 0755) || chdir("d")) return ERROR;
 #elif defined NEGATIVE_STATUS
