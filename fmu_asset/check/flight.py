@@ -257,8 +257,6 @@ class Flights:
             )
         elif trial.works is False:
             yield Finding("reset", "problem" if trial.lies else "warning", trial.fault)
-        elif trial.works is None:
-            yield Finding("reset", "ok", "It stays at its start, so that nothing is to be seen of a reset.")
         else:
             yield Finding("reset", "ok", "After a reset it is as new.")
 

@@ -109,7 +109,7 @@ def wiring_hash(wiring: Wiring, binding: Binding, algorithm: str, iterations: in
         "outward": {
             name: [str(port.end), *port.conversion, port.delayed] for name, port in wiring.outward.items()
         },
-        "binding": binding.model_dump(mode="json"),
+        "binding": binding.model_dump(mode="json", exclude={"limits"}),
         "algorithm": [algorithm, iterations, tolerance],
     }
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()

@@ -23,21 +23,21 @@ _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_FOLDER, _TRUNCATE, _DEVICE = (1 << k fo
 _READ = _READ_FILE | _READ_FOLDER
 _ALL = (1 << 16) - 1
 _FILE = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _DEVICE
-_BIND, _CONNECT = 1, 2
+_TCP, _CONNECT = 3, 2
 _SOCKETS_AND_SIGNALS = 3
 _NO_NEW_PRIVILEGES, _SET_FILTER = 38, 22  # of prctl(2)
 
+_CONFIGURATION = (
+    "alternatives", "fonts", "gai.conf", "group", "host.conf", "hosts", "ld.so.cache", "ld.so.conf",
+    "ld.so.conf.d", "locale.alias", "localtime", "machine-id", "nsswitch.conf", "os-release", "passwd",
+    "protocols", "resolv.conf", "services", "ssl/certs", "ssl/openssl.cnf", "timezone",
+)  # fmt: skip
 _SYSTEM = (
     "/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/opt", "/nix/store", "/gnu/store",
-    *(f"/etc/{name}" for name in (
-        "alternatives", "fonts", "gai.conf", "group", "host.conf", "hosts", "ld.so.cache", "ld.so.conf",
-        "ld.so.conf.d", "locale.alias", "localtime", "machine-id", "nsswitch.conf", "os-release", "passwd",
-        "protocols", "resolv.conf", "services", "ssl/certs", "ssl/openssl.cnf", "timezone",
-    )),
-    *(f"/proc/{name}" for name in ("self", "cpuinfo", "meminfo", "stat", "version", "filesystems", "sys")),
-    "/sys/devices/system", "/sys/fs/cgroup",
+    "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/version", "/proc/filesystems",
+    "/proc/sys", "/sys/devices/system", "/sys/fs/cgroup", *(f"/etc/{name}" for name in _CONFIGURATION),
 )  # fmt: skip
-_DEVICES = tuple(f"/dev/{name}" for name in ("null", "zero", "full", "random", "urandom"))
+_DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
 
 
 @dataclass(frozen=True)
@@ -88,22 +88,14 @@ def confine(grants: Grants, own: str, shared: str) -> bool:
         return False
     # What a version does not know would be refused: it is left out.
     handled = _ALL >> (3, 2, 1, 1)[version - 1] if version < 5 else _ALL
-    program = _EXECUTE if grants.programs else 0
-    attributes = struct.pack(
-        "QQQ", handled, _BIND | _CONNECT if version > 3 else 0, _SOCKETS_AND_SIGNALS if version > 5 else 0
-    )
+    attributes = struct.pack("QQQ", handled, _TCP * (version > 3), _SOCKETS_AND_SIGNALS * (version > 5))
     rules = _done(_libc().syscall(_CREATE_RULESET, attributes, len(attributes), 0))
-    everything = _ALL & ~_EXECUTE
-    for paths, access in (
-        ((*_SYSTEM, *_paths_of_python(), shared), _READ | program),
-        ((*_DEVICES, own), everything | program),
-        ([_located(path, shared) for path in grants.read], _READ | program),
-        ([_located(path, shared) for path in grants.write], everything | program),
-    ):
-        _allow(rules, paths, access & handled)
+    program = _EXECUTE * grants.programs
+    read, write = (_READ | program) & handled, (_ALL & ~_EXECUTE | program) & handled
+    _allow(rules, (*_SYSTEM, *_paths_of_python(), shared, *_located(grants.read, shared)), read)
+    _allow(rules, (*_DEVICES, own, *_located(grants.write, shared)), write)
     for port in grants.ports if version > 3 else ():
-        rule = struct.pack("QQ", _CONNECT, port)
-        _done(_libc().syscall(_ADD_RULE, rules, _PORT, rule, 0))
+        _done(_libc().syscall(_ADD_RULE, rules, _PORT, struct.pack("QQ", _CONNECT, port), 0))
     _done(_libc().prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0))
     _done(_libc().syscall(_RESTRICT_SELF, rules, 0))
     os.close(rules)
@@ -113,8 +105,8 @@ def confine(grants: Grants, own: str, shared: str) -> bool:
 
 def missing_path(grants: Grants, shared: str) -> str:
     """Return the first path that is granted and does not exist; an empty text if all do."""
-    given = (*grants.read, *grants.write)
-    return next((path for path in given if not os.path.exists(_located(path, shared))), "")  # noqa: PTH110
+    paths = _located(grants.read + grants.write, shared)
+    return next((path for path in paths if not os.path.exists(path)), "")  # noqa: PTH110
 
 
 @cache
@@ -128,8 +120,8 @@ def _done(result: int) -> int:
     return result
 
 
-def _located(path: str, shared: str) -> str:
-    return os.path.join(shared, os.path.expanduser(path))  # noqa: PTH111, PTH118 - pathlib would be loaded
+def _located(paths: tuple[str, ...], shared: str) -> list[str]:
+    return [os.path.join(shared, os.path.expanduser(path)) for path in paths]  # noqa: PTH111, PTH118 - light
 
 
 def _paths_of_python() -> Iterator[str]:
@@ -142,11 +134,8 @@ def _paths_of_python() -> Iterator[str]:
 
 
 def _allow(rules: int, paths: Iterable[str], access: int) -> None:
-    for path in paths:
-        try:
-            descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
-        except OSError:
-            continue
+    for path in filter(os.path.exists, paths):
+        descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
         is_folder = stat.S_ISDIR(os.fstat(descriptor).st_mode)
         rule = struct.pack("=Qi", access if is_folder else access & _FILE, descriptor)
         _done(_libc().syscall(_ADD_RULE, rules, _BENEATH, rule, 0))
@@ -161,16 +150,16 @@ _GRANTED, _ERROR = 0x7FFF0000, 0x50000
 _OTHER_NUMBERS = 0x40000000  # of the same calls, for another size of pointers
 _INTERNET, _PLAIN_PROTOCOLS = (2, 10), (0, 6, 17)  # IPv4 and IPv6; TCP, and UDP for the names of hosts
 
-# By processor: its number, that of socket(), calls that are refused (io_uring, by which sockets could be
-# made all the same, and the user's keys), and calls that return OK and do nothing: the rights, owners,
-# times and attributes of files, whoever's they are; those who copy a file change them without need.
+# By processor: its number, those of socket() and truncate(), calls that are refused (io_uring, by which
+# sockets could be made all the same, and the user's keys), and calls that return OK and do nothing: the
+# rights, owners, times and attributes of files, whoever's they are; who copies a file changes them in vain.
 _CALLS = {
     "x86_64": (
-        0xC000003E, 41, (248, 249, 250, 425),
+        0xC000003E, 41, 76, (248, 249, 250, 425),
         (90, 91, 92, 93, 94, 132, 188, 189, 190, 197, 198, 199, 235, 260, 261, 268, 280, 452, 463, 466),
     ),
     "aarch64": (
-        0xC00000B7, 198, (217, 218, 219, 425), (5, 6, 7, 14, 15, 16, 52, 53, 54, 55, 88, 452, 463, 466),
+        0xC00000B7, 198, 45, (217, 218, 219, 425), (5, 6, 7, 14, 15, 16, 52, 53, 54, 55, 88, 452, 463, 466),
     ),
 }  # fmt: skip
 
@@ -179,7 +168,7 @@ def _filter_calls(*, tcp: bool) -> None:
     """Refuse sockets, but for those of the internet where a port is granted, which Landlock then watches."""
     if os.uname().machine not in _CALLS:
         return
-    processor, socket, refused, idle = _CALLS[os.uname().machine]
+    processor, socket, truncate, refused, idle = _CALLS[os.uname().machine]
     granted, denied, done = (
         struct.pack("HBBI", _RETURN, 0, 0, value) for value in (_GRANTED, _ERROR | EACCES, _ERROR)
     )
@@ -192,7 +181,7 @@ def _filter_calls(*, tcp: bool) -> None:
 
     code = load(_PROCESSOR) + where(_EQUAL, processor, denied, otherwise=True) + load(_NUMBER)
     code += where(_AT_LEAST, _OTHER_NUMBERS, denied)
-    code += b"".join(where(_EQUAL, number, denied) for number in refused)
+    code += b"".join(where(_EQUAL, number, denied) for number in (*refused, *[truncate] * (landlock_version() < 3)))
     code += b"".join(where(_EQUAL, number, done) for number in idle)
     code += where(_EQUAL, socket, granted, otherwise=True)
     if tcp:

@@ -9,7 +9,7 @@ import signal
 import sys
 import traceback
 from json import loads
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -50,9 +50,28 @@ _STEP, _RUN, _OPEN, _RENEW, _CLOSE, _LOG = (
 
 
 _NOT_GRANTED = (
-    " The system refused it something (Permission denied), as its sandbox does: what it needs can be granted "
-    "by `read`, `write`, `ports` or `programs` in the table [limits] of its binding."
+    " The system refused it something (Permission denied{}), as its sandbox does: what it needs can be "
+    "granted by `read`, `write`, `ports` or `programs` in the table [limits] of its binding."
 )
+_REACHES = ("open", "os.", "shutil.", "socket.", "subprocess.", "urllib.")
+_last_reach: list[Any] = []
+"""What Python code has tried last beyond this process, if it has: the event of auditing and its arguments."""
+
+
+def _notice(event: str, arguments: tuple[object, ...]) -> None:
+    if event.startswith(_REACHES) and event != "os.chdir":  # which is free, and which we do ourselves
+        _last_reach[:] = event, arguments
+
+
+def _refusal() -> str:
+    """Return the sentence on what the sandbox has refused, with its name if Python knows it."""
+    if not _last_reach:
+        return _NOT_GRANTED.format("")
+    event, arguments = _last_reach
+    what = ", ".join(repr(value) for value in arguments if isinstance(value, str | bytes | list | tuple))
+    return _NOT_GRANTED.format(f"; the last that its Python code tried was {event}({what})")
+
+
 _locate_errno = ctypes.CDLL(None).__errno_location
 _locate_errno.restype = ctypes.c_void_p
 
@@ -90,6 +109,8 @@ def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
 
 def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[bool, FmuInstance | None]:
     """Answer requests; return whether the end was asked for, and the instance that is still open."""
+    if confined:
+        sys.addaudithook(_notice)
     asked, own_number = False, os.getpid()
     instance: FmuInstance | None = None
     plan: Plan | None = None
@@ -111,6 +132,7 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
             else:
                 content = bytearray(length)
                 asked, system_error.value = operation == _CLOSE, 0
+                _last_reach.clear()
                 if not receive(incoming, memoryview(content)) or asked:
                     break
                 if operation == _OPEN:
@@ -129,7 +151,7 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
             HEADER.pack_into(reply_header, 0, RESULT, logged, number, len(payload))
         except FmuError as error:
             refused = system_error.value == errno.EACCES or "ermission denied" in str(error)
-            sentence = error.sentence + _NOT_GRANTED * (confined and refused)
+            sentence = error.sentence + (_refusal() if confined and refused else "")
             lost = instance is None or instance.lost
             time = "" if error.time is None else repr(error.time)
             payload = joined(type(error).__name__, "lost" * lost, time, sentence, *error.messages)

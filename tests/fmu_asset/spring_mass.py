@@ -13,7 +13,7 @@ import time
 from pythonfmu import Boolean, Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real
 
 FINE, NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD, WANDER, TALK, LOOP = range(9)
-HOLD, SPOIL_JSON, SPOIL_BUILTINS, ESCAPES = range(9, 13)
+HOLD, SPOIL_JSON, SPOIL_BUILTINS, ESCAPES, READ = range(9, 14)
 
 
 class SpringMass(Fmi2Slave):
@@ -60,6 +60,9 @@ class SpringMass(Fmi2Slave):
         elif self.misbehaviour == ESCAPES:
             self.log("\x1b[2J\x1b]0;owned\x07 the spring \x9b31mcreaks")
             raise ArithmeticError("\x1b[31mthe spring broke")
+        elif self.misbehaviour == READ:
+            with open(os.environ["HOSTILE_TARGET"]) as file:  # noqa: PTH123
+                file.read()
         elif self.misbehaviour == DIE:
             os.abort()
         elif self.misbehaviour == RAISE:

@@ -94,19 +94,10 @@ class SamplingProcess:
         ours, theirs = socket.socketpair()
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         environment["TMPDIR"] = folder = str(self._folder)
-        root = str(Path(__file__).parents[2])
+        arguments = [str(Path(__file__).parents[2]), str(theirs.fileno()), grid.to_json(), folder]
         try:
             self._process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-P",
-                    "-c",
-                    _PROGRAM,
-                    root,
-                    str(theirs.fileno()),
-                    grid.to_json(),
-                    folder,
-                ],
+                [sys.executable, "-P", "-c", _PROGRAM, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,

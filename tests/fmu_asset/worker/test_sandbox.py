@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 import subprocess
@@ -13,10 +14,16 @@ from typing import Any
 
 import pytest
 
+from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.structure import Component, SystemStructure
+from fmu_asset.door import placement
 from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuCallError
+from fmu_asset.errors import BindingError, FmuCallError, FmuInputError
 from fmu_asset.worker.sandbox import landlock_version
+from twin_master.errors import InvalidObservationLibraryError
+from twin_master.library.grid import SamplingGrid
+from twin_master.library.sampling import sample_library
 
 pytestmark = pytest.mark.skipif(landlock_version() < 6, reason="the kernel is older than Linux 6.12")
 
@@ -115,6 +122,7 @@ def targets(tmp_path: Path, key: Path) -> Iterator[Targets]:
 
 ATTEMPTS = [
     ("delete", "unlink(TARGET)", "Permission denied"),
+    ("delete", "BY_CHILD(unlink(TARGET))", "Permission denied"),
     ("overwrite", "overwrite(TARGET)", "Permission denied"),
     ("overwrite", "truncate(TARGET,0)", "Permission denied"),
     ("delete", 'rename(TARGET,"mine")', "Permission denied"),
@@ -160,3 +168,181 @@ def test_an_fmu_that_does_not_say_what_it_was_refused(
         asset.step(), asset.step()
         with pytest.raises(FmuCallError, match=r"The system refused it something \(Permission denied\)"):
             asset.step()
+
+
+def test_an_fmu_in_python_names_what_it_was_refused(
+    spring_mass: Path, spring_binding: Binding, key: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOSTILE_TARGET", str(key))
+    with (
+        FmiAsset(spring_mass, spring_binding) as asset,
+        pytest.raises(
+            FmuCallError, match=rf"\(Permission denied; the last .* tried was open\('{key}', 'r'\)\)"
+        ),
+    ):
+        asset.step(load={"misbehaviour": 13.0})
+
+
+def test_rights_of_files_stay_as_they_are(
+    foreign_fmu: Any, key: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Landlock does not know them: calls that change them return OK, in vain."""
+    monkeypatch.setenv("HOSTILE_TARGET", str(key))
+    for attempt in ("chmod(TARGET,0777)", "chown(TARGET,1,1)"):
+        fmu = foreign_fmu("hostile2", f"ATTEMPT={attempt}")
+        before = key.stat()
+        with FmiAsset(fmu, binding()) as asset:
+            assert [asset.step().values[0] for _ in range(4)] == [1.0, 2.0, 3.0, 4.0]
+        assert key.stat() == before
+        if os.geteuid() == 0 or "chmod" in attempt:
+            with FmiAsset(fmu, binding(sandbox=False)) as asset:
+                asset.step(), asset.step(), asset.step()
+            assert key.stat() != before
+
+
+GRANTED = [
+    ("read", "look_into(TARGET)", "read"),
+    ("overwrite", "overwrite(TARGET)", "write"),
+    ("call", "call(SOCK_STREAM,0,TARGET)", "ports"),
+    ("datagram", "call(SOCK_DGRAM,0,TARGET)", "ports"),  # by which the names of hosts are looked up
+]
+
+
+@pytest.mark.parametrize(("what", "attempt", "key_name"), GRANTED, ids=[case[1] for case in GRANTED])
+def test_what_is_granted_can_be_had(
+    foreign_fmu: Any,
+    targets: Targets,
+    monkeypatch: pytest.MonkeyPatch,
+    what: str,
+    attempt: str,
+    key_name: str,
+) -> None:
+    target, happened = getattr(targets, what)()
+    monkeypatch.setenv("HOSTILE_TARGET", target)
+    granted = {key_name: [int(target) if key_name == "ports" else target]}
+    with FmiAsset(foreign_fmu("hostile2", f"ATTEMPT={attempt}"), binding(**granted)) as asset:
+        asset.step(), asset.step(), asset.step()
+    assert happened()
+
+
+def test_a_port_beside_the_granted_one_and_another_protocol_stay_closed(
+    foreign_fmu: Any, targets: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for what, attempt in (
+        ("call", "call(SOCK_STREAM,0,TARGET)"),
+        ("call", "call(SOCK_STREAM,262,TARGET)"),
+        ("service", "call_service(TARGET)"),
+    ):
+        target, happened = getattr(targets, what)()
+        monkeypatch.setenv("HOSTILE_TARGET", target)
+        port = int(target) if "262" in attempt else 9
+        with FmiAsset(foreign_fmu("hostile2", f"ATTEMPT={attempt}"), binding(ports=[port])) as asset:
+            asset.step(), asset.step()
+            with pytest.raises(FmuCallError, match="Permission denied"):
+                asset.step()
+        assert not happened()
+
+
+def test_a_program_that_is_granted_is_as_confined_as_the_fmu(
+    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It makes a file where the FMU may write, and none elsewhere."""
+    fmu = foreign_fmu("hostile2", "ATTEMPT=start_program(TARGET)")
+    given = tmp_path / "given"
+    given.mkdir()
+    for place in (given / "made", tmp_path / "made"):
+        monkeypatch.setenv("HOSTILE_TARGET", str(place))
+        with FmiAsset(fmu, binding(programs=True, write=[str(given)])) as asset:
+            asset.step(), asset.step(), asset.step()
+    assert [path.name for path in tmp_path.rglob("made")] == ["made"]
+    assert (given / "made").exists()
+
+
+def test_its_own_folder_is_its_own(foreign_fmu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also that for temporary files, which is the same; that of the extracted FMU by a key."""
+    monkeypatch.setenv("HOSTILE_TARGET", "notes.txt")
+    for attempt, granted in (
+        ("create(TARGET)", {}),
+        ('rename("worker.log",TARGET)', {}),
+        ("create(in_temporary())", {}),
+        ("create(beside_binary())", {"write": ["."]}),
+    ):
+        with FmiAsset(foreign_fmu("hostile2", f"ATTEMPT={attempt}"), binding(**granted)) as asset:
+            assert [asset.step().values[0] for _ in range(4)] == [1.0, 2.0, 3.0, 4.0]
+    with FmiAsset(foreign_fmu("hostile2", "ATTEMPT=create(beside_binary())"), binding()) as asset:
+        asset.step(), asset.step()
+        with pytest.raises(FmuCallError, match="Permission denied"):
+            asset.step()
+
+
+REFUSED = [
+    ({"read": ["/there/is/no/such"]}, FmuInputError, r"grants '/there/is/no/such', which does not exist"),
+    ({"ports": [0]}, BindingError, r"limits\.ports.*1"),
+    ({"ports": ["27000"]}, BindingError, r"limits\.ports.*an integer"),
+    ({"read": "/opt"}, BindingError, r"limits\.read.*a list"),
+    ({"sandbox": "no"}, BindingError, r"limits\.sandbox.*true or false"),
+]
+
+
+@pytest.mark.parametrize(("limits", "kind", "sentence"), REFUSED, ids=[case[2] for case in REFUSED])
+def test_keys_that_are_wrong_are_one_sentence(
+    foreign_fmu: Any, limits: dict[str, Any], kind: type[Exception], sentence: str
+) -> None:
+    with pytest.raises(kind, match=sentence):
+        FmiAsset(foreign_fmu("hostile2"), binding(**limits)).reset()
+
+
+def test_what_is_not_confined_is_said_once(
+    foreign_fmu: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of an FMU whose binding says so, and of a kernel without Landlock."""
+    fmu = foreign_fmu("hostile2", "CASE=said")
+    for _ in range(2):
+        with caplog.at_level(logging.WARNING), FmiAsset(fmu, binding(sandbox=False)):
+            pass
+    assert caplog.messages == [
+        f"{fmu}: its binding turns the sandbox off, so that it has all rights of its user."
+    ]
+    caplog.clear()
+    monkeypatch.setattr(placement, "landlock_version", lambda: 0)
+    for _ in range(2):
+        with caplog.at_level(logging.WARNING), FmiAsset(fmu, binding()):
+            pass
+    assert len(caplog.messages) == 1
+    assert caplog.messages[0].startswith("This kernel has no Landlock (Linux 5.13 or later)")
+
+
+def test_components_and_samplers_are_confined_too(
+    foreign_fmu: Any, key: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A system of FMUs, and a library, whose FMU flies in the process that samples it."""
+    monkeypatch.setenv("HOSTILE_TARGET", str(key))
+    fmu = foreign_fmu("hostile2", "ATTEMPT=unlink(TARGET)")
+    structure = SystemStructure(name="one", components=(Component("thief", fmu),))
+    record = {
+        "binding": {"name": "one", "step_size": 1.0},
+        "health": {"damage": {"variable": "thief.d", "unit": "1"}},
+        "control": {"u": {"variable": "thief.u", "unit": "m/s"}},
+        "observation": {"y": {"variables": "thief.y", "unit": "m"}},
+    }
+    with CoupledAsset(structure, parse_binding(record)) as system:
+        system.step(), system.step()
+        with pytest.raises(FmuCallError, match=rf"it cannot have {key}: Permission denied"):
+            system.step()
+    file = tmp_path / "hostile.toml"
+    file.write_text(
+        '[binding]\nname = "hostile"\nstep_size = 1.0\n[control.u]\nvariable = "u"\nunit = "m/s"\n'
+        '[health.damage]\nvariable = "d"\nunit = "1"\n'
+        '[observation.y]\nvariables = "y"\nunit = "m"\n'
+    )
+    grid = SamplingGrid(
+        fmu=str(fmu), binding=str(file), role="y", parameter="", draws=(0.0,), settling_steps=5,
+        states={"damage": (0.0, 0.1)}, controls={"go": {"u": 1.0}},
+    )  # fmt: skip
+    with pytest.raises(FmuCallError, match=rf"it cannot have {key}: Permission denied"):
+        sample_library(grid, tmp_path / "library.nc", workers=1)
+    assert key.exists()
+    file.write_text(f"{file.read_text()}[limits]\nsandbox = false\n")
+    with pytest.raises(InvalidObservationLibraryError):  # an integrator does not settle
+        sample_library(grid, tmp_path / "library.nc", workers=1, replace_existing=True)
+    assert not key.exists()
