@@ -166,9 +166,11 @@ _CALLS = {
 
 def _filter_calls(*, tcp: bool) -> None:
     """Refuse sockets, but for those of the internet where a port is granted, which Landlock then watches."""
-    if os.uname().machine not in _CALLS:
+    if os.uname().machine not in _CALLS or sys.maxsize < 2**32:
         return
     processor, socket, truncate, refused, idle = _CALLS[os.uname().machine]
+    if landlock_version() < 3:  # which does not know that this empties a file
+        refused = (*refused, truncate)
     granted, denied, done = (
         struct.pack("HBBI", _RETURN, 0, 0, value) for value in (_GRANTED, _ERROR | EACCES, _ERROR)
     )
@@ -181,7 +183,7 @@ def _filter_calls(*, tcp: bool) -> None:
 
     code = load(_PROCESSOR) + where(_EQUAL, processor, denied, otherwise=True) + load(_NUMBER)
     code += where(_AT_LEAST, _OTHER_NUMBERS, denied)
-    code += b"".join(where(_EQUAL, number, denied) for number in (*refused, *[truncate] * (landlock_version() < 3)))
+    code += b"".join(where(_EQUAL, number, denied) for number in refused)
     code += b"".join(where(_EQUAL, number, done) for number in idle)
     code += where(_EQUAL, socket, granted, otherwise=True)
     if tcp:

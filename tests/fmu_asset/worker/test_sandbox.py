@@ -346,3 +346,28 @@ def test_components_and_samplers_are_confined_too(
     with pytest.raises(InvalidObservationLibraryError):  # an integrator does not settle
         sample_library(grid, tmp_path / "library.nc", workers=1, replace_existing=True)
     assert not key.exists()
+
+
+@pytest.mark.parametrize("version", range(1, 7))
+def test_what_older_kernels_know_is_asked_of_them(tmp_path: Path, key: Path, version: int) -> None:
+    """By the rights of that version, which newer kernels take as well; its own files can be made."""
+    own = tmp_path / "own"
+    own.mkdir()
+    program = (
+        "import os, sys\n"
+        "from fmu_asset.worker import sandbox\n"
+        "sandbox.landlock_version = lambda: int(sys.argv[1])\n"
+        "sandbox.confine(sandbox.Grants(ports=(9,)), sys.argv[2], sys.argv[2])\n"
+        "for attempt in (os.unlink, os.listdir, open, lambda path: os.truncate(path, 0)):\n"
+        "    try: attempt(sys.argv[3])\n"
+        "    except PermissionError: continue\n"
+        "    except NotADirectoryError: continue\n"
+        "    sys.exit(f'{attempt} went')\n"
+        "open(f'{sys.argv[2]}/mine', 'w').close()\n"
+        "os.rename(f'{sys.argv[2]}/mine', f'{sys.argv[2]}/renamed')\n"
+    )
+    subprocess.run(
+        [sys.executable, "-c", program, str(version), own, key], cwd=Path(__file__).parents[3], check=True
+    )
+    assert (own / "renamed").exists()
+    assert key.read_text() == "the private key"
