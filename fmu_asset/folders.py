@@ -8,7 +8,8 @@ import re
 import signal
 import tempfile
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import FmuFileError
@@ -80,35 +81,43 @@ def end_processes(folder: str | os.PathLike[str]) -> None:
 
     A process has that of its parent, in whatever group or session it hides and whoever has ended before it.
     """
-    mark, found, rounds = f"\0TMPDIR={os.fspath(folder)}".encode(), True, 0
-    while found and rounds < _ROUNDS:
-        found, rounds = False, rounds + 1
-        for name in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208 - here and below, strings
+    mark = f"\0TMPDIR={os.fspath(folder)}".encode()
+    for _ in range(_ROUNDS):
+        found = False
+        for process in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
-                handle = os.pidfd_open(int(name))  # it stands for no other process, whoever has the number
-                try:
-                    with open(f"/proc/{name}/environ", "rb") as file:  # noqa: PTH123
-                        if mark in b"\0" + file.read():
-                            signal.pidfd_send_signal(handle, signal.SIGKILL)
-                            found = True
-                finally:
-                    os.close(handle)
-        time.sleep(0.01 * found)
+                if mark in b"\0" + (process / "environ").read_bytes():
+                    os.kill(int(process.name), signal.SIGKILL)
+                    found = True
+        if not found:
+            return
+        time.sleep(0.01)
+
+
+@contextmanager
+def _held(folder: str) -> Iterator[str]:
+    """Give a path of this very folder, wherever it is moved and whatever takes its place."""
+    descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        yield f"/proc/self/fd/{descriptor}"
+    finally:
+        os.close(descriptor)
 
 
 def remove_folder(folder: str | os.PathLike[str]) -> None:
     """Remove a folder and all that can be removed in it, however deep an FMU has nested it.
 
     Folders inside are first moved to the top: `shutil.rmtree` calls itself for each level, and the path of a
-    deep one is longer than the system allows. Links are not followed.
+    deep one is longer than the system allows. Links are not followed, not even those that a process of the
+    FMU, which cannot reach what it links to, puts in the place of a folder meanwhile.
     """
     top = os.fspath(folder)
     waiting, number = [top], 0
     while waiting:
         here = waiting.pop()
-        with suppress(OSError):
-            os.chmod(here, 0o700)  # noqa: PTH101 - here and below, strings: half the time
-            for entry in list(os.scandir(here)):
+        with suppress(OSError), _held(here) as held:
+            os.chmod(held, 0o700)  # noqa: PTH101 - here and below, strings: half the time
+            for entry in list(os.scandir(held)):
                 with suppress(OSError):
                     if entry.is_dir(follow_symlinks=False):
                         number += 1

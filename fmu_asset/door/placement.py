@@ -55,7 +55,8 @@ class Housing:
         self._extraction: Extraction | None = None
         self._release: Callable[[], object] = lambda: None
         self.instance: Instance | None = None
-        self.reset_trial = ResetTrial()
+        # Where there can be no instance after the first one, there is nothing to compare a reset with.
+        self.reset_trial = ResetTrial(comparable=isolated or not description.once_per_process)
         self._way = Way.LOADING
         self._start: Start | None = None
 
@@ -107,7 +108,7 @@ class Housing:
             If the other one cannot be started.
         """
         trial, start = self.reset_trial, self._start
-        if start is None or trial.chaotic or self._only_one:
+        if start is None or not trial.comparable:
             return None
         if trial.first is None:
             trial.first = FirstStep(start, request, np.array(reply))
@@ -130,11 +131,6 @@ class Housing:
             return self.instance
         return self._another()
 
-    @property
-    def _only_one(self) -> bool:
-        """Whether there can be no instance beside this one, nor after it, so that nothing can be compared."""
-        return self._description.once_per_process and not self._isolated
-
     def _restarted(self) -> Instance:
         """Return an instance as after its instantiation, by the fastest way that is seen to work."""
         trial = self.reset_trial
@@ -142,7 +138,7 @@ class Housing:
         if self._isolated and not self._description.once_per_process:
             ways.append((Way.RENEWAL, self.renew))
         for self._way, again in ways:
-            unproved = self._way == Way.RESET and trial.first is None and not self._only_one
+            unproved = self._way == Way.RESET and trial.first is None and trial.comparable
             if self._way < trial.way or unproved:
                 continue
             with suppress(FmuError):  # a worker that does not survive it is replaced

@@ -107,14 +107,14 @@ class ResetTrial:
         The fastest way to start again that has shown no difference.
     first : FirstStep or None
         Of the first instance; None as long as it has made none.
-    chaotic : bool
-        Whether not even two loaded instances begin alike, so that nothing can be compared.
+    comparable : bool
+        Whether there are other instances to compare one with, and they begin alike.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, comparable: bool = True) -> None:
         self.works: bool | None = None
         self.fault = ""
-        self.lies = self.chaotic = False
+        self.lies, self.comparable = False, comparable
         self.way = Way.RESET
         self.first: FirstStep | None = None
 
@@ -143,7 +143,7 @@ class ResetTrial:
                 self.works = True
             return True
         if way == Way.LOADING:
-            self.chaotic, self.first, self.way = True, None, Way.RENEWAL
+            self.comparable, self.first, self.way = False, None, Way.RENEWAL
             return True
         at = np.flatnonzero(different)[0]
         doubted = " Flights that began by a reset before may be wrong." * bool(self.works)

@@ -33,6 +33,10 @@ _REMEDY = "Reset the asset, or resume the run, to go on; if it happens again, th
 _CONFINED = ", or needs what its sandbox does not grant ([limits] of its binding)"
 
 
+def _open_plainly(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
+
+
 class WorkerProcess:
     """The process, its keeper and its two pipes.
 
@@ -162,7 +166,8 @@ class WorkerProcess:
     def _last_words(self) -> list[str]:
         """Return the last lines of its output; of a crash of Python's, not the trace of our own code."""
         with contextlib.suppress(OSError):
-            with (self._folder / "worker.log").open("rb") as file:
+            # The FMU may have put a link or a pipe there.
+            with open(self._folder / "worker.log", "rb", opener=_open_plainly) as file:
                 file.seek(max(file.seek(0, os.SEEK_END) - 4000, 0))
                 text = file.read().decode("utf-8", "replace")
             text = text.partition("Fatal Python error")[0]

@@ -153,7 +153,7 @@ _INTERNET, _PLAIN_PROTOCOLS = (2, 10), (0, 6, 17)  # IPv4 and IPv6; TCP, and UDP
 # By processor: its number, those of socket() and truncate(), calls that are refused (io_uring, by which
 # sockets could be made all the same, and the user's keys), and calls that return OK and do nothing: the
 # rights, owners, times and attributes of files, whoever's they are; who copies a file changes them in vain.
-_CALLS = {
+_CALLS: dict[str, tuple[int, int, int, tuple[int, ...], tuple[int, ...]]] = {
     "x86_64": (
         0xC000003E, 41, 76, (248, 249, 250, 425),
         (90, 91, 92, 93, 94, 132, 188, 189, 190, 197, 198, 199, 235, 260, 261, 268, 280, 452, 463, 466),
@@ -170,7 +170,7 @@ def _filter_calls(*, tcp: bool) -> None:
         return
     processor, socket, truncate, refused, idle = _CALLS[os.uname().machine]
     if landlock_version() < 3:  # which does not know that this empties a file
-        refused = (*refused, truncate)
+        refused += (truncate,)
     granted, denied, done = (
         struct.pack("HBBI", _RETURN, 0, 0, value) for value in (_GRANTED, _ERROR | EACCES, _ERROR)
     )

@@ -9,7 +9,7 @@ import signal
 import sys
 import traceback
 from json import loads
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 
@@ -54,22 +54,22 @@ _NOT_GRANTED = (
     "granted by `read`, `write`, `ports` or `programs` in the table [limits] of its binding."
 )
 _REACHES = ("open", "os.", "shutil.", "socket.", "subprocess.", "urllib.")
-_last_reach: list[Any] = []
+_last_reach: list[tuple[str, tuple[object, ...]]] = []
 """What Python code has tried last beyond this process, if it has: the event of auditing and its arguments."""
 
 
 def _notice(event: str, arguments: tuple[object, ...]) -> None:
     if event.startswith(_REACHES) and event != "os.chdir":  # which is free, and which we do ourselves
-        _last_reach[:] = event, arguments
+        _last_reach[:] = [(event, arguments)]
 
 
 def _refusal() -> str:
     """Return the sentence on what the sandbox has refused, with its name if Python knows it."""
-    if not _last_reach:
-        return _NOT_GRANTED.format("")
-    event, arguments = _last_reach
-    what = ", ".join(repr(value) for value in arguments if isinstance(value, str | bytes | list | tuple))
-    return _NOT_GRANTED.format(f"; the last that its Python code tried was {event}({what})")
+    tried = ""
+    for event, arguments in _last_reach:
+        what = ", ".join(repr(value) for value in arguments if isinstance(value, str | bytes | list | tuple))
+        tried = f"; the last that its Python code tried was {event}({what})"
+    return _NOT_GRANTED.format(tried)
 
 
 _locate_errno = ctypes.CDLL(None).__errno_location

@@ -19,7 +19,8 @@ from fmu_asset.coupling.structure import Component, SystemStructure
 from fmu_asset.door import placement
 from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import BindingError, FmuCallError, FmuInputError
+from fmu_asset.errors import BindingError, FmuCallError, FmuInputError, FmuWorkerError
+from fmu_asset.folders import remove_folder
 from fmu_asset.worker.sandbox import landlock_version
 from twin_master.errors import InvalidObservationLibraryError
 from twin_master.library.grid import SamplingGrid
@@ -371,3 +372,39 @@ def test_what_older_kernels_know_is_asked_of_them(tmp_path: Path, key: Path, ver
     )
     assert (own / "renamed").exists()
     assert key.read_text() == "the private key"
+
+
+@pytest.mark.parametrize("trap", ['symlink(TARGET,"worker.log")', 'mkfifo("worker.log",0600)'])
+def test_a_trap_in_the_place_of_the_log(
+    foreign_fmu: Any, key: Path, monkeypatch: pytest.MonkeyPatch, trap: str
+) -> None:
+    """The twin, which may read the key, reads the last words of a worker that has died, not the key."""
+    monkeypatch.setenv("HOSTILE_TARGET", str(key))
+    fmu = foreign_fmu("hostile2", f'ATTEMPT=(unlink("worker.log"),{trap},raise(SIGKILL))')
+    with FmiAsset(fmu, binding()) as asset:
+        asset.step(), asset.step()
+        with pytest.raises(FmuWorkerError, match="SIGKILL") as caught:
+            asset.step()
+    assert not caught.value.messages
+
+
+def test_a_link_that_takes_the_place_of_a_folder_while_it_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine, folder = tmp_path / "mine", tmp_path / "folder"
+    (folder / "deep").mkdir(parents=True)
+    mine.mkdir()
+    (mine / "letter.txt").write_text("dear")
+
+    def swapped(source: str, target: str) -> None:
+        renamed(source, target)
+        renamed(target, f"{target}-away")
+        Path(target).symlink_to(mine)
+
+    renamed = os.rename
+    monkeypatch.setattr("fmu_asset.folders.os.rename", swapped)
+    remove_folder(folder)
+    assert [path.name for path in mine.iterdir()] == ["letter.txt"]
+    monkeypatch.undo()
+    remove_folder(folder)
+    assert not folder.exists()
