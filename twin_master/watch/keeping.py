@@ -49,10 +49,12 @@ class Keeper:
         if turn.turn % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1 and reading.revises is None:
             record["twin_state"] = base64.b64encode(self.twin.save_state()).decode("ascii")
         record |= belief_record(turn)
+        known = {(notice.kind, notice.sensors) for notice in turn.notices}
+        self.told = [vars(n) for n in self.intake.notices if (n.kind, n.sensors) not in known]
         if self.tutor is not None:
-            self.told = list(self.tutor.teaching.untold)
-            if self.told:
-                record["notices"] = record.get("notices", []) + self.told
+            self.told += self.tutor.teaching.untold
+        if self.told:
+            record["notices"] = record.get("notices", []) + self.told
         self._journal.append(record)
         if self.tutor is not None:
             self.tutor.teaching.take(record)
