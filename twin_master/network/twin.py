@@ -29,6 +29,9 @@ from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
 
+_LARGEST = np.float64(1e150)
+"""What is carried is below this, so that what follows from it are numbers, too."""
+
 Planner = Callable[[GraphicalModel], ArrayLike]
 """Returns the policy p(U | D), (S, U), for states, controls and transitions."""
 DEFAULT_LAG = 50
@@ -363,12 +366,12 @@ class Twin:
         return seen if self.lag is None else seen[-(self.lag + 1) :]
 
     def _estimate(self, before: Carried | None, given: Float, control: int, turn: int) -> Estimate:
-        """Return what the estimator concludes, of which nothing is NaN or plus infinity."""
+        """Return what the estimator concludes, of which nothing is NaN or too large to be squared."""
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 estimate = self.estimator.turn(before, given, control, turn)
             found = (estimate.log_evidence, estimate.filtered, *estimate.carried.arrays.values())
-            held = all(np.all(np.asarray(values) < np.inf) for values in found)
+            held = all(np.all(np.asarray(values) < _LARGEST) for values in found)
         except (ArithmeticError, np.linalg.LinAlgError):
             held = False
         if not held:

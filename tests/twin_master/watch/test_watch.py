@@ -209,6 +209,25 @@ def test_a_watch_that_learns_goes_on_as_if_it_had_never_ended(
     assert json.loads(journals[0].splitlines()[-1][65:])["filtered"] == last.filtered.tolist()
 
 
+def test_a_control_that_is_reported_wrongly_ends_no_watch(
+    base: Watch, mission: Flight, tmp_path: Path
+) -> None:
+    """From turn 10 on, for a twin that learns and gives notice, also when it is taken up again."""
+    controls = np.where(np.arange(50) < 10, mission.control_index, 1 - mission.control_index)
+    path = write_csv(tmp_path / "m.csv", mission.observed, controls)
+    given = load_scenario("level_turns_learning").scenario
+    tables = {"learning": given.learning, "notice": given.notice}
+    scenario, ends = base.scenario.model_copy(update=tables), []
+    for name, stops in (("whole", (None,)), ("stopped", (12, 35, None))):
+        watch = begun(base, tmp_path / name)
+        watch.models = [BelievedModel(0, replace(base.models[0].knowledge, scenario=scenario))]
+        for stop in stops:
+            counts = watch.run(CsvFeed(path, scenario), lambda _decision: None, turns=stop)
+        assert (counts.received, counts.rejected, counts.missing) == (50, 0, 0)
+        ends.append((watch.folder / JOURNAL_NAME).read_bytes())
+    assert ends[0] == ends[1]
+
+
 def test_a_long_watch_goes_on_from_its_snapshot(
     base: Watch, mission: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
