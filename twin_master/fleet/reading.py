@@ -22,7 +22,7 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Estimated", "Outcomes", "fleet_groups", "fly_seeds", "group_figures"]
+__all__ = ["Estimated", "Outcomes", "attention", "fleet_groups", "fly_seeds", "group_figures"]
 
 Float = NDArray[np.float64]
 
@@ -160,6 +160,25 @@ def last_turns(group: "xr.Dataset") -> NDArray[np.int64]:
     """Return the last turn of each twin: that of a recording may come early."""
     last: NDArray[np.int64] = np.maximum((group["control_index"].values >= 0).sum(axis=1) - 1, 0)
     return last
+
+
+def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
+    """Return the probability that the policy leaves a control within the steps that are predicted: (B,).
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        Of the twins.
+    belief : (B, S)
+        After the last turn.
+    control : int
+        In force then; it stays so until the policy leaves it.
+    """
+    keeps = (knowledge.plan.control_index == control).astype(np.float64)
+    stays = keeps.copy()
+    for _ in range(knowledge.scenario.mission.prediction_steps - 1):
+        stays = keeps * knowledge.model.transition.expected(control, stays)
+    return np.asarray(1.0 - belief @ stays)
 
 
 def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:

@@ -22,16 +22,15 @@ from twin_master.errors import TwinMasterError
 from twin_master.fleet.flight import GROUPS, RESULT_NAME, fleet_config
 from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.outcome import FAILED, has_flown
-from twin_master.fleet.reading import WITHIN, group_figures, last_turns, shown
+from twin_master.fleet.reading import WITHIN, attention, group_figures, last_turns, shown
 from twin_master.fleet.store import open_group
 from twin_master.mission.kept_knowledge import kept_knowledge
-from twin_master.mission.preparation import Knowledge
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["REPORT_NAME", "attention", "write_fleet_report"]
+__all__ = ["REPORT_NAME", "write_fleet_report"]
 
 Float = NDArray[np.float64]
 
@@ -44,25 +43,6 @@ BANDS = (
     "Bands hold 90 and 50 % of the assets; the line is the median of the filtered means, "
     "the dash-dotted one that of the true states, where they are known."
 )
-
-
-def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
-    """Return the probability that the policy leaves a control within the steps that are predicted: (B,).
-
-    Parameters
-    ----------
-    knowledge : Knowledge
-        Of the twins.
-    belief : (B, S)
-        After the last turn.
-    control : int
-        In force then; it stays so until the policy leaves it.
-    """
-    keeps = (knowledge.plan.control_index == control).astype(np.float64)
-    stays = keeps.copy()
-    for _ in range(knowledge.scenario.mission.prediction_steps - 1):
-        stays = keeps * knowledge.model.transition.expected(control, stays)
-    return np.asarray(1.0 - belief @ stays)
 
 
 def write_fleet_report(folder: Path | str) -> Path:

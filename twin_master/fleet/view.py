@@ -36,9 +36,9 @@ from twin_master.fleet.report import (
     map_figure,
     scale_of,
 )
+from twin_master.fleet.standing import STATE_NAME, FleetRecord
 from twin_master.fleet.store import DONE_NAME, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
-from twin_master.fleet.watching import STATE_NAME, FleetRecord
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
 from twin_master.viewer.server import HEADERS, OWN_NAMES, serve_application

@@ -3,6 +3,9 @@
 import base64
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from twin_master.mission.journal import JournalFile, belief_record, plain
 from twin_master.mission.loop import Reading
 from twin_master.network.twin import Twin, TwinTurn
@@ -28,16 +31,19 @@ class Keeper:
         What teaches the twin.
     told : list
         Notices that the last line has beside those of its turn.
+    filtered : (S,) or None
+        What was believed after the last turn; None before the first one of this process.
     """
 
     def __init__(self, journal: JournalFile, intake: Intake, twin: Twin) -> None:
         self._journal, self.intake, self.twin = journal, intake, twin
         self.tutor: Tutor | None = None
         self.told: list[dict[str, Any]] = []
+        self.filtered: NDArray[np.float64] | None = None
 
     def __call__(self, reading: Reading, turn: TwinTurn) -> None:
         """Write down a reading and what became of it."""
-        at = self.intake.observation_turn
+        at, self.filtered = self.intake.observation_turn, turn.filtered
         record: dict[str, Any] = {
             "turn": turn.turn,
             "observation_turn": at,

@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from functools import partial
 from http.client import HTTPConnection
@@ -32,11 +32,13 @@ from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import fleet_groups, group_figures
 from twin_master.fleet.report import write_fleet_report
+from twin_master.fleet.standing import WatchedAsset
 from twin_master.fleet.view import fleet_view, serve_fleet
-from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
+from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
+from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begin_watch
 from uav_twin.cli import app
 
@@ -156,6 +158,51 @@ def test_an_asset_is_lost_alone(fleet_file: Path, alone: list[bytes], tmp_path: 
     fleet_file.write_text(fleet_file.read_text().replace('observations = "logs/*.csv"', "count = 2"))
     with pytest.raises(FleetError, match="north has none"):
         FleetWatch(load_fleet(fleet_file), tmp_path / "flown", print, print)
+
+
+def test_an_asset_that_was_lost_is_taken_up_again(
+    fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One whose file is gone for a while, one whose file was wrong, and one that met an error of ours."""
+    for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
+        monkeypatch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
+    logs = [tmp_path / "logs" / f"wing-{number}.csv" for number in range(3)]
+    (tmp_path / "logs" / "wing-1.txt").write_text("turn,strain_1\n")  # another of that name
+    contents, (at, decisions) = [log.read_bytes() for log in logs], (0, Watch.decisions)
+    logs[1].write_text("turn,strian_1\n")
+    unwell = iter([True])
+
+    def once_unwell(watch: Watch, *given: Any) -> Iterator[dict[str, Any]]:
+        for number, decision in enumerate(decisions(watch, *given)):
+            yield decision
+            if watch.folder.name == "wing-2" and number == 2 and next(unwell, False):
+                raise ZeroDivisionError("division by zero")
+
+    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+        if asset.name == "north/wing-0" and decision["turn"] == 2 and "told_again" not in decision:
+            logs[0].unlink()
+
+    def mend() -> None:
+        nonlocal at
+        at += 1
+        if at == 3:
+            for log, content in zip(logs, contents, strict=True):
+                log.write_bytes(content)
+        fleet.asked = at == 6
+
+    monkeypatch.setattr(Watch, "decisions", once_unwell)
+    notes: list[str] = []
+    file = fleet_of(tmp_path, "logs/*")
+    fleet = FleetWatch(load_fleet(file), tmp_path / "out", tell, notes.append, follow=True)
+    fleet.run(mend)
+    assert journals(tmp_path / "out") == alone
+    assert fleet.failures == {"north/wing-1 of wing-1.txt": "another file has the same name."}
+    said = [note for note in notes if "is not watched" in note]
+    for begin in ("north/wing-0 is not watched: [Errno 2]", "north/wing-2 is not watched: ZeroDivisionError"):
+        assert sum(note.startswith(begin) for note in said) == 1
+    assert sum("strian_1" in note for note in said) == 1
+    for number in range(3):
+        assert f"north/wing-{number} is watched again." in notes
 
 
 @pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
