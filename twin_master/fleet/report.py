@@ -19,12 +19,11 @@ from reporting.files import atomic_write_text
 from reporting.page import Column, Page, Table
 from reporting.words import counted
 from twin_master.errors import TwinMasterError
-from twin_master.fleet.flight import GROUPS, RESULT_NAME, fleet_config
+from twin_master.fleet.flight import RESULT_NAME, fleet_config
 from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.outcome import FAILED, has_flown
-from twin_master.fleet.reading import WITHIN, attention, group_figures, last_turns, shown
+from twin_master.fleet.reading import WITHIN, group_figures, last_turns, leaving, noticed, shown
 from twin_master.fleet.store import open_group
-from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
@@ -90,6 +89,11 @@ def _opening(records: list[dict[str, Any]], groups: "dict[str, xr.Dataset]") -> 
     twins = sum(group.sizes["twin"] for group in groups.values())
     flown = {name: has_flown(group["status"].values) for name, group in groups.items()}
     sentences = [f"{sum(map(len, flown.values()))} of {counted(twins, 'asset')} have flown."]
+    told = [(noticed(group, "alarm"), group["first_notice"].values[:, 0]) for group in groups.values()]
+    alarms = np.concatenate([first[alarmed] for alarmed, first in told])
+    if len(alarms):
+        step = next(iter(groups.values())).attrs["step_name"]
+        sentences.append(f"{counted(len(alarms), 'asset')} raised an alarm, first in {step} {alarms.min()}.")
     delay = np.concatenate([group["delay"].values[flown[name]] for name, group in groups.items()])
     called = delay[~np.isnan(delay)]
     if len(called):
@@ -155,6 +159,8 @@ def add_lessons(page: Page, record: dict[str, Any]) -> None:
             off = not rate["lower_95"] <= rate["assumed"] <= rate["upper_95"]
             assumed = f"{rate['assumed']:.4f}{' (outside)' if off else ''}"
             rows.append([name, f"probability to worsen, {control}", assumed, f"{rate['mean']:.4f}", interval])
+        if group["alarmed"]:
+            rows.append([name, "twins with an alarm among them", "", str(group["alarmed"]), ""])
         lines = [("noise over the assumed", "1", group["noise_factor"])]
         if "population" in group:
             told = group["population"]
@@ -267,19 +273,13 @@ def _attention(
 ) -> None:
     """Add the table of the assets whose control is likely to change next."""
     scenario = Scenario.model_validate(record["scenarios"][0])
-    own = folder / GROUPS / record["name"]
     try:
-        knowledge = kept_knowledge(own / "0" if record["files"] else own, scenario)
+        chance = leaving(folder, record, group)
     except TwinMasterError as error:
         page.add_paragraph(f"Who needs attention next is not known: {error}")
         return
-    belief = group["belief"].values.astype(np.float64)
     last = last_turns(group)
     control = group["control_index"].values[np.arange(len(last)), last]
-    chance = np.zeros(len(belief))
-    for index in np.unique(control[flown]):
-        mine = flown[control[flown] == index]
-        chance[mine] = attention(knowledge, belief[mine], int(index))
     scale, unit = scale_of(scenario)
     rows = []
     for row in flown[np.argsort(-chance[flown], kind="stable")][:NEXT].tolist():
@@ -287,9 +287,7 @@ def _attention(
         pairs = zip(*moments, strict=True)
         states = [f"{scale * mean:.1f} ± {scale * deviation:.1f}" for mean, deviation in pairs]
         name = record["members"][row][0]
-        rows.append(
-            [name, *states, scenario.control_names[int(control[row])], f"{100.0 * max(chance[row], 0.0):.0f}"]
-        )
+        rows.append([name, *states, scenario.control_names[int(control[row])], f"{100.0 * chance[row]:.0f}"])
     columns = [Column("asset"), *(Column(factor.name, unit, numeric=True) for factor in scenario.state)]
     columns += [Column("control"), Column("change", "%", numeric=True)]
     steps = scenario.mission.prediction_steps

@@ -24,8 +24,8 @@ from reporting.words import counted
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.outcome import FAILED, has_flown
-from twin_master.fleet.reading import last_turns
+from twin_master.fleet.outcome import FAILED, NOTICE_KINDS, has_flown
+from twin_master.fleet.reading import last_turns, leaving
 from twin_master.fleet.report import (
     BANDS,
     LOST,
@@ -66,7 +66,10 @@ def is_fleet(folder: Path) -> bool:
 
 @dataclass(frozen=True)
 class _Standing:
-    """How B assets of a group stand: turns and alarms (B,), moments of the state (B, F), SI, controls."""
+    """How B assets of a group stand: turns and alarms (B,), moments of the state (B, F), SI, controls.
+
+    `leaving` (B,) is the probability that a control is left soon; NaN where it is not known.
+    """
 
     scenario: Scenario
     names: list[str]
@@ -75,6 +78,7 @@ class _Standing:
     deviation: Float
     control: list[str]
     alarms: NDArray[np.int64]
+    leaving: Float
 
 
 def fleet_view(folder: Path) -> str:
@@ -119,11 +123,11 @@ def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
     for group in fleet["groups"]:
         scenario = Scenario.model_validate(group["scenarios"][0])
         own = {
-            name.partition("/")[2]: (told.last, told.alarms)
+            name.partition("/")[2]: (told.last, told.alarms, told.leaving)
             for name, told in known.items()
             if name.startswith(f"{group['name']}/") and told.last is not None
         }
-        last = [told for told, _ in own.values()]
+        last = [told for told, _, _ in own.values()]
         if any(set(scenario.state_names) - told.health.keys() for told in last):
             raise FleetError(
                 f"{folder / STATE_NAME}: the health of an asset of {group['name']} is that of "
@@ -136,7 +140,8 @@ def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
         standing = _Standing(
             scenario, list(own), np.array([told.turn for told in last], dtype=np.int64), mean, deviation,
             [told.next_control for told in last],
-            np.array([alarms for _, alarms in own.values()], dtype=np.int64),
+            np.array([alarms for _, alarms, _ in own.values()], dtype=np.int64),
+            np.array([chance for _, _, chance in own.values()], dtype=np.float64),
         )  # fmt: skip
         _add_group(page, group["name"], standing, 0)
 
@@ -162,7 +167,7 @@ def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
         standing = _Standing(
             scenario, [record["members"][row][0] for row in rows], last[rows], mean[at],
             group["standard_deviation"].values[rows][at], [scenario.control_names[u] for u in control],
-            np.zeros(len(rows), dtype=np.int64),
+            group["notices"].values[rows, NOTICE_KINDS.index("alarm")], leaving(folder, record, group)[rows],
         )  # fmt: skip
         _add_group(
             page, record["name"], standing, int(np.sum(known == FAILED)), group["state"].values[rows], mean
@@ -188,7 +193,8 @@ def _add_group(
         with style.publication_style():
             drawn = course_figure(scenario, scale * mean, scale * state, unit)
         page.add_figure(style.to_svg(drawn), BANDS, title="Over time")
-    order = np.lexsort((-standing.mean.sum(axis=1), -standing.alarms))[:WORST]
+    soon = np.nan_to_num(standing.leaving)
+    order = np.lexsort((-standing.mean.sum(axis=1), -soon, -standing.alarms))[:WORST]
     rows, told = [], bool(standing.alarms.any())
     for row in order.tolist():
         pairs = zip(scale * standing.mean[row], scale * standing.deviation[row], strict=True)
@@ -196,13 +202,20 @@ def _add_group(
             f"{mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{deviation:.1f}" for mean, deviation in pairs
         ]
         alarms = [str(standing.alarms[row] or "")] * told
-        rows.append([standing.names[row], str(standing.turn[row]), *states, standing.control[row], *alarms])
+        change = f"{100.0 * soon[row]:.0f}"
+        rows.append(
+            [standing.names[row], str(standing.turn[row]), *states, standing.control[row], change, *alarms]
+        )
     columns = [Column("asset"), Column(scenario.mission.step_name, numeric=True)]
     columns += [Column(factor.name, unit, numeric=True) for factor in scenario.state]
-    columns += [Column("control"), *[Column("alarms", numeric=True)] * told]
-    by = "by alarms, then by the sum of their states" if told else "by the sum of their states"
-    caption = f"{len(rows)} of {counted(count, 'asset')}, {by}."
-    page.add_table(Table(columns, rows), caption, title="The worst")
+    columns += [Column("control"), Column("change", "%", numeric=True)]
+    columns += [*[Column("alarms", numeric=True)] * told]
+    caption = (
+        f"{len(rows)} of {counted(count, 'asset')}, by {'alarms, then by ' * told}the probability that the "
+        f"policy leaves the control within {scenario.mission.prediction_steps} {scenario.mission.step_name}s "
+        "(change), then by the sum of their states."
+    )
+    page.add_table(Table(columns, rows), caption, title="Who needs attention next")
 
 
 def _failures(folder: Path) -> dict[str, str]:

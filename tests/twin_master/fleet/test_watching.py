@@ -30,13 +30,15 @@ from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import ensemble, load_fleet
-from twin_master.fleet.reading import fleet_groups, group_figures
+from twin_master.fleet.reading import attention, fleet_groups, group_figures, leaving
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.standing import WatchedAsset
 from twin_master.fleet.view import fleet_view, serve_fleet
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begin_watch
@@ -347,6 +349,46 @@ def test_recordings_teach_what_the_flights_taught(fleet_file: Path, tmp_path: Pa
     assert [m.mean for m in first] == [m.mean for m in second]
 
 
+def ensemble_scenario(folder: Path) -> Scenario:
+    return ensemble(str(folder / "wing.toml"), range(60)).groups[0].scenarios[0]
+
+
+def test_the_store_counts_the_notices_that_watches_gave(fleet_file: Path, tmp_path: Path) -> None:
+    """And a watched asset says how probably it leaves its control, as the store does."""
+    wing, log = tmp_path / "wing.toml", tmp_path / "logs" / "wing-1.csv"
+    wing.write_text(wing.read_text() + "\n[notice]\n")
+    header, *rows = log.read_text().splitlines()
+    rows[2] = ",".join([*rows[2].split(",")[:-1], "OL"])
+    log.write_text("\n".join([header, *rows]) + "\n")
+    with fleet_file.open("a") as file:
+        file.write(f"steps = {TURNS}\n")
+    fleet = watched(fleet_file, tmp_path / "out")
+    fly_fleet(load_fleet(fleet_file), tmp_path / "flown", Engine(0))
+    group = fleet_groups(tmp_path / "flown")["north"]
+    alarmed = 0
+    for row in range(3):
+        told = [n for n in fleet.assets[f"north/wing-{row}"].watch.told(0) if n[1].kind != "gauge_back"]
+        for place, kind in enumerate(("alarm", "gauge_left_out")):
+            turns = [turn for turn, notice in told if notice.kind == kind]
+            if row != 2:  # whose late message tells of turns before it
+                assert group["notices"].values[row, place] == len(turns)
+                assert group["first_notice"].values[row, place] == min(turns, default=-1)
+        alarmed += any(notice.kind == "alarm" for _, notice in told)
+        assert fleet.assets[f"north/wing-{row}"].record().alarms == sum(n.kind == "alarm" for _, n in told)
+    assert group["notices"].values[1, 1] >= 1
+    assert alarmed >= 1
+    assert group_figures(group)["raised an alarm"] == alarmed
+    assert learn_fleet(tmp_path / "flown").groups[0].alarmed == alarmed
+    assert "raised an alarm, first in" in write_fleet_report(tmp_path / "flown").read_text()
+    config = json.loads((tmp_path / "flown" / "config.json").read_text())
+    soon = leaving(tmp_path / "flown", config["fleet"]["groups"][0], group)
+    state = json.loads((tmp_path / "out" / "watched.json").read_text())["assets"]
+    found = [state[f"north/wing-{row}"]["leaving"] for row in range(3)]
+    np.testing.assert_allclose(found, soon, atol=1e-6)
+    again = watched(fleet_file, tmp_path / "out")  # of which nothing is left to read
+    assert [again.assets[f"north/wing-{row}"].record().leaving for row in range(3)] == pytest.approx(found)
+
+
 def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
     (tmp_path / "logs" / "wing-0.csv").write_text("turn,colour\n0,red\n")
     (tmp_path / "logs" / "wing-9.csv").write_text("turn,control\n")
@@ -355,7 +397,11 @@ def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
     fly_fleet(ensemble(str(tmp_path / "wing.toml"), range(60)), tmp_path / "flown", Engine(0))
     flown = fleet_view(tmp_path / "flown")
     group = fleet_groups(tmp_path / "flown")["growing_damage"]
-    worst = np.argsort(-group["mean"].values[:, -1].sum(axis=1), kind="stable")
+    knowledge = kept_knowledge(tmp_path / "flown" / "groups" / "growing_damage", ensemble_scenario(tmp_path))
+    belief, control = group["belief"].values.astype(float), group["control_index"].values[:, -1]
+    soon = [attention(knowledge, own[None], int(u))[0] for own, u in zip(belief, control, strict=True)]
+    worst = np.lexsort((-group["mean"].values[:, -1].sum(axis=1), -np.maximum(soon, 0.0)))
+    assert max(soon) > min(soon) + 0.1
     assert re.findall(r"seed-\d+", flown) == [f"seed-{row}" for row in worst[:50]]
     with pytest.raises(FleetError, match="holds no fleet"):
         fleet_view(tmp_path)
