@@ -5,21 +5,19 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from reporting.errors import DamagedFileError
-from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.resolution import Overrides, given_overrides
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.writing import SUMMARY_NAME
 from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, check_file, file_feed
 from twin_master.watch.folder import STORED_TURNS, Patched, Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.mqtt import MqttFeed, broker_of, is_broker
 from twin_master.watch.opening import begin_watch, resume_watch
+from twin_master.watch.snapshot import stored
 from twin_master.watch.teaching import Search, check_teachable
 
 Decide = Callable[[Mapping[str, Any]], object]
@@ -222,8 +220,4 @@ def _untold(watched: Watch) -> dict[str, Any] | None:
     """Return the last decision, to be told again, where a kill may have left it untold."""
     model = watched.models[-1].knowledge.model
     last = last_decision(watched.folder / JOURNAL_NAME, watched.scenario, model)
-    try:
-        ended = read_json(watched.folder / SUMMARY_NAME, DamagedFileError)["steps"]
-    except (DamagedFileError, KeyError, TypeError):
-        return last
-    return None if last is None or ended == last["turn"] + 1 else last
+    return None if stored(watched.folder) else last
