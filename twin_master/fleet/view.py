@@ -7,35 +7,22 @@ bands of all, and the fifty that are worst.
 import asyncio
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tornado.web import Application, RequestHandler
 
-from reporting import figures as style
 from reporting.errors import ReportingError
 from reporting.json_file import read_json
-from reporting.page import Column, Page, Table, script_source
+from reporting.page import Page, script_source
 from reporting.words import counted
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.outcome import FAILED, NOTICE_KINDS, has_flown
-from twin_master.fleet.reading import last_turns, leaving
-from twin_master.fleet.report import (
-    BANDS,
-    LOST,
-    add_failures,
-    add_lessons,
-    course_figure,
-    grey,
-    map_figure,
-    scale_of,
-)
+from twin_master.fleet.outcome import FAILED, has_flown
+from twin_master.fleet.report import LOST, Standing, add_failures, add_flown_group, add_group, add_lessons
 from twin_master.fleet.standing import STATE_NAME, FleetRecord
 from twin_master.fleet.store import DONE_NAME, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
@@ -44,8 +31,6 @@ from twin_master.scenario.schema import Scenario
 from twin_master.viewer.server import HEADERS, OWN_NAMES, serve_application
 
 __all__ = ["fleet_view", "is_fleet", "serve_fleet"]
-
-Float = NDArray[np.float64]
 
 WORST = 50
 """Assets in the table."""
@@ -62,23 +47,6 @@ def _config(folder: Path) -> dict[str, Any]:
 def is_fleet(folder: Path) -> bool:
     """Return whether a folder is that of a fleet, flown or watched."""
     return _config(folder).get("kind") in (FLOWN_KIND, WATCHED_KIND)
-
-
-@dataclass(frozen=True)
-class _Standing:
-    """How B assets of a group stand: turns and alarms (B,), moments of the state (B, F), SI, controls.
-
-    `leaving` (B,) is the probability that a control is left soon; NaN where it is not known.
-    """
-
-    scenario: Scenario
-    names: list[str]
-    turn: NDArray[np.int64]
-    mean: Float
-    deviation: Float
-    control: list[str]
-    alarms: NDArray[np.int64]
-    leaving: Float
 
 
 def fleet_view(folder: Path) -> str:
@@ -137,13 +105,13 @@ def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
             np.array([[getattr(told.health[n], m) for n in scenario.state_names] for told in last])
             for m in ("mean", "standard_deviation")
         )
-        standing = _Standing(
+        standing = Standing(
             scenario, list(own), np.array([told.turn for told in last], dtype=np.int64), mean, deviation,
             [told.next_control for told in last],
             np.array([alarms for _, alarms, _ in own.values()], dtype=np.int64),
             np.array([chance for _, _, chance in own.values()], dtype=np.float64),
         )  # fmt: skip
-        _add_group(page, group["name"], standing, 0)
+        add_group(page, group["name"], standing, WORST)
 
 
 def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
@@ -158,64 +126,7 @@ def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
         notice = LOST.format(len(failures), len(status))
         add_failures(page, failures, notice, "They stand in fleet.json once the fleet has flown.")
     for record in fleet["groups"]:
-        group, scenario = groups[record["name"]], Scenario.model_validate(record["scenarios"][0])
-        known = group["status"].values
-        rows, last = has_flown(known), last_turns(group)
-        mean = group["mean"].values[rows]
-        at = np.arange(len(rows)), last[rows]
-        control = group["control_index"].values[rows][at]
-        standing = _Standing(
-            scenario, [record["members"][row][0] for row in rows], last[rows], mean[at],
-            group["standard_deviation"].values[rows][at], [scenario.control_names[u] for u in control],
-            group["notices"].values[rows, NOTICE_KINDS.index("alarm")], leaving(folder, record, group)[rows],
-        )  # fmt: skip
-        _add_group(
-            page, record["name"], standing, int(np.sum(known == FAILED)), group["state"].values[rows], mean
-        )
-
-
-def _add_group(
-    page: Page, name: str, standing: _Standing, failed: int, state: Float | None = None,
-    mean: Float | None = None,
-) -> None:  # fmt: skip
-    """Add a map of a group, bands where all turns are at hand, and its worst assets."""
-    page.add_section(f"Group {name}")
-    count, scenario = len(standing.names), standing.scenario
-    if not count:
-        page.add_paragraph("Nothing is known of its assets yet.")
-        return
-    scale, unit = scale_of(scenario)
-    with style.publication_style():
-        drawn = map_figure(scenario, scale * standing.mean, failed, unit)
-    caption = f"Filtered means, one cell for each asset, the worst first.{grey(failed)}"
-    page.add_figure(style.to_svg(drawn), caption, title="The assets by health")
-    if state is not None and mean is not None:
-        with style.publication_style():
-            drawn = course_figure(scenario, scale * mean, scale * state, unit)
-        page.add_figure(style.to_svg(drawn), BANDS, title="Over time")
-    soon = np.nan_to_num(standing.leaving)
-    order = np.lexsort((-standing.mean.sum(axis=1), -soon, -standing.alarms))[:WORST]
-    rows, told = [], bool(standing.alarms.any())
-    for row in order.tolist():
-        pairs = zip(scale * standing.mean[row], scale * standing.deviation[row], strict=True)
-        states = [
-            f"{mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{deviation:.1f}" for mean, deviation in pairs
-        ]
-        alarms = [str(standing.alarms[row] or "")] * told
-        change = f"{100.0 * soon[row]:.0f}"
-        rows.append(
-            [standing.names[row], str(standing.turn[row]), *states, standing.control[row], change, *alarms]
-        )
-    columns = [Column("asset"), Column(scenario.mission.step_name, numeric=True)]
-    columns += [Column(factor.name, unit, numeric=True) for factor in scenario.state]
-    columns += [Column("control"), Column("change", "%", numeric=True)]
-    columns += [*[Column("alarms", numeric=True)] * told]
-    caption = (
-        f"{len(rows)} of {counted(count, 'asset')}, by {'alarms, then by ' * told}the probability that the "
-        f"policy leaves the control within {scenario.mission.prediction_steps} {scenario.mission.step_name}s "
-        "(change), then by the sum of their states."
-    )
-    page.add_table(Table(columns, rows), caption, title="Who needs attention next")
+        add_flown_group(page, folder, record, groups[record["name"]], WORST)
 
 
 def _failures(folder: Path) -> dict[str, str]:

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,9 +102,8 @@ class MessageReader:
         if base not in self._index and self._allows_unknown:
             return None
         if base not in self._index:
-            near = get_close_matches(name[:60], self._index, 3) or [next(iter(self._index))]
             raise Refused(
-                f"`{name[:60]}` is no sensor: a sensor is called such as {listing(f'`{n}`' for n in near)}, "
+                f"`{name[:60]}` is no sensor: a sensor is called such as {_near(name[:60], *self._index)}, "
                 f"its unit behind it, and there are {self._observation.count}; what is none is passed over "
                 "with --allow-unknown, or where its name begins with `_`"
             )
@@ -205,7 +205,8 @@ class MessageReader:
             raise Refused(f"`covariance` is {count} rows of {count} numbers, in SI units; null is none")
         size = np.sqrt(np.abs(np.diag(matrix)))
         size[size == 0.0] = 1.0
-        scaled = matrix / size / size[:, None]
+        with np.errstate(over="ignore"):
+            scaled = matrix / size / size[:, None]
         wrong = np.abs(scaled).max() > 1.0 + 1e-6 or np.abs(scaled - scaled.T).max() > 1e-6
         if wrong or np.linalg.eigvalsh(scaled)[0] < -1e-6:
             raise Refused("`covariance` is not symmetric with eigenvalues of zero or more")
@@ -221,10 +222,9 @@ class MessageReader:
             return number
         if not math.isfinite(number):
             return json.dumps(value)[:30]
-        if self._largest[sensor] == LARGEST:
-            return f"{number:g}"
-        forgotten = "" if factor != 1.0 else f"; give its unit, such as `strain_{sensor + 1}_microstrain`"
-        return f"a strain of {number:g}{forgotten}"
+        forgotten = factor == 1.0 and self._largest[sensor] == LARGEST_STRAIN
+        unit = f"; give its unit, such as `strain_{sensor + 1}_microstrain`" if forgotten else ""
+        return f"{number:g}{unit}"
 
     def _control(self, control: object) -> int | None:
         if control is None:
@@ -232,3 +232,9 @@ class MessageReader:
         if not isinstance(control, str) or control not in self._controls:
             raise Refused(f"`control` is one of {', '.join(self._controls)}, or absent")
         return self._controls.index(control)
+
+
+@lru_cache(maxsize=1000)
+def _near(name: str, *known: str) -> str:
+    """Return the names next to one, in words: kept, because finding them takes longer than a message."""
+    return listing(f"`{near}`" for near in get_close_matches(name, known, 3) or known[:1])

@@ -307,7 +307,7 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
     assert isinstance(units, Message)
     assert isinstance(infinite, Message)
     assert isinstance(fine, Message)
-    assert units.unreadable == {1: "a strain of 0.6; give its unit, such as `strain_2_microstrain`"}
+    assert units.unreadable == {1: "0.6; give its unit, such as `strain_2_microstrain`"}
     assert (infinite.observed[1], infinite.unreadable) == (1e-4, {0: '"inf"'})
     np.testing.assert_allclose(fine.observed[:2], [5e-6, np.nan], rtol=1e-15)
     path.write_text("turn,_rain,strain_1\n12.0,wet,1e-4\n12.5,wet,1e-4\n", encoding="utf-8")
@@ -346,8 +346,8 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
         ('"OL"', '"OL"'),
         ("true", "true"),
         ("[1e-4]", "[0.0001]"),
-        ("0.6", "a strain of 0.6; give its unit, such as `strain_5_microstrain`"),
-        ("1e8", "a strain of 1e+08; give its unit"),
+        ("0.6", "0.6; give its unit, such as `strain_5_microstrain`"),
+        ("1e8", "1e+08; give its unit"),
     ],
 )
 def test_an_unreadable_gauge_is_lost_alone_and_named_once(
