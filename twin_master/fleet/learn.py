@@ -202,7 +202,7 @@ def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
     left_out = sum(len(kept) for kept in explained) - twins
     parameter = parts[0].knowledge.draws.name
     flown = frozenset[str]().union(*(part.controls for part in parts))
-    alarmed = int(noticed(group, "alarm")[has_flown(group["status"].values)].sum())
+    alarmed = int(np.sum(noticed(group, "alarm")[has_flown(group["status"].values)] > 0))
     return GroupLessons(
         record["name"], twins, left_out, alarmed, worsening, grid, noise, parameter, own, flown
     )

@@ -157,9 +157,11 @@ def fleet_groups(folder: Path) -> "dict[str, xr.Dataset]":
     return {name: open_group(folder, name) for name in names}
 
 
-def noticed(group: "xr.Dataset", kind: str) -> NDArray[np.bool_]:
-    """Return whether each twin gave a notice of a kind."""
-    return np.asarray(group["notices"].values[:, NOTICE_KINDS.index(kind)] > 0)
+def noticed(group: "xr.Dataset", kind: str) -> NDArray[np.int64]:
+    """Return how many notices of a kind each twin gave; none in a store of a version that kept none."""
+    if "notices" not in group:
+        return np.zeros(group.sizes["twin"], dtype=np.int64)
+    return np.asarray(group["notices"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
 
 
 def last_turns(group: "xr.Dataset") -> NDArray[np.int64]:
@@ -228,8 +230,8 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
         "failed in flight": int(np.sum(status == FAILED)),
         **({"ended early": short} if (short := int(np.sum(status == ENDED))) else {}),
     }
-    alarmed, left_out = (int(noticed(group, kind).sum()) for kind in NOTICE_KINDS)
-    found |= {"raised an alarm": alarmed} if group.attrs["gives_notice"] else {}
+    alarmed, left_out = (int(np.sum(noticed(group, kind) > 0)) for kind in NOTICE_KINDS)
+    found |= {"raised an alarm": alarmed} if group.attrs.get("gives_notice") else {}
     found |= {"left a gauge out": left_out} if left_out else {}
     if not found["flown"]:
         return found

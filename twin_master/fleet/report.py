@@ -22,7 +22,7 @@ from reporting.words import counted
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.flight import RESULT_NAME, fleet_config
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.outcome import FAILED, NOTICE_KINDS, has_flown
+from twin_master.fleet.outcome import FAILED, has_flown
 from twin_master.fleet.reading import WITHIN, group_figures, last_turns, leaving, noticed, shown
 from twin_master.fleet.store import open_group
 from twin_master.scenario.schema import Scenario
@@ -106,11 +106,13 @@ def _opening(records: list[dict[str, Any]], groups: "dict[str, xr.Dataset]") -> 
     twins = sum(group.sizes["twin"] for group in groups.values())
     flown = {name: has_flown(group["status"].values) for name, group in groups.items()}
     sentences = [f"{sum(map(len, flown.values()))} of {counted(twins, 'asset')} have flown."]
-    told = [(noticed(group, "alarm"), group["first_notice"].values[:, 0]) for group in groups.values()]
-    alarms = np.concatenate([first[alarmed] for alarmed, first in told])
-    if len(alarms):
-        step = next(iter(groups.values())).attrs["step_name"]
-        sentences.append(f"{counted(len(alarms), 'asset')} raised an alarm, first in {step} {alarms.min()}.")
+    alarmed = {name: np.flatnonzero(noticed(group, "alarm")) for name, group in groups.items()}
+    first = [
+        groups[name]["first_notice"].values[rows, 0].min() for name, rows in alarmed.items() if len(rows)
+    ]
+    if first:
+        count, step = sum(map(len, alarmed.values())), next(iter(groups.values())).attrs["step_name"]
+        sentences.append(f"{counted(count, 'asset')} raised an alarm, first in {step} {min(first)}.")
     delay = np.concatenate([group["delay"].values[flown[name]] for name, group in groups.items()])
     called = delay[~np.isnan(delay)]
     if len(called):
@@ -205,7 +207,7 @@ def add_flown_group(page: Page, folder: Path, record: dict[str, Any], group: "xr
     standing = Standing(
         scenario, [record["members"][row][0] for row in rows], last[rows], mean[at],
         group["standard_deviation"].values[rows][at], [scenario.control_names[u] for u in control],
-        group["notices"].values[rows, NOTICE_KINDS.index("alarm")], chance,
+        noticed(group, "alarm")[rows], chance,
     )  # fmt: skip
     failed = int(np.sum(known == FAILED))
     add_group(page, record["name"], standing, most, failed, group["state"].values[rows], mean)

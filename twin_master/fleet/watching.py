@@ -182,7 +182,7 @@ class FleetWatch:
                 self.lost(key, error)
                 return None
         self.closing.callback(asset.close)
-        if self.failures.pop(key, None):
+        if self.failures.pop(key, None) is not None:
             self.note(f"{key} is watched again.")
         self._like.setdefault(group.name, watch)
         self.assets[key] = asset
@@ -363,11 +363,14 @@ class _Topics:
         self._messages = self._session.messages(0.0)
         self._assets: dict[str, WatchedAsset] = {}
         self._inboxes: dict[str, _Inbox | None] = {}
+        self._searched = time.monotonic()
 
     def look(self) -> int:
         """Take in what the broker has sent; return the number of turns."""
         turns = 0
-        for topic in [*self._inboxes] if self._fleet.failures else ():
+        again = time.monotonic() - self._searched >= SEARCH_SECONDS
+        self._searched = time.monotonic() if again else self._searched
+        for topic in [*self._inboxes] if again else ():
             if self._fleet.due(f"{self._group.name}/{topic.rpartition('/')[2]}"):
                 self._inboxes[topic] = self._begun(topic, self._inboxes[topic])
                 turns += self._advanced(topic)

@@ -256,6 +256,50 @@ def test_a_topic_for_each_asset(
 
 
 @pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
+def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
+    fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
+    monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
+    decisions, unwell = Watch.decisions, iter([True])
+
+    def once_unwell(watch: Watch, *given: Any) -> Iterator[dict[str, Any]]:
+        for decision in decisions(watch, *given):
+            yield decision
+            if decision["turn"] == 2 and next(unwell, False):
+                raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr(Watch, "decisions", once_unwell)
+    broker = Mosquitto(tmp_path)
+    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+    publisher, notes, told, sent = broker.client("publisher"), list[str](), list[int](), list[int]()
+
+    def send() -> None:
+        if notes and not sent:
+            sent.append(1)
+            for turn in range(TURNS):
+                record = {"turn": turn, "control": "2g", "strain": [1e-3] * 24}
+                publisher.publish("wings/wing-0", json.dumps(record), qos=1)
+        inbox = fleet._sources[0]._inboxes.get("wings/wing-0")  # type: ignore[union-attr]
+        if inbox is not None and len(inbox.came) == TURNS - 3:  # all that came while it was lost
+            fleet._again["north/wing-0"] = 0.0
+
+    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+        told.append(decision["turn"])
+        fleet.asked = decision["turn"] == TURNS - 1
+
+    fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
+    fleet.run(send)
+    broker.stop()
+    assert told == [0, 1, 2, 2, 3, 4, 5]
+    assert notes[1:3] == [
+        "north/wing-0 is not watched: ZeroDivisionError: division by zero",
+        "north/wing-0 is watched again.",
+    ]
+    assert fleet.assets["north/wing-0"].keep.intake.counts.missing == 0
+
+
+@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
 def test_a_topic_that_jumps_ahead_and_is_left_alone(
     fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
