@@ -22,15 +22,18 @@ def read_json(path: Path | str, error: type[Exception], *, what: str = "file") -
     return parse_json(read_text(path, error, what=what), f"The {what} {path}", error)
 
 
-def parse_json(content: bytes | str, source: str, error: type[Exception]) -> Any:
-    """Return the content of JSON that was read elsewhere; `source` names it in the sentence of `error`."""
+def parse_json(content: bytes | str, source: str, error: type[Exception], *, any_number: bool = False) -> Any:
+    """Return the content of JSON that was read elsewhere; `source` names it in the sentence of `error`.
+
+    With `any_number` it may have NaN, infinities and numbers that 64 bits cannot hold, which are floats.
+    """
     text = decoded(content, source, error) if isinstance(content, bytes) else content
     try:
         found = json.loads(
             text,
-            parse_int=_integer,
-            parse_float=_decimal,
-            parse_constant=_refuse,
+            parse_int=_any_integer if any_number else _integer,
+            parse_float=float if any_number else _decimal,
+            parse_constant=float if any_number else _refuse,
             object_pairs_hook=_table,
         )
     except ValueError as cause:
@@ -57,6 +60,10 @@ def _refuse(number: str) -> NoReturn:
 def _decimal(text: str) -> float:
     number = float(text)
     return number if isfinite(number) else _refuse(text)
+
+
+def _any_integer(digits: str) -> float:
+    return int(digits) if len(digits) < _LONGEST_INTEGER else float(digits)
 
 
 def _integer(digits: str) -> int:

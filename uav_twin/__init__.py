@@ -39,9 +39,9 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from twin_master.network.sensor_model import GaussianSensorModel
     from twin_master.network.twin import Twin
     from twin_master.report.page import report_figures, write_report
-    from twin_master.report.reading import open_run
     from twin_master.scenario.reading import load_scenario
     from twin_master.watch.from_python import watch
+    from twin_master.watch.snapshot import open_run
     from twin_master.workflow import new_run as fly
     from twin_master.workflow import resume_run as resume
 
@@ -115,7 +115,7 @@ _HOMES = {
     "load_scenario": "twin_master.scenario.reading",
     "natural_frequencies": "fe.structure.solution",
     "open_fleet": "twin_master.fleet.reading:fleet_groups",
-    "open_run": "twin_master.report.reading",
+    "open_run": "twin_master.watch.snapshot",
     "prepare_twin": "twin_master.mission.preparation",
     "read_campaign": "discrepancy.campaign.reading",
     "read_verdict": "discrepancy.files.verdict:read_verdict_folder",

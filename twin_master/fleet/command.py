@@ -85,6 +85,7 @@ def _show_lessons(record: dict[str, Any]) -> None:
     table = Table("group", "learnt", "assumed", "mean", "95 % interval", box=box.SIMPLE_HEAD)
     for name, group in record["groups"].items():
         heading = f"{name}, {counted(group['twins'], 'twin')}"
+        heading += f", {group['alarmed']} with an alarm" if group["alarmed"] else ""
         for control, rate in group["probability"].items():
             mean, interval = f"{rate['mean']:.4f}", f"{rate['lower_95']:.4f} to {rate['upper_95']:.4f}"
             if not rate["flown"]:

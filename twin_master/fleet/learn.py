@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,15 @@ from twin_master.fleet.flight import GROUPS, fleet_config, source_of
 from twin_master.fleet.outcome import has_flown
 from twin_master.fleet.population import Line, population
 from twin_master.fleet.posterior import POINTS, Grid, Marginal, Shared, refined, shared
+from twin_master.fleet.reading import noticed
 from twin_master.fleet.store import open_group
 from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["FleetLessons", "GroupLessons", "Line", "learn_fleet"]
 
@@ -44,8 +48,9 @@ class GroupLessons:
     Attributes
     ----------
     name : str
-    twins, unexplained : int
-        How many taught, and how many were left out because no probability explains what they saw.
+    twins, unexplained, alarmed : int
+        How many taught, how many were left out because no probability explains what they saw, and how many of
+        all raised an alarm.
     worsening : Worsening
         The probabilities and what was assumed of them.
     grid : Grid
@@ -63,6 +68,7 @@ class GroupLessons:
     name: str
     twins: int
     unexplained: int
+    alarmed: int
     worsening: Worsening
     grid: Grid
     noise: Line
@@ -152,7 +158,8 @@ class _Seen:
 
 def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
     """Learn the noise first, for what else is learnt rests on it, then the rates, then the population."""
-    parts = list(_seen(folder, record))
+    group = open_group(folder, record["name"])
+    parts = list(_seen(folder, record, group))
     if not parts:
         return None
     worsening = Worsening.of(parts[0].knowledge.scenario)
@@ -195,12 +202,14 @@ def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
     left_out = sum(len(kept) for kept in explained) - twins
     parameter = parts[0].knowledge.draws.name
     flown = frozenset[str]().union(*(part.controls for part in parts))
-    return GroupLessons(record["name"], twins, left_out, worsening, grid, noise, parameter, own, flown)
+    alarmed = int(np.sum(noticed(group, "alarm")[has_flown(group["status"].values)] > 0))
+    return GroupLessons(
+        record["name"], twins, left_out, alarmed, worsening, grid, noise, parameter, own, flown
+    )
 
 
-def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
+def _seen(folder: Path, record: dict[str, Any], group: "xr.Dataset") -> Iterator[_Seen]:
     """Yield the twins of a group that flew, those together that share what they know."""
-    group = open_group(folder, record["name"])
     flown = has_flown(group["status"].values)
     if not len(flown):
         return

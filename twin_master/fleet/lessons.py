@@ -121,7 +121,8 @@ def lessons_record(lessons: FleetLessons) -> dict[str, Any]:
                 strict=True,
             )
         }
-        found: dict[str, Any] = {"twins": group.twins, "left_out": group.unexplained, "probability": rates}
+        counts = {"twins": group.twins, "left_out": group.unexplained, "alarmed": group.alarmed}
+        found: dict[str, Any] = {**counts, "probability": rates}
         found["noise_factor"] = _figures(group.noise)
         if group.population is not None:
             mean, spread = group.population

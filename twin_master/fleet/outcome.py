@@ -18,6 +18,8 @@ __all__ = ["ENDED", "FAILED", "FLOWN", "VARIABLES", "Variable", "in_credible_set
 
 Float = NDArray[np.float64]
 
+NOTICE_KINDS = ("alarm", "gauge_left_out")
+"""Notices that are kept of each twin, by their kinds."""
 CREDIBILITY = 0.9
 """Probability of the set of states in which the true one is looked for."""
 _TOLERANCE = 1e-9
@@ -62,6 +64,8 @@ VARIABLES: Mapping[str, Variable] = {
     ),
     "early": Variable((), "i1", "whether another control than the first was flown before that damage"),
     "credible": Variable((), "f4", "share of turns with the true state in the 90 % set of the belief"),
+    "notices": Variable(("notice_kind",), "i4", f"notices of the kinds {', '.join(NOTICE_KINDS)}"),
+    "first_notice": Variable(("notice_kind",), "i4", "turn of the first of each kind; -1: none"),
 }
 """What is stored of each twin, by its name; true parameters that differ from twin to twin stand beside it."""
 
@@ -72,6 +76,7 @@ def sizes_of(scenario: Scenario) -> dict[str, int]:
         "turn": scenario.mission.steps,
         "sensor": scenario.observation.count,
         "factor": len(scenario.state),
+        "notice_kind": len(NOTICE_KINDS),
         "level": int(np.prod([len(factor.levels) for factor in scenario.state])),
     }
 
@@ -91,6 +96,10 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
     unknown = np.isnan(flights.state[:, 0]).any(axis=1)  # of a real asset
     turns = (flights.control_index >= 0).sum(axis=1)  # a recording or a simulation may end early
     short = np.array([bool(text) for text in flights.ended])
+    told = [
+        [[turn for turn, notice in own if notice.kind == kind] for kind in NOTICE_KINDS]
+        for own in flights.notices
+    ]
     found: dict[str, Any] = {
         "status": np.where(failed, FAILED, np.where(short, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
@@ -103,6 +112,8 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
         "belief": flights.filtered[np.arange(len(failed)), np.where(failed, steps, turns) - 1],
         "delay": np.where(failed, np.nan, delay),
         "early": early & ~failed,
+        "notices": [[len(turns) for turns in own] for own in told],
+        "first_notice": [[min(turns, default=-1) for turns in own] for own in told],
         "credible": np.where(
             failed | unknown, np.nan, inside.reshape(-1, steps).sum(axis=1) / np.maximum(turns, 1)
         ),

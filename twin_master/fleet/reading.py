@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.errors import FleetError
-from twin_master.fleet.flight import fleet_config
-from twin_master.fleet.outcome import ENDED, FAILED, FLOWN, outcomes_of
+from twin_master.fleet.flight import GROUPS, fleet_config
+from twin_master.fleet.outcome import ENDED, FAILED, FLOWN, NOTICE_KINDS, has_flown, outcomes_of
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import open_group
+from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.scenario.schema import Scenario
@@ -22,7 +23,7 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Estimated", "Outcomes", "fleet_groups", "fly_seeds", "group_figures"]
+__all__ = ["Estimated", "Outcomes", "attention", "fleet_groups", "fly_seeds", "group_figures"]
 
 Float = NDArray[np.float64]
 
@@ -156,10 +157,68 @@ def fleet_groups(folder: Path) -> "dict[str, xr.Dataset]":
     return {name: open_group(folder, name) for name in names}
 
 
+def noticed(group: "xr.Dataset", kind: str) -> NDArray[np.int64]:
+    """Return how many notices of a kind each twin gave; none in a store of a version that kept none."""
+    if "notices" not in group:
+        return np.zeros(group.sizes["twin"], dtype=np.int64)
+    return np.asarray(group["notices"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
+
+
 def last_turns(group: "xr.Dataset") -> NDArray[np.int64]:
     """Return the last turn of each twin: that of a recording may come early."""
     last: NDArray[np.int64] = np.maximum((group["control_index"].values >= 0).sum(axis=1) - 1, 0)
     return last
+
+
+def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
+    """Return the probability that the policy leaves a control within the steps that are predicted: (B,).
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        Of the twins.
+    belief : (B, S)
+        After the last turn.
+    control : int
+        In force then; it stays so until the policy leaves it.
+    """
+    keeps = (knowledge.plan.control_index == control).astype(np.float64)
+    stays = keeps.copy()
+    for _ in range(knowledge.scenario.mission.prediction_steps - 1):
+        stays = keeps * knowledge.model.transition.expected(control, stays)
+    return np.asarray(1.0 - belief @ stays)
+
+
+def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
+    """Return the probability that each twin of a group leaves its control soon, see `attention`: (B,).
+
+    It is NaN of twins that have not flown.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the fleet.
+    record : mapping
+        Of the group, as `config.json` has it.
+    group : Dataset
+        Of the store.
+
+    Raises
+    ------
+    RunFolderError
+        What the twins know is missing or damaged.
+    """
+    own, flown = folder / GROUPS / record["name"], has_flown(group["status"].values)
+    chance = np.full(group.sizes["twin"], np.nan)
+    if len(flown):
+        scenario = Scenario.model_validate(record["scenarios"][0])
+        knowledge = kept_knowledge(own / "0" if record["files"] else own, scenario)
+        belief = group["belief"].values.astype(np.float64)
+        control = group["control_index"].values[np.arange(len(chance)), last_turns(group)]
+        for index in np.unique(control[flown]):
+            mine = flown[control[flown] == index]
+            chance[mine] = np.maximum(attention(knowledge, belief[mine], int(index)), 0.0)
+    return chance
 
 
 def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
@@ -171,6 +230,9 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
         "failed in flight": int(np.sum(status == FAILED)),
         **({"ended early": short} if (short := int(np.sum(status == ENDED))) else {}),
     }
+    alarmed, left_out = (int(np.sum(noticed(group, kind) > 0)) for kind in NOTICE_KINDS)
+    found |= {"raised an alarm": alarmed} if group.attrs.get("gives_notice") else {}
+    found |= {"left a gauge out": left_out} if left_out else {}
     if not found["flown"]:
         return found
     study = Outcomes.of(group)

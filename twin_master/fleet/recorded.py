@@ -7,6 +7,7 @@ from pathlib import Path
 from twin_master.mission.loop import Beliefs, operate
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT, Flights
+from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import Fed, file_feed
 from twin_master.watch.growing import Place
@@ -44,6 +45,7 @@ def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Fl
     """
     scenario = knowledge.scenario
     flights, failure = Flights.empty(knowledge, len(recordings)), [""] * len(recordings)
+    notices = [*flights.notices]
     for number, messages in enumerate(recordings):
         try:
             beliefs = _beliefs(knowledge, messages)
@@ -63,20 +65,24 @@ def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Fl
         flights.control_index[number, :turns] = beliefs.control_index
         flights.filtered[number, :turns] = beliefs.filtered
         flights.log_evidence[number, :turns] = beliefs.log_evidence
-    return replace(flights, failure=tuple(failure))
+        notices[number] = tuple(beliefs.notices)
+    return replace(flights, failure=tuple(failure), notices=tuple(notices))
 
 
 def _beliefs(knowledge: Knowledge, messages: Sequence[Fed]) -> Beliefs:
     scenario = knowledge.scenario
     twin, beliefs = knowledge.twin(lag=scenario.watch.lag), Beliefs(scenario.observation.count)
     intake, seen, late = Intake(scenario, _Recorded(messages), RejectedFile(None)), {}, False
+    lost: list[tuple[int, Notice]] = []
     for reading, turn, _ in operate(twin, intake):
         at = intake.observation_turn
         seen[at] = reading.observed, twin.control_of(at)
         late |= reading.revises is not None
+        lost += [(at, notice) for notice in intake.notices]
         beliefs.add(reading.observed, turn)
     if late:
         twin, beliefs = knowledge.twin(), Beliefs(scenario.observation.count)
         for at in sorted(seen):
             beliefs.add(seen[at][0], twin.turn(*seen[at]))
+    beliefs.notices += lost
     return beliefs

@@ -6,6 +6,7 @@ number of assets: a cell of a map for each, and tables of the few that matter.
 
 import json
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,19 +20,17 @@ from reporting.files import atomic_write_text
 from reporting.page import Column, Page, Table
 from reporting.words import counted
 from twin_master.errors import TwinMasterError
-from twin_master.fleet.flight import GROUPS, RESULT_NAME, fleet_config
+from twin_master.fleet.flight import RESULT_NAME, fleet_config
 from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.outcome import FAILED, has_flown
-from twin_master.fleet.reading import WITHIN, group_figures, last_turns, shown
+from twin_master.fleet.reading import WITHIN, group_figures, last_turns, leaving, noticed, shown
 from twin_master.fleet.store import open_group
-from twin_master.mission.kept_knowledge import kept_knowledge
-from twin_master.mission.preparation import Knowledge
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["REPORT_NAME", "attention", "write_fleet_report"]
+__all__ = ["REPORT_NAME", "write_fleet_report"]
 
 Float = NDArray[np.float64]
 
@@ -46,23 +45,21 @@ BANDS = (
 )
 
 
-def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
-    """Return the probability that the policy leaves a control within the steps that are predicted: (B,).
+@dataclass(frozen=True)
+class Standing:
+    """How B assets of a group stand: turns and alarms (B,), moments of the state (B, F), SI, controls.
 
-    Parameters
-    ----------
-    knowledge : Knowledge
-        Of the twins.
-    belief : (B, S)
-        After the last turn.
-    control : int
-        In force then; it stays so until the policy leaves it.
+    `leaving` (B,) is the probability that a control is left soon; NaN where it is not known.
     """
-    keeps = (knowledge.plan.control_index == control).astype(np.float64)
-    stays = keeps.copy()
-    for _ in range(knowledge.scenario.mission.prediction_steps - 1):
-        stays = keeps * knowledge.model.transition.expected(control, stays)
-    return np.asarray(1.0 - belief @ stays)
+
+    scenario: Scenario
+    names: list[str]
+    turn: NDArray[np.int64]
+    mean: Float
+    deviation: Float
+    control: list[str]
+    alarms: NDArray[np.int64]
+    leaving: Float
 
 
 def write_fleet_report(folder: Path | str) -> Path:
@@ -99,8 +96,7 @@ def write_fleet_report(folder: Path | str) -> Path:
         page.add_section("Learnt across the fleet")
         add_lessons(page, json.loads(lessons.read_text()))
     for record in fleet["groups"]:
-        page.add_section(f"Group {record['name']}")
-        _group(page, folder, record, groups[record["name"]])
+        add_flown_group(page, folder, record, groups[record["name"]], NEXT)
     atomic_write_text(folder / REPORT_NAME, page.render())
     return folder / REPORT_NAME
 
@@ -110,6 +106,13 @@ def _opening(records: list[dict[str, Any]], groups: "dict[str, xr.Dataset]") -> 
     twins = sum(group.sizes["twin"] for group in groups.values())
     flown = {name: has_flown(group["status"].values) for name, group in groups.items()}
     sentences = [f"{sum(map(len, flown.values()))} of {counted(twins, 'asset')} have flown."]
+    alarmed = {name: np.flatnonzero(noticed(group, "alarm")) for name, group in groups.items()}
+    first = [
+        groups[name]["first_notice"].values[rows, 0].min() for name, rows in alarmed.items() if len(rows)
+    ]
+    if first:
+        count, step = sum(map(len, alarmed.values())), next(iter(groups.values())).attrs["step_name"]
+        sentences.append(f"{counted(count, 'asset')} raised an alarm, first in {step} {min(first)}.")
     delay = np.concatenate([group["delay"].values[flown[name]] for name, group in groups.items()])
     called = delay[~np.isnan(delay)]
     if len(called):
@@ -175,6 +178,8 @@ def add_lessons(page: Page, record: dict[str, Any]) -> None:
             off = not rate["lower_95"] <= rate["assumed"] <= rate["upper_95"]
             assumed = f"{rate['assumed']:.4f}{' (outside)' if off else ''}"
             rows.append([name, f"probability to worsen, {control}", assumed, f"{rate['mean']:.4f}", interval])
+        if group["alarmed"]:
+            rows.append([name, "twins with an alarm among them", "", str(group["alarmed"]), ""])
         lines = [("noise over the assumed", "1", group["noise_factor"])]
         if "population" in group:
             told = group["population"]
@@ -188,29 +193,68 @@ def add_lessons(page: Page, record: dict[str, Any]) -> None:
     page.add_table(Table(columns, rows), caption, title="What was learnt beside what was assumed")
 
 
-def _group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset") -> None:
-    scenario = Scenario.model_validate(record["scenarios"][0])
-    flown = has_flown(group["status"].values)
-    if not len(flown):
-        page.add_paragraph("No twin of this group has flown to its end yet.")
+def add_flown_group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset", most: int) -> None:
+    """Add a group of the store, see `add_group`."""
+    scenario, known = Scenario.model_validate(record["scenarios"][0]), group["status"].values
+    rows, last = has_flown(known), last_turns(group)
+    mean, at = group["mean"].values[rows], (np.arange(len(rows)), last[rows])
+    try:
+        chance = leaving(folder, record, group)[rows]
+    except TwinMasterError as error:
+        page.add_paragraph(f"Who leaves its control soon is not known: {error}")
+        chance = np.full(len(rows), np.nan)
+    control = group["control_index"].values[rows][at]
+    standing = Standing(
+        scenario, [record["members"][row][0] for row in rows], last[rows], mean[at],
+        group["standard_deviation"].values[rows][at], [scenario.control_names[u] for u in control],
+        noticed(group, "alarm")[rows], chance,
+    )  # fmt: skip
+    failed = int(np.sum(known == FAILED))
+    add_group(page, record["name"], standing, most, failed, group["state"].values[rows], mean)
+
+
+def add_group(
+    page: Page, name: str, standing: Standing, most: int, failed: int = 0, state: Float | None = None,
+    mean: Float | None = None,
+) -> None:  # fmt: skip
+    """Add a map of a group, bands where all turns are at hand, and so many assets that need attention."""
+    page.add_section(f"Group {name}")
+    count, scenario = len(standing.names), standing.scenario
+    if not count:
+        page.add_paragraph("Nothing is known of its assets yet.")
         return
     scale, unit = scale_of(scenario)
-    mean = scale * group["mean"].values[flown]  # (B, T, F)
-    failed = int(np.sum(group["status"].values == FAILED))
-    last = mean[np.arange(len(flown)), last_turns(group)[flown]]
     with style.publication_style():
-        page.add_figure(
-            style.to_svg(map_figure(scenario, last, failed, unit)),
-            f"Filtered mean after the last {scenario.mission.step_name}, one cell for each asset, "
-            f"the worst first by the sum of its states.{grey(failed)}",
-            title="The assets by health",
+        drawn = map_figure(scenario, scale * standing.mean, failed, unit)
+    caption = f"Filtered means, one cell for each asset, the worst first.{grey(failed)}"
+    page.add_figure(style.to_svg(drawn), caption, title="The assets by health")
+    if state is not None and mean is not None:
+        with style.publication_style():
+            drawn = course_figure(scenario, scale * mean, scale * state, unit)
+        page.add_figure(style.to_svg(drawn), BANDS, title="Health over time")
+    soon = np.nan_to_num(standing.leaving)
+    order = np.lexsort((-standing.mean.sum(axis=1), -soon, -standing.alarms))[:most]
+    rows, told = [], bool(standing.alarms.any())
+    for row in order.tolist():
+        pairs = zip(scale * standing.mean[row], scale * standing.deviation[row], strict=True)
+        states = [
+            f"{mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{deviation:.1f}" for mean, deviation in pairs
+        ]
+        alarms = [str(standing.alarms[row] or "")] * told
+        change = "" if np.isnan(standing.leaving[row]) else f"{100.0 * soon[row]:.0f}"
+        rows.append(
+            [standing.names[row], str(standing.turn[row]), *states, standing.control[row], change, *alarms]
         )
-        page.add_figure(
-            style.to_svg(course_figure(scenario, mean, scale * group["state"].values[flown], unit)),
-            BANDS,
-            title="Health over time",
-        )
-    _attention(page, folder, record, group, flown)
+    columns = [Column("asset"), Column(scenario.mission.step_name, numeric=True)]
+    columns += [Column(factor.name, unit, numeric=True) for factor in scenario.state]
+    columns += [Column("control"), Column("change", "%", numeric=True)]
+    columns += [*[Column("alarms", numeric=True)] * told]
+    caption = (
+        f"{len(rows)} of {counted(count, 'asset')}, by {'alarms, then by ' * told}the probability that the "
+        f"policy leaves the control within {scenario.mission.prediction_steps} {scenario.mission.step_name}s "
+        "(change; of assets with calibrations of their own by one policy), then by the sum of their states."
+    )
+    page.add_table(Table(columns, rows), caption, title="Who needs attention next")
 
 
 def scale_of(scenario: Scenario) -> tuple[float, str]:
@@ -280,41 +324,3 @@ def course_figure(scenario: Scenario, mean: Float, state: Float, unit: str) -> F
         style.panel_label(axes, "abcdefgh"[number % 8])
     figure.tight_layout()
     return figure
-
-
-def _attention(
-    page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset", flown: NDArray[np.int64]
-) -> None:
-    """Add the table of the assets whose control is likely to change next."""
-    scenario = Scenario.model_validate(record["scenarios"][0])
-    own = folder / GROUPS / record["name"]
-    try:
-        knowledge = kept_knowledge(own / "0" if record["files"] else own, scenario)
-    except TwinMasterError as error:
-        page.add_paragraph(f"Who needs attention next is not known: {error}")
-        return
-    belief = group["belief"].values.astype(np.float64)
-    last = last_turns(group)
-    control = group["control_index"].values[np.arange(len(last)), last]
-    chance = np.zeros(len(belief))
-    for index in np.unique(control[flown]):
-        mine = flown[control[flown] == index]
-        chance[mine] = attention(knowledge, belief[mine], int(index))
-    scale, unit = scale_of(scenario)
-    rows = []
-    for row in flown[np.argsort(-chance[flown], kind="stable")][:NEXT].tolist():
-        moments = (group[name].values[row, last[row]] for name in ("mean", "standard_deviation"))
-        pairs = zip(*moments, strict=True)
-        states = [f"{scale * mean:.1f} ± {scale * deviation:.1f}" for mean, deviation in pairs]
-        name = record["members"][row][0]
-        rows.append(
-            [name, *states, scenario.control_names[int(control[row])], f"{100.0 * max(chance[row], 0.0):.0f}"]
-        )
-    columns = [Column("asset"), *(Column(factor.name, unit, numeric=True) for factor in scenario.state)]
-    columns += [Column("control"), Column("change", "%", numeric=True)]
-    steps = scenario.mission.prediction_steps
-    caption = (
-        f"Change: probability that the policy leaves the control within {steps} "
-        f"{scenario.mission.step_name}s; for assets with calibrations of their own by one policy."
-    )
-    page.add_table(Table(columns, rows), caption, title="Who needs attention next")

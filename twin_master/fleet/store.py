@@ -131,7 +131,9 @@ def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
             shape=shape,
             chunks=(min(fleet.shard, count), *shape[1:]),
             dtype=variable.type,
-            fill_value=np.nan if variable.type.startswith("f") else {"control_index": -1}.get(name, 0),
+            fill_value=np.nan
+            if variable.type.startswith("f")
+            else -int(name in ("control_index", "first_notice")),
             dimension_names=("twin", *variable.dimensions),
             attributes={"title": variable.title, "units": variable.unit},
             overwrite=True,
@@ -144,6 +146,7 @@ def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
             "factors": list(scenario.state_names),
             "controls": list(scenario.control_names),
             "step_name": scenario.mission.step_name,
+            "gives_notice": scenario.notice is not None,
         }
     )
 

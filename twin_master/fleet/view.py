@@ -7,45 +7,30 @@ bands of all, and the fifty that are worst.
 import asyncio
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tornado.web import Application, RequestHandler
 
-from reporting import figures as style
 from reporting.errors import ReportingError
 from reporting.json_file import read_json
-from reporting.page import Column, Page, Table, script_source
+from reporting.page import Page, script_source
 from reporting.words import counted
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
 from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.outcome import FAILED, has_flown
-from twin_master.fleet.reading import last_turns
-from twin_master.fleet.report import (
-    BANDS,
-    LOST,
-    add_failures,
-    add_lessons,
-    course_figure,
-    grey,
-    map_figure,
-    scale_of,
-)
+from twin_master.fleet.report import LOST, Standing, add_failures, add_flown_group, add_group, add_lessons
+from twin_master.fleet.standing import STATE_NAME, FleetRecord
 from twin_master.fleet.store import DONE_NAME, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
-from twin_master.fleet.watching import STATE_NAME, FleetRecord
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
 from twin_master.viewer.server import HEADERS, OWN_NAMES, serve_application
 
 __all__ = ["fleet_view", "is_fleet", "serve_fleet"]
-
-Float = NDArray[np.float64]
 
 WORST = 50
 """Assets in the table."""
@@ -62,19 +47,6 @@ def _config(folder: Path) -> dict[str, Any]:
 def is_fleet(folder: Path) -> bool:
     """Return whether a folder is that of a fleet, flown or watched."""
     return _config(folder).get("kind") in (FLOWN_KIND, WATCHED_KIND)
-
-
-@dataclass(frozen=True)
-class _Standing:
-    """How B assets of a group stand: turns and alarms (B,), moments of the state (B, F), SI, controls."""
-
-    scenario: Scenario
-    names: list[str]
-    turn: NDArray[np.int64]
-    mean: Float
-    deviation: Float
-    control: list[str]
-    alarms: NDArray[np.int64]
 
 
 def fleet_view(folder: Path) -> str:
@@ -119,11 +91,11 @@ def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
     for group in fleet["groups"]:
         scenario = Scenario.model_validate(group["scenarios"][0])
         own = {
-            name.partition("/")[2]: (told.last, told.alarms)
+            name.partition("/")[2]: (told.last, told.alarms, told.leaving)
             for name, told in known.items()
             if name.startswith(f"{group['name']}/") and told.last is not None
         }
-        last = [told for told, _ in own.values()]
+        last = [told for told, _, _ in own.values()]
         if any(set(scenario.state_names) - told.health.keys() for told in last):
             raise FleetError(
                 f"{folder / STATE_NAME}: the health of an asset of {group['name']} is that of "
@@ -133,12 +105,13 @@ def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
             np.array([[getattr(told.health[n], m) for n in scenario.state_names] for told in last])
             for m in ("mean", "standard_deviation")
         )
-        standing = _Standing(
+        standing = Standing(
             scenario, list(own), np.array([told.turn for told in last], dtype=np.int64), mean, deviation,
             [told.next_control for told in last],
-            np.array([alarms for _, alarms in own.values()], dtype=np.int64),
+            np.array([alarms for _, alarms, _ in own.values()], dtype=np.int64),
+            np.array([chance for _, _, chance in own.values()], dtype=np.float64),
         )  # fmt: skip
-        _add_group(page, group["name"], standing, 0)
+        add_group(page, group["name"], standing, WORST)
 
 
 def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
@@ -153,56 +126,7 @@ def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
         notice = LOST.format(len(failures), len(status))
         add_failures(page, failures, notice, "They stand in fleet.json once the fleet has flown.")
     for record in fleet["groups"]:
-        group, scenario = groups[record["name"]], Scenario.model_validate(record["scenarios"][0])
-        known = group["status"].values
-        rows, last = has_flown(known), last_turns(group)
-        mean = group["mean"].values[rows]
-        at = np.arange(len(rows)), last[rows]
-        control = group["control_index"].values[rows][at]
-        standing = _Standing(
-            scenario, [record["members"][row][0] for row in rows], last[rows], mean[at],
-            group["standard_deviation"].values[rows][at], [scenario.control_names[u] for u in control],
-            np.zeros(len(rows), dtype=np.int64),
-        )  # fmt: skip
-        _add_group(
-            page, record["name"], standing, int(np.sum(known == FAILED)), group["state"].values[rows], mean
-        )
-
-
-def _add_group(
-    page: Page, name: str, standing: _Standing, failed: int, state: Float | None = None,
-    mean: Float | None = None,
-) -> None:  # fmt: skip
-    """Add a map of a group, bands where all turns are at hand, and its worst assets."""
-    page.add_section(f"Group {name}")
-    count, scenario = len(standing.names), standing.scenario
-    if not count:
-        page.add_paragraph("Nothing is known of its assets yet.")
-        return
-    scale, unit = scale_of(scenario)
-    with style.publication_style():
-        drawn = map_figure(scenario, scale * standing.mean, failed, unit)
-    caption = f"Filtered means, one cell for each asset, the worst first.{grey(failed)}"
-    page.add_figure(style.to_svg(drawn), caption, title="The assets by health")
-    if state is not None and mean is not None:
-        with style.publication_style():
-            drawn = course_figure(scenario, scale * mean, scale * state, unit)
-        page.add_figure(style.to_svg(drawn), BANDS, title="Over time")
-    order = np.lexsort((-standing.mean.sum(axis=1), -standing.alarms))[:WORST]
-    rows, told = [], bool(standing.alarms.any())
-    for row in order.tolist():
-        pairs = zip(scale * standing.mean[row], scale * standing.deviation[row], strict=True)
-        states = [
-            f"{mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{deviation:.1f}" for mean, deviation in pairs
-        ]
-        alarms = [str(standing.alarms[row] or "")] * told
-        rows.append([standing.names[row], str(standing.turn[row]), *states, standing.control[row], *alarms])
-    columns = [Column("asset"), Column(scenario.mission.step_name, numeric=True)]
-    columns += [Column(factor.name, unit, numeric=True) for factor in scenario.state]
-    columns += [Column("control"), *[Column("alarms", numeric=True)] * told]
-    by = "by alarms, then by the sum of their states" if told else "by the sum of their states"
-    caption = f"{len(rows)} of {counted(count, 'asset')}, {by}."
-    page.add_table(Table(columns, rows), caption, title="The worst")
+        add_flown_group(page, folder, record, groups[record["name"]], WORST)
 
 
 def _failures(folder: Path) -> dict[str, str]:

@@ -16,7 +16,8 @@ from twin_master.viewer.command import View, shown
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from twin_master.fleet.watching import FleetWatch, WatchedAsset
+    from twin_master.fleet.standing import WatchedAsset
+    from twin_master.fleet.watching import FleetWatch
 
 ROWS = 20
 """Assets that the table on the console shows, the worst first."""
@@ -97,7 +98,7 @@ class _Console:
     def tell(self, asset: "WatchedAsset", decision: Mapping[str, Any]) -> None:
         """Tell a decision to a program, and to people what is new of it."""
         for notice in decision["notices"]:
-            if notice["sentence"] not in asset.alarms:
+            if notice["sentence"] not in asset.alarms:  # which are told once
                 sentence = notice["sentence"].replace(" DIR", f" {asset.watch.folder}")
                 self.say(f"{asset.name}: {sentence}")
         if not self._people and not terminal.loudness.quiet:

@@ -11,129 +11,44 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from reporting.errors import DiskFullError
 from reporting.files import atomic_write_text
 from reporting.folders import lock_folder
 from reporting.json_file import read_json
 from reporting.progress import SilentProgress
 from reporting.provenance import collect_provenance
-from reporting.section import Section, checked
 from twin_master.assets.resolution import portable_scenario
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
+from twin_master.fleet.standing import STATE_NAME, FleetRecord, WatchedAsset
 from twin_master.fleet.store import written
-from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import Fed, file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed, LiveFeed
-from twin_master.watch.keeping import Keeper
 from twin_master.watch.message import MessageReader
 from twin_master.watch.mqtt import Session, broker_of, is_broker, placed
 from twin_master.watch.opening import begin_resolved, resume_watch
 
-__all__ = ["KIND", "STATE_NAME", "FleetRecord", "FleetWatch", "WatchedAsset"]
+__all__ = ["KIND", "FleetWatch"]
 
 KIND = "uav-twin fleet watch"
-STATE_NAME = "watched.json"
-"""In the folder of a fleet that is watched: its assets as they stood a moment ago, for its view."""
 TURNS_AT_ONCE = 64
 """Turns of one asset before the next one is looked at."""
 SEARCH_SECONDS, STATE_SECONDS = 2.0, 2.0
 """Between two searches for new files, and between two writings of the state."""
+AGAIN_SECONDS = 30.0
+"""After which an asset that was lost is taken up again."""
+HELD = 200
+"""Messages of an asset that is lost, the last ones, that wait for it here."""
 IDLE_SECONDS, BUSY_SHARE = 0.05, 0.2
 """Shortest pause where nothing came, and share of a processor that looking in vain may take."""
 LARGEST_FLEET = 100_000
 """Assets; a broker could name more of them without end."""
 _NAME = re.compile(r"\w[\w.-]{0,63}")
-
-
-class Moments(Section):
-    """What is believed of a factor of the state."""
-
-    mean: float
-    standard_deviation: float
-    unit: str
-
-
-class TurnRecord(Section):
-    """What a decision said."""
-
-    turn: int
-    control: str
-    next_control: str
-    probability: float | None
-    health: dict[str, Moments]
-
-
-class AssetRecord(Section):
-    """How an asset stands: its last decision, None before the first, and what was told and refused."""
-
-    last: TurnRecord | None
-    alarms: int
-    refused: int
-
-
-class FleetRecord(Section):
-    """How a fleet stands."""
-
-    assets: dict[str, AssetRecord]
-    failures: dict[str, str]
-
-    @classmethod
-    def read(cls, folder: Path) -> "FleetRecord":
-        """Return the record in a folder, an empty one where there is none; raises `FleetError`."""
-        path = folder / STATE_NAME
-        if not path.is_file():
-            return cls(assets={}, failures={})
-        return checked(cls, read_json(path, FleetError), str(path), FleetError, what="a watched fleet")
-
-
-class WatchedAsset:
-    """An asset under watch.
-
-    Attributes
-    ----------
-    name : str
-        Of its group and its own: GROUP/NAME, which is its folder, too.
-    watch : Watch
-    keep : Keeper
-        Holds twin and intake.
-    tell : callable
-        Told each decision.
-    decision : dict or None
-        The last one.
-    alarms : set of str
-        What the operator was told since it was taken up, each sentence once.
-    alarms_before : int
-        How many sentences there were before.
-    """
-
-    def __init__(
-        self, name: str, watch: Watch, keep: Keeper, tell: Callable[[Mapping[str, Any]], None],
-        before: AssetRecord | None = None,
-    ) -> None:  # fmt: skip
-        self.name, self.watch, self.keep, self.tell = name, watch, keep, tell
-        model = watch.models[-1].knowledge.model
-        self.decision = last_decision(watch.folder / JOURNAL_NAME, watch.scenario, model)
-        first = before.last.turn + 1 if before is not None and before.last is not None else 0
-        self.alarms_before = before.alarms if before is not None and first else 0
-        self.alarms = {notice.sentence for _, notice in watch.told(first)} if self.decision else set()
-
-    @property
-    def alarm_count(self) -> int:
-        """How many sentences the operator was told."""
-        return self.alarms_before + len(self.alarms)
-
-    def record(self) -> AssetRecord:
-        """Return how it stands, for the view."""
-        last = None
-        if self.decision is not None:
-            last = TurnRecord.model_validate({key: self.decision.get(key) for key in TurnRecord.model_fields})
-        return AssetRecord(last=last, alarms=self.alarm_count, refused=self.keep.intake.counts.rejected)
 
 
 class FleetWatch:
@@ -167,7 +82,7 @@ class FleetWatch:
     ----------
     assets : dict of str to WatchedAsset
     failures : dict of str to str
-        What ended the watch of an asset; the others go on.
+        What ended the watch of an asset, until it is taken up again; the others go on.
     asked : bool
         Set it to end between two turns.
     """
@@ -185,6 +100,7 @@ class FleetWatch:
     ) -> None:
         self.folder, self.assets, self.asked = folder, dict[str, WatchedAsset](), False
         self.failures: dict[str, str] = {}
+        self._again: dict[str, float] = {}
         self.note, self.closing = note, ExitStack()
         self._tell, self._turns = tell, turns
         self._like: dict[str, Watch] = {}
@@ -214,8 +130,8 @@ class FleetWatch:
 
         Raises
         ------
-        FileNotWrittenError
-            The disk is full or the folder cannot be written; what was observed is kept.
+        DiskFullError
+            The disk is full; what was observed is kept.
         MissionInputError
             A broker does not answer, or refuses the twin.
         """
@@ -247,9 +163,7 @@ class FleetWatch:
             try:
                 if not _NAME.fullmatch(name):
                     raise FleetError(f"letters, digits, dots and hyphens name an asset, and {name!r} came.")
-                if key in self.assets:
-                    raise FleetError("another file has the same name.")
-                if len(self.assets) == LARGEST_FLEET:
+                if len(self.assets) == LARGEST_FLEET and key not in self.assets:
                     raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
                 source, like = feed(group.scenarios[0]), self._like.get(group.name)
                 if (folder / CONFIG_NAME).is_file():
@@ -262,12 +176,15 @@ class FleetWatch:
                     )
                 closing.callback(os.close, lock)
                 _, keep = closing.enter_context(watch.begun(source))
-                told = self._told_before.get(key)
-                asset = WatchedAsset(key, watch, keep, publish or (lambda _decision: None), told)
-            except IN_FLIGHT as error:
-                self._lost(key, error)
+                tell, told = publish or (lambda _decision: None), self._told_before.get(key)
+                asset = WatchedAsset(key, watch, keep, tell, told)
+                asset.close = closing.pop_all().close
+            except Exception as error:  # noqa: BLE001 - whatever one asset comes to, the others go on
+                self.lost(key, error)
                 return None
-            self.closing.push(closing.pop_all())
+        self.closing.callback(asset.close)
+        if self.failures.pop(key, None) is not None:
+            self.note(f"{key} is watched again.")
         self._like.setdefault(group.name, watch)
         self.assets[key] = asset
         last = asset.decision
@@ -280,7 +197,7 @@ class FleetWatch:
         asset.decision = decision
         self._tell(asset, decision)
         asset.tell(decision)
-        asset.alarms |= {notice["sentence"] for notice in decision["notices"]}
+        asset.alarms |= {notice["sentence"] for notice in decision["notices"] if notice["kind"] == "alarm"}
 
     def advance(self, asset: WatchedAsset, most: int | None = None) -> int:
         """Take in what has come of an asset, in so many turns at most; return the number of turns."""
@@ -293,19 +210,33 @@ class FleetWatch:
                 count += 1
                 if count == most or self.done(asset) or self.asked:
                     break
-        except IN_FLIGHT as error:
-            self._lost(asset.name, error)
+        except DiskFullError:
+            raise
+        except Exception as error:  # noqa: BLE001 - likewise
+            self.lost(asset.name, error)
         return count
 
     def done(self, asset: WatchedAsset) -> bool:
         """Return whether an asset is left alone: it is lost, or has the turns that were wanted."""
-        enough = self._turns is not None and asset.keep.twin.turns >= self._turns
-        return enough or asset.name in self.failures
+        return self.enough(asset) or asset.name in self.failures
 
-    def _lost(self, name: str, error: Exception) -> None:
-        if name not in self.failures and len(self.failures) < LARGEST_FLEET:
-            self.failures[name] = str(error)
-            self.note(f"{name} is not watched: {error}")
+    def enough(self, asset: WatchedAsset) -> bool:
+        """Return whether an asset has the turns that were wanted."""
+        return self._turns is not None and asset.keep.twin.turns >= self._turns
+
+    def due(self, name: str) -> bool:
+        """Return whether an asset that was lost is to be taken up again."""
+        return name in self.failures and time.monotonic() >= self._again[name]
+
+    def lost(self, name: str, error: Exception) -> None:
+        """Say once why an asset is not watched, and give its folder free."""
+        sentence = str(error) if isinstance(error, IN_FLIGHT) else f"{type(error).__name__}: {error}"
+        if self.failures.get(name) != sentence and len(self.failures) < LARGEST_FLEET:
+            self.failures[name] = sentence
+            self.note(f"{name} is not watched: {sentence}")
+        self._again[name] = time.monotonic() + AGAIN_SECONDS
+        if name in self.assets:
+            self.assets[name].close()
 
     def _write_state(self) -> None:
         assets = {name: asset.record() for name, asset in sorted(self.assets.items())}
@@ -356,6 +287,7 @@ class _Files:
                 f"no recording fits {group.observations}; what is still to come is waited for with --follow."
             )
         self._assets: dict[Path, WatchedAsset | None] = {}
+        self._owner: dict[str, Path] = {}
         self._searched = -SEARCH_SECONDS
 
     @property
@@ -369,9 +301,17 @@ class _Files:
         if time.monotonic() - self._searched >= SEARCH_SECONDS:
             self._searched = time.monotonic()
             for path in recordings(self._group.observations):
-                if path not in self._assets and not self._fleet.asked and self._begun(path):
+                name = asset_name(path)
+                key = f"{self._group.name}/{name}"
+                if self._owner.setdefault(name, path) != path:
+                    self._fleet.lost(f"{key} of {path.name}", FleetError("another file has the same name."))
+                elif (
+                    (path not in self._assets or self._fleet.due(key))
+                    and not self._fleet.asked
+                    and self._begun(path)
+                ):
                     feed = partial(self._feed, path)
-                    self._assets[path] = self._fleet.take_up(self._group, asset_name(path), feed)
+                    self._assets[path] = self._fleet.take_up(self._group, name, feed)
         turns = 0
         for asset in self._assets.values():
             if self._fleet.asked:
@@ -399,7 +339,7 @@ class _Inbox(LiveFeed):
 
     def __init__(self, scenario: Scenario) -> None:
         self._reader = MessageReader(scenario)
-        self.came: deque[bytes] = deque()
+        self.came: deque[bytes] = deque(maxlen=HELD)
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         while True:
@@ -419,28 +359,38 @@ class _Topics:
         self._messages = self._session.messages(0.0)
         self._assets: dict[str, WatchedAsset] = {}
         self._inboxes: dict[str, _Inbox | None] = {}
+        self._searched = time.monotonic()
 
     def look(self) -> int:
         """Take in what the broker has sent; return the number of turns."""
         turns = 0
+        again = time.monotonic() - self._searched >= SEARCH_SECONDS
+        self._searched = time.monotonic() if again else self._searched
+        for topic in [*self._inboxes] if again else ():
+            if self._fleet.due(f"{self._group.name}/{topic.rpartition('/')[2]}"):
+                self._inboxes[topic] = self._begun(topic, self._inboxes[topic])
+                turns += self._advanced(topic)
         while not self._fleet.asked and (message := next(self._messages)) is not None:
             topic = message.topic
             if topic not in self._inboxes and len(self._inboxes) < LARGEST_FLEET:
-                self._inboxes[topic] = self._begun(topic)  # one that is refused is refused once
+                self._inboxes[topic] = self._begun(topic, None)
             inbox = self._inboxes.get(topic)
-            if inbox is not None and not self._fleet.done(self._assets[topic]):
+            if inbox is not None and not self._fleet.enough(self._assets[topic]):
                 inbox.came.append(message.payload)
-                turns += self._fleet.advance(self._assets[topic])
+                turns += self._advanced(topic)
         return turns
 
-    def _begun(self, topic: str) -> _Inbox | None:
-        inbox, name = _Inbox(self._group.scenarios[0]), topic.rpartition("/")[2]
+    def _advanced(self, topic: str) -> int:
+        return self._fleet.advance(self._assets[topic]) if topic in self._assets else 0
+
+    def _begun(self, topic: str, before: _Inbox | None) -> _Inbox | None:
+        inbox, name = before or _Inbox(self._group.scenarios[0]), topic.rpartition("/")[2]
 
         def publish(decision: Mapping[str, Any]) -> None:
             self._session.publish(topic, decision)
 
         asset = self._fleet.take_up(self._group, name, lambda _scenario: inbox, publish)
         if asset is None:
-            return None
+            return before
         self._assets[topic] = asset
         return inbox

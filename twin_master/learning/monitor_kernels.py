@@ -216,9 +216,14 @@ def weigh_none(
                 left = (degrees + statistics[g, 4]) * (1.0 + c * c / (1.0 + statistics[g, 2]))
                 log_with = power * math.log(known[e, s, g] / (1.0 + x * x / left))
                 log_with += 0.5 * math.log((degrees + squares_of_model[g]) / left)
+                share = min(statistics[g, 0], 1.0)  # rounding takes it above one
+                if share == 0.0:  # what is ruled out for good is not the larger, whatever it would explain
+                    log_with = -np.inf
+                elif share == 1.0:
+                    log_without = -np.inf
                 largest = max(log_with, log_without)
-                own = statistics[g, 0] * _exp(log_with - largest)
-                both = own + (1.0 - statistics[g, 0]) * _exp(log_without - largest)
+                own = share * _exp(log_with - largest)
+                both = own + (1.0 - share) * _exp(log_without - largest)
                 free[e, s, g] = own / both
                 total += largest + math.log(both)
             log_value[e, s] = total

@@ -47,11 +47,12 @@ def scenario_estimator(
         sensor_model,
         draws,
         MonitorSettings(**dict(scenario.notice)),
-        _words(scenario),
+        words_of(scenario),
     )
 
 
-def _words(scenario: Scenario) -> Words:
+def words_of(scenario: Scenario) -> Words:
+    """Return how sentences speak of the turns and sensors of a scenario."""
     observation = scenario.observation
     more: dict[str, Any] = {"names": observation.titles} | ({} if scenario.searchable else {"command": ""})
     if observation.role == "strain" and set(observation.sensor_units) == {"1"}:

@@ -5,7 +5,7 @@ A mission is the loop with a simulated asset as its source, and at its end the h
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuEndedError
 from reporting.progress import Progress, SilentProgress
-from twin_master.errors import ImpossibleObservation, MissionError, NotResumableError
+from twin_master.errors import (
+    ImpossibleObservation,
+    InvalidObservationError,
+    MissionError,
+    NotResumableError,
+    TwinMasterError,
+)
 from twin_master.mission.checkpoint import Checkpoint, FlownTurn
 from twin_master.mission.plant import Plant, PlantRecord
 from twin_master.network.estimator import Carried, Notice, Suspicion
@@ -47,11 +53,14 @@ class Reading:
         Index of the control in force; None for the one that the twin proposed.
     revises : int or None
         The turn that it belongs to, if it came late; None for the next one.
+    unreadable : dict of int to str
+        What came in the place of a reading, of each sensor that has none, from 0.
     """
 
     observed: Float
     control: int | None = None
     revises: int | None = None
+    unreadable: Mapping[int, str] = field(default_factory=dict)
 
 
 class Source(Protocol):
@@ -60,8 +69,8 @@ class Source(Protocol):
     def read(self, twin: Twin) -> Reading | None:
         """Return the next observation of what the twin watches; None where there are no more."""
 
-    def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
-        """Return what is assimilated in the place of an observation that no state allows, or raise."""
+    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
+        """Return what is assimilated in the place of one that no state allows, or that has no weight."""
 
 
 def operate(
@@ -86,7 +95,7 @@ def operate(
         received = time.perf_counter()
         try:
             turn = _assimilated(twin, reading)
-        except ImpossibleObservation as error:
+        except (ImpossibleObservation, InvalidObservationError) as error:
             reading = source.impossible(reading, error)
             turn = _assimilated(twin, reading)
         decided = time.perf_counter()
@@ -286,7 +295,7 @@ class _Flown:
             self.ended = error.sentence
             return None
 
-    def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
+    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         raise error
 
 

@@ -21,6 +21,7 @@ from twin_master.mission.loop import Flight, ended_sentence, fly
 from twin_master.mission.plant import Plant, checked_values
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth
+from twin_master.network.estimator import Notice
 from twin_master.network.step_many import decide_many, filter_step_many
 
 __all__ = ["Flights", "fly_one_by_one", "fly_side_by_side"]
@@ -52,6 +53,8 @@ class Flights:
         What ended the flight of each twin; empty for one that flew to its end.
     ended : tuple of str
         How the asset of each twin has ended its simulation before that, with what was flown; mostly empty.
+    notices : tuple of tuple
+        What each twin told its operator, each notice with its turn.
     """
 
     observed: Float
@@ -61,6 +64,7 @@ class Flights:
     log_evidence: Float
     failure: tuple[str, ...]
     ended: tuple[str, ...]
+    notices: tuple[tuple[tuple[int, Notice], ...], ...]
 
     @classmethod
     def empty(cls, knowledge: Knowledge, count: int) -> "Flights":
@@ -75,6 +79,7 @@ class Flights:
             log_evidence=np.full((count, steps), np.nan),
             failure=("",) * count,
             ended=("",) * count,
+            notices=((),) * count,
         )
 
     @classmethod
@@ -85,7 +90,7 @@ class Flights:
             getattr(found, name)[0, : len(flight.observed)] = getattr(flight, name)
         found.state[0, : len(flight.observed)] = flight.happened.state
         ended = "".join(notice.sentence for _, notice in flight.notices if notice.kind == "ended")
-        return replace(found, ended=(ended,))
+        return replace(found, ended=(ended,), notices=(flight.notices,))
 
     @classmethod
     def joined(cls, parts: "Sequence[Flights]") -> "Flights":
@@ -96,7 +101,8 @@ class Flights:
             tuple(text for part in parts for text in texts(part))
             for texts in (attrgetter("failure"), attrgetter("ended"))
         )
-        return cls(**arrays, failure=failure, ended=ended)
+        notices = tuple(told for part in parts for told in part.notices)
+        return cls(**arrays, failure=failure, ended=ended, notices=notices)
 
 
 class _Plants(Protocol):

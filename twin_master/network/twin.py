@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twin_master.errors import InvalidModelError
+from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.estimator import (
     Carried,
     Estimate,
@@ -28,6 +28,9 @@ from twin_master.network.packed_arrays import packed_arrays, unpacked_arrays
 from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
+
+_LARGEST = np.float64(1e150)
+"""What is carried is below this, so that what follows from it are numbers, too."""
 
 Planner = Callable[[GraphicalModel], ArrayLike]
 """Returns the policy p(U | D), (S, U), for states, controls and transitions."""
@@ -238,12 +241,13 @@ class Twin:
         ImpossibleObservation
             If the observation is impossible in every state that the belief allows; the twin is unchanged.
         InvalidObservationError, InvalidModelError
-            If the observation has another shape or is infinite; if there is no such control.
+            If the observation has another shape, is infinite or cannot be weighed, the twin is unchanged; if
+            there is no such control.
         """
         given = np.array(observation, dtype=np.float64)
         index = self._proposed if control is None else self._index_of(control)
         before = self._seen[-1].estimate if self._seen else None
-        estimate = self.estimator.turn(before, given, index, self._turns)
+        estimate = self._estimate(before, given, index, self._turns)
         self._seen.append(_Seen(given, estimate.carried))
         self._turns += 1
         return self._decided(estimate)
@@ -288,7 +292,7 @@ class Twin:
         anew: list[_Seen] = []
         notices: list[Notice] = []
         for number, (given, in_force) in enumerate(rows, start=turn):
-            estimate = self.estimator.turn(before, given, in_force, number)
+            estimate = self._estimate(before, given, in_force, number)
             before = estimate.carried
             anew.append(_Seen(given, before))
             notices += estimate.notices
@@ -371,6 +375,22 @@ class Twin:
     def _recent(self) -> list[_Seen]:
         seen = list(self._seen)
         return seen if self.lag is None else seen[-(self.lag + 1) :]
+
+    def _estimate(self, before: Carried | None, given: Float, control: int, turn: int) -> Estimate:
+        """Return what the estimator concludes, of which nothing is NaN or too large to be squared."""
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                estimate = self.estimator.turn(before, given, control, turn)
+            found = (estimate.log_evidence, estimate.filtered, *estimate.carried.arrays.values())
+            held = all(np.all(np.asarray(values) < _LARGEST) for values in found)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            held = False
+        if not held:
+            raise InvalidObservationError(
+                f"twin {self.name!r}, step {turn}: the observation cannot be weighed, for beside what was "
+                "observed before its numbers leave no belief; check the sensors and the control in force"
+            )
+        return estimate
 
     def _index_of(self, control: int | str) -> int:
         controls = self.model.controls

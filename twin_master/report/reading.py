@@ -53,13 +53,7 @@ def read_run(folder: Path) -> RunRecord:
 
 
 def open_run(folder: Path | str) -> xr.DataTree:
-    """Return everything that a run left, `run.nc`, as labelled arrays in memory.
-
-    Returns
-    -------
-    xarray.DataTree
-        The groups `observed`, `filtered`, `smoothed`, `predicted`, `policy`, `calibration` and `truth`; each
-        variable has its unit in `.attrs["units"]`. See `docs/run_folder.md`.
+    """Return everything that a run has stored, `run.nc`; `watch.snapshot.open_run` also reads what goes on.
 
     Raises
     ------

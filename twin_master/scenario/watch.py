@@ -20,6 +20,8 @@ class WatchSection(Section):
     """Turns that a message may be ahead of the next one; those between are predicted through."""
     seconds_per_turn: Positive | None = None
     """Of messages that have a time in the place of a turn."""
+    allow_unknown: bool = False
+    """Keys and columns that are no sensor are passed over, and not refused."""
 
     @property
     def recording(self) -> Path | None:

@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import math
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -96,19 +95,17 @@ class CsvFeed(_FileFeed):
                 f"standard input, `--observations - < {path}`."
             )
         called = ["turn" if name in _TURN_COLUMNS else name for name in names]
-        sensors = [place for place, name in enumerate(called) if name not in _OTHERS and name[:1] != "_"]
+        sensors = [name for name in called if name not in _OTHERS and name[:1] != "_"]
         try:
-            columns = [self._reader.column(called[place]) for place in sensors]
+            columns = [column for column in map(self._reader.column, sensors) if column is not None]
         except Refused as refusal:
             raise MissionInputError(
                 f"{path}: the column {refusal}; others are `turn`, `time` and `control`."
             ) from None
-        index = [sensor for sensor, _ in columns]
-        if len({*index}) < len(columns) or any(called.count(name) > 1 for name in _OTHERS):
+        once = {sensor for sensor, _ in columns}
+        if len(once) < len(columns) or any(called.count(name) > 1 for name in _OTHERS):
             raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
-        self._names, self._sensors = called, sensors
-        self._index = np.array(index, dtype=np.int64)
-        self._factor = np.array([factor for _, factor in columns], dtype=np.float64)
+        self._names = called
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the rows behind a place."""
@@ -151,26 +148,14 @@ class CsvFeed(_FileFeed):
             return Refused(f"a cell is no number: {str(error)[:80]}")
 
     def _row(self, cells: list[str]) -> Message:
-        values = [
-            math.nan if (cell := cells[place]).lower() in _LOST else float(cell) for place in self._sensors
-        ]
         record: dict[str, object] = {
-            name: cells[place]
-            if name == "control"
-            else _whole(cells[place])
-            if name == "turn"
-            else float(cells[place])
-            for place, name in enumerate(self._names)
-            if name in _OTHERS and cells[place].lower() not in _LOST
+            name: cell for name, cell in zip(self._names, cells, strict=True) if cell
         }
-        message = self._reader.read(record)
-        observed = np.array(values) * self._factor
-        wrong = np.abs(observed) > self._reader.largest[self._index]
-        if wrong.any():  # say which, and why
-            first = int(np.argmax(wrong))
-            return self._reader.read({self._names[self._sensors[first]]: values[first]})
-        message.observed[self._index] = observed
-        return message
+        for name, reader in (("control", str), ("turn", _whole), ("time", float)):
+            if name in record:
+                cell = str(record[name])
+                record[name] = None if cell.lower() in _LOST else reader(cell)
+        return self._reader.read(record)
 
 
 class RunFeed:
@@ -186,7 +171,8 @@ class RunFeed:
     place: Place | None = None
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
-        role = scenario.observation.role
+        self._role = role = scenario.observation.role
+        self._reader, self._controls = MessageReader(scenario), scenario.control_names
         try:
             group: xr.Dataset = read_groups(path)["observed"].to_dataset()
             self._values = np.asarray(group[role].values, dtype=np.float64)
@@ -220,8 +206,10 @@ class RunFeed:
         """Return the steps behind a place."""
         for row in range(place["read"] if place else 0, len(self._values)):
             self.place = self._place(row + 1)
-            control = None if self._control is None else int(self._control[row])
-            yield Message(self._values[row].copy(), int(self._turn[row]), None, control), f"row {row}"
+            record: dict[str, object] = {self._role: self._values[row].tolist(), "turn": int(self._turn[row])}
+            if self._control is not None:
+                record["control"] = self._controls[self._control[row]]
+            yield parsed(self._reader, record), f"row {row}"
 
 
 class FolderFeed(_FileFeed):
@@ -298,12 +286,12 @@ def _plain(value: Any) -> Any:
     return np.asarray(value).tolist()
 
 
-def parsed(reader: MessageReader, content: bytes | Refused) -> Message | Refused:
-    """Return the observation in a JSON object, or why there is none."""
+def parsed(reader: MessageReader, content: bytes | dict[str, object] | Refused) -> Message | Refused:
+    """Return the observation in a JSON object, or a record, or why there is none."""
     if isinstance(content, Refused):
         return content
     try:
-        return reader.parse(content)
+        return reader.read(content) if isinstance(content, dict) else reader.parse(content)
     except Refused as refusal:
         return refusal
 

@@ -74,6 +74,11 @@ class Watch:
         Shows stages and notes.
     like : Watch, optional
         A watch of the same scenario, whose model and plan this one shares.
+
+    Attributes
+    ----------
+    counts : Counts
+        Of the messages, once it has run.
     """
 
     def __init__(
@@ -93,6 +98,7 @@ class Watch:
         self._patches: list[Path | None] = [Path(own) if own else None]  # of these models
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
+        self.counts = Counts()
         self._take_up()
         if like is not None and len(self.models) == len(like.models) == 1:
             share_knowledge(like.folder, folder)
@@ -147,6 +153,7 @@ class Watch:
                 try:
                     self._operate(source, keep, decide)
                 finally:
+                    self.counts = keep.intake.counts
                     if keep.tutor is not None:
                         keep.tutor.end()
         return keep.intake.counts

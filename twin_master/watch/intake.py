@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.files import atomic_write_text, write_error
-from twin_master.errors import ImpossibleObservation
+from twin_master.errors import TwinMasterError
+from twin_master.learning.setup import words_of
 from twin_master.mission.loop import Reading
+from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
@@ -140,12 +142,14 @@ class Intake:
         What came so far, up to the last reading.
     observation_turn : int
         The turn of the last reading.
+    notices : list of Notice
+        Of sensors of which no number came with the last reading, and before it did, or the other way round.
     ended : bool
         Whether the feed has ended; if not, more may come after `read` has returned None.
     """
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: RejectedFile) -> None:
-        self._section = scenario.watch
+        self._section, self._words = scenario.watch, words_of(scenario)
         self._width = scenario.observation.width
         self._feed = feed
         self._rejected = rejected
@@ -157,6 +161,8 @@ class Intake:
         self._origin: float | None = None
         self._first: int | None = None  # the only turn that was told a time so far, if there is but one
         self._text = ""
+        self._unreadable: set[int] = set()
+        self.notices: list[Notice] = []
         self._before: Float = np.empty(0)
         self.counts = Counts()
         self.observation_turn = -1
@@ -172,7 +178,9 @@ class Intake:
             "given": "".join(map(str, self._given)),
             "origin": self._origin,
             "source": self._before_last if waiting else self._place,
-        } | ({} if self._first is None else {"first_timed": self._first})
+            **({} if self._first is None else {"first_timed": self._first}),
+            **({"unreadable": sorted(self._unreadable)} if self._unreadable else {}),
+        }
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
         """Go on from a state; None is the begin.
@@ -184,6 +192,7 @@ class Intake:
             self.counts = Counts(**state["counts"])
             self._origin, self._first = state["origin"], state.get("first_timed")
             self._given.extend(map(int, state["given"]))
+            self._unreadable = set(state.get("unreadable", ()))
             again &= state["source"] is not None and self._feed.holds(state["source"])
             self._place = state["source"] if again else None
         self._rejected.go_back(self.counts.received if again else LARGEST_SEED)
@@ -208,6 +217,7 @@ class Intake:
                 self._refuse(str(refusal))
         turn, reading, given = self._pending.popleft()
         self.observation_turn = turn
+        self.notices = [*self._noticed(reading)]
         if reading.revises is None:
             self._given.append(given)
             self.counts.missing += given == MISSING
@@ -218,7 +228,25 @@ class Intake:
             self._given[place] = max(given, self._given[place])
         return reading
 
-    def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
+    def _noticed(self, reading: Reading) -> Iterator[Notice]:
+        """Say of each sensor once that it is unreadable, and once that it is back."""
+        came, words = reading.unreadable, self._words
+        when = f"{words.step.capitalize()} {self.observation_turn}"
+        for g in sorted(came.keys() - self._unreadable):
+            sentence = (
+                f"{when}: {words.sensors([g])} shows {came[g]}, which is no reading; it is left out until "
+                "readings of it come back."
+            )
+            yield Notice("gauge_left_out", sentence, (g + 1,))
+        if reading.revises is not None:
+            return  # it says nothing of how the sensors are now
+        back = {g for g in self._unreadable - came.keys() if not np.isnan(reading.observed[g])}
+        for g in sorted(back):
+            sentence = f"{when}: the readings of {words.sensors([g])} are back, and used again."
+            yield Notice("gauge_back", sentence, (g + 1,))
+        self._unreadable = (self._unreadable | came.keys()) - back
+
+    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Refuse an observation that no state allows; its turn is predicted through, or stays as it was."""
         self._refuse(str(error))
         if reading.revises is not None:
@@ -280,7 +308,8 @@ class Intake:
             return
         lost = np.full(self._width, np.nan)
         self._pending += [(twin.turns + gap, Reading(lost), MISSING) for gap in range(ahead)]
-        self._pending.append((turn, Reading(message.observed, message.control), given))
+        reading = Reading(message.observed, message.control, unreadable=message.unreadable)
+        self._pending.append((turn, reading, given))
 
     def _sort_late(self, twin: Twin, turn: int, message: Message, given: int) -> None:
         if turn < twin.first_kept:
@@ -300,4 +329,4 @@ class Intake:
             return
         self._before = before
         merged = np.where(np.isnan(before), message.observed, before)
-        self._pending.append((turn, Reading(merged, control, revises=turn), given))
+        self._pending.append((turn, Reading(merged, control, turn, message.unreadable), given))

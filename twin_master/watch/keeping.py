@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from twin_master.mission.journal import (
     JournalFile,
     belief_record,
@@ -104,16 +107,19 @@ class Keeper:
         What teaches the twin.
     told : list
         Notices that the last line has beside those of its turn.
+    filtered : (S,) or None
+        What was believed after the last turn; None before the first one of this process.
     """
 
     def __init__(self, journal: JournalFile, intake: Intake, twin: Twin, standing: Standing) -> None:
         self._journal, self.intake, self.twin, self._standing = journal, intake, twin, standing
         self.tutor: Tutor | None = None
         self.told: list[dict[str, Any]] = []
+        self.filtered: NDArray[np.float64] | None = None
 
     def __call__(self, reading: Reading, turn: TwinTurn) -> None:
         """Write down a reading and what became of it."""
-        at = self.intake.observation_turn
+        at, self.filtered = self.intake.observation_turn, turn.filtered
         record: dict[str, Any] = {
             "turn": turn.turn,
             "observation_turn": at,
@@ -125,10 +131,12 @@ class Keeper:
         if turn.turn % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1 and reading.revises is None:
             record |= self._standing.snapshot(self.twin, self._journal.size)
         record |= belief_record(turn)
+        known = {(notice.kind, notice.sensors) for notice in turn.notices}
+        self.told = [vars(n) for n in self.intake.notices if (n.kind, n.sensors) not in known]
         if self.tutor is not None:
-            self.told = list(self.tutor.teaching.untold)
-            if self.told:
-                record["notices"] = record.get("notices", []) + self.told
+            self.told += self.tutor.teaching.untold
+        if self.told:
+            record["notices"] = record.get("notices", []) + self.told
         self.write(record)
 
     def write(self, record: Mapping[str, Any]) -> None:

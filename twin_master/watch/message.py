@@ -3,15 +3,19 @@
 A publisher is not trusted. Whatever it sends is an observation or a `Refused` with one sentence.
 """
 
+import json
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reporting.json_file import parse_json
+from reporting.words import listing
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
 
@@ -21,7 +25,8 @@ LARGEST_MESSAGE = 1_000_000
 """Bytes of a message; a larger one is refused unread."""
 LARGEST_STRAIN = 0.5
 """A strain beyond this is one whose unit was forgotten."""
-LARGEST = float(np.finfo(np.float64).max)
+LARGEST = 1e30
+"""The same of any other sensor, SI: far beyond what exists, and its powers are still numbers."""
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
 _WITHOUT_UNIT = {"1": 1.0, "percent": 1e-2, "microstrain": 1e-6}
 _NAMED = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]$")
@@ -38,19 +43,22 @@ class Message:
     Attributes
     ----------
     observed : (G,)
-        SI; NaN where a sensor is absent or null. Where modes are observed, a row with their covariance.
+        SI; NaN where a sensor is absent or unreadable. Where modes are observed, a row with their covariance.
     turn : int or None
         Its turn, if it says so.
     time : float or None
         Its time [s], if it says so.
     control : int or None
         Index of the control in force, if it says so.
+    unreadable : dict of int to str
+        What came in the place of a reading, of each sensor that has none, from 0.
     """
 
     observed: Float
     turn: int | None = None
     time: float | None = None
     control: int | None = None
+    unreadable: Mapping[int, str] = field(default_factory=dict)
 
 
 class MessageReader:
@@ -58,29 +66,24 @@ class MessageReader:
 
     A sensor goes by `ROLE_NUMBER` (`strain_7`) or its title, its unit behind it: `strain_7_microstrain`,
     `strain_7 [microstrain]`; without a unit it is in that of the scenario. All sensors together go by their
-    role, as a list, with `unit` beside it.
-
-    Attributes
-    ----------
-    largest : (G,)
-        Largest value of each sensor that is believed, SI.
+    role, as a list, with `unit` beside it. A sensor of which no number comes, or an absurd one, is lost
+    alone.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._observation = scenario.observation
+        self._observation, self._allows_unknown = scenario.observation, scenario.watch.allow_unknown
         self._controls = scenario.control_names
         role, count = scenario.observation.role, scenario.observation.count
         self._index = {f"{role}_{number + 1}": number for number in range(count)}
         self._index |= {title: number for number, title in enumerate(scenario.observation.titles)}
         self._columns: dict[str, tuple[int, float]] = {}
         units = scenario.observation.sensor_units
-        self.largest: Float = np.array(
-            [LARGEST_STRAIN if role == "strain" and unit == "1" else LARGEST for unit in units]
-        )
-        self._largest = self.largest.tolist()
+        self._largest = [LARGEST_STRAIN if role == "strain" and unit == "1" else LARGEST for unit in units]
 
-    def column(self, name: str) -> tuple[int, float]:
+    def column(self, name: str) -> tuple[int, float] | None:
         """Return the index of the sensor that a name stands for, and what its values are multiplied by.
+
+        None for a name that is no sensor, where the scenario allows them.
 
         Raises
         ------
@@ -96,11 +99,13 @@ class MessageReader:
                 base, unit = named["name"], named["unit"]
             else:
                 base, _, unit = name.rpartition("_")
+        if base not in self._index and self._allows_unknown:
+            return None
         if base not in self._index:
-            known = next(iter(self._index))
             raise Refused(
-                f"`{name[:60]}` is no sensor: a sensor is called such as `{known}`, its unit behind it, and "
-                f"there are {self._observation.count}"
+                f"`{name[:60]}` is no sensor: a sensor is called such as {_near(name[:60], *self._index)}, "
+                f"its unit behind it, and there are {self._observation.count}; what is none is passed over "
+                "with --allow-unknown, or where its name begins with `_`"
             )
         sensor = self._index[base]
         found = sensor, self._factor(sensor, unit)
@@ -134,7 +139,7 @@ class MessageReader:
         if len(content) > LARGEST_MESSAGE:
             raise Refused(f"a message has at most {LARGEST_MESSAGE} bytes, and {len(content)} came")
         try:
-            record = parse_json(content, "the message", Refused)
+            record = parse_json(content, "the message", Refused, any_number=True)
         except RecursionError:
             raise Refused("it is nested too deeply") from None
         if not isinstance(record, dict):
@@ -151,6 +156,7 @@ class MessageReader:
         """
         observed = np.full(self._observation.width, np.nan)
         given: set[int] = set()
+        unreadable: dict[int, str] = {}
         unit = record.get("unit", "")
         if not isinstance(unit, str):
             raise Refused("`unit` is the name of a unit")
@@ -163,22 +169,25 @@ class MessageReader:
             if name == self._observation.role and isinstance(value, list):
                 pairs: Iterable[tuple[int, float, object]] = self._all(value, unit)
             else:
-                sensor, factor = self.column(name)
-                pairs = [(sensor, factor, value)]
+                found = self.column(name)
+                pairs = [] if found is None else [(*found, value)]
             for sensor, factor, single in pairs:
                 if sensor in given:
                     raise Refused(f"sensor {sensor + 1} is given twice")
                 given.add(sensor)
-                observed[sensor] = self._value(name, sensor, factor, single)
+                shown = self._value(sensor, factor, single)
+                if isinstance(shown, str):
+                    unreadable[sensor] = shown
+                else:
+                    observed[sensor] = shown
         turn, time = record.get("turn"), record.get("time")
         if turn is not None and (type(turn) is not int or not 0 <= turn <= LARGEST_SEED):
             raise Refused("`turn` is a whole number from 0")
-        if time is not None and (type(time) not in (int, float) or not math.isfinite(_number(time))):
+        time = float(time) if type(time) is int else time
+        if time is not None and not (isinstance(time, float) and math.isfinite(time)):
             raise Refused("`time` is a number of seconds")
-        return Message(
-            observed, turn if type(turn) is int else None, None if time is None else _number(time),
-            self._control(record.get("control")),
-        )  # fmt: skip
+        control = self._control(record.get("control"))
+        return Message(observed, turn if type(turn) is int else None, time, control, unreadable)
 
     def _all(self, values: list[object], unit: str) -> list[tuple[int, float, object]]:
         if len(values) != self._observation.count:
@@ -190,31 +199,32 @@ class MessageReader:
         count = self._observation.count
         try:
             matrix = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             matrix = np.empty(0)
-        if matrix.shape != (count, count) or not np.isfinite(matrix).all():
+        if matrix.shape != (count, count) or not np.all(np.abs(matrix) <= LARGEST):
             raise Refused(f"`covariance` is {count} rows of {count} numbers, in SI units; null is none")
         size = np.sqrt(np.abs(np.diag(matrix)))
         size[size == 0.0] = 1.0
-        scaled = matrix / np.outer(size, size)
-        if np.abs(scaled - scaled.T).max() > 1e-6 or np.linalg.eigvalsh(scaled)[0] < -1e-6:
+        with np.errstate(over="ignore"):
+            scaled = matrix / size / size[:, None]
+        wrong = np.abs(scaled).max() > 1.0 + 1e-6 or np.abs(scaled - scaled.T).max() > 1e-6
+        if wrong or np.linalg.eigvalsh(scaled)[0] < -1e-6:
             raise Refused("`covariance` is not symmetric with eigenvalues of zero or more")
         return matrix[np.tril_indices(count)]
 
-    def _value(self, name: str, sensor: int, factor: float, value: object) -> float:
-        if value is None:
-            return math.nan
-        if type(value) not in (int, float):
-            raise Refused(f"`{name[:60]}` is a number, or null where the sensor is lost")
-        number = _number(value) * factor
+    def _value(self, sensor: int, factor: float, value: object) -> float | str:
+        """Return what a sensor shows, SI, or what came in the place of that; the one reader of readings."""
+        try:
+            number = math.nan if isinstance(value, bool) else float(value) * factor  # type: ignore[arg-type]
+        except (TypeError, ValueError, OverflowError):
+            number = math.nan
+        if abs(number) <= self._largest[sensor]:
+            return number
         if not math.isfinite(number):
-            raise Refused(f"`{name[:60]}` is not finite; a sensor that is lost is null or absent")
-        if abs(number) > self._largest[sensor]:
-            raise Refused(
-                f"`{name[:60]}` would be a strain of {number:g}: give its unit, such as "
-                f"`strain_{sensor + 1}_microstrain`"
-            )
-        return number
+            return json.dumps(value)[:30]
+        forgotten = factor == 1.0 and self._largest[sensor] == LARGEST_STRAIN
+        unit = f"; give its unit, such as `strain_{sensor + 1}_microstrain`" if forgotten else ""
+        return f"{number:g}{unit}"
 
     def _control(self, control: object) -> int | None:
         if control is None:
@@ -224,8 +234,7 @@ class MessageReader:
         return self._controls.index(control)
 
 
-def _number(value: object) -> float:
-    try:
-        return float(value)  # type: ignore[arg-type]
-    except OverflowError:
-        return math.inf
+@lru_cache(maxsize=1000)
+def _near(name: str, *known: str) -> str:
+    """Return the names next to one, in words: kept, because finding them takes longer than a message."""
+    return listing(f"`{near}`" for near in get_close_matches(name, known, 3) or known[:1])

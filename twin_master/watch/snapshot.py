@@ -5,16 +5,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
+from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
-from reporting.progress import Progress
+from reporting.progress import Progress, SilentProgress
 from twin_master.assets.resolution import located_scenario
 from twin_master.errors import MissionInputError, NotResumableError
-from twin_master.mission.journal import JOURNAL_NAME, read_lines, record_of
+from twin_master.mission.journal import JOURNAL_NAME, read_lines, record_of, records_backwards
+from twin_master.report import reading
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
+from twin_master.store.writing import SUMMARY_NAME
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 @contextmanager
@@ -56,6 +63,41 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
         scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
         Watch(copy, config, located_scenario(scenario, copy), progress).store(Counts(), report=False)
         yield copy
+
+
+def open_run(folder: Path | str) -> "xr.DataTree":
+    """Return everything that a run or a watch left, `run.nc`, as labelled arrays in memory.
+
+    A watch that goes on, or was killed, is read as it would be had it ended after the last turn of its
+    journal, and is not touched.
+
+    Returns
+    -------
+    xarray.DataTree
+        The groups `observed`, `filtered`, `smoothed`, `predicted`, `policy`, `calibration` and `truth`; each
+        variable has its unit in `.attrs["units"]`. See `docs/run_folder.md`.
+
+    Raises
+    ------
+    RunFolderError
+        There is no ``run.nc``, or it is damaged; or nothing was observed yet.
+    NotResumableError
+        The journal of a watch was changed or is damaged.
+    """
+    if stored(Path(folder)) or not (Path(folder) / JOURNAL_NAME).is_file():
+        return reading.open_run(folder)
+    with flown(Path(folder), None, None, SilentProgress()) as ended:
+        return reading.open_run(ended)
+
+
+def stored(folder: Path) -> bool:
+    """Return whether the files of a watch have the last turn of its journal."""
+    try:
+        ended = read_json(folder / SUMMARY_NAME, DamagedFileError)["steps"]
+    except (DamagedFileError, KeyError, TypeError):
+        return False
+    last = next((int(line.get("turn", -1)) for line, *_ in records_backwards(folder / JOURNAL_NAME)), -1)
+    return bool(ended == last + 1)
 
 
 def _end_of(path: Path, last: int | None) -> tuple[int, int]:

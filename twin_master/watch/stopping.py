@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from twin_master.errors import ImpossibleObservation
+from twin_master.errors import TwinMasterError
 from twin_master.mission.loop import Reading
 from twin_master.network.twin import Twin
 from twin_master.watch.intake import Intake
@@ -37,7 +37,7 @@ class Stopping:
         finally:
             self._waiting = False
 
-    def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
+    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Return what is assimilated in the place of an observation that no state allows."""
         return self._intake.impossible(reading, error)
 

@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from functools import partial
 from http.client import HTTPConnection
@@ -30,13 +30,17 @@ from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import ensemble, load_fleet
-from twin_master.fleet.reading import fleet_groups, group_figures
+from twin_master.fleet.reading import attention, fleet_groups, group_figures, leaving
 from twin_master.fleet.report import write_fleet_report
+from twin_master.fleet.standing import WatchedAsset
 from twin_master.fleet.view import fleet_view, serve_fleet
-from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
+from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
+from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begin_watch
 from uav_twin.cli import app
 
@@ -158,6 +162,50 @@ def test_an_asset_is_lost_alone(fleet_file: Path, alone: list[bytes], tmp_path: 
         FleetWatch(load_fleet(fleet_file), tmp_path / "flown", print, print)
 
 
+def test_an_asset_that_was_lost_is_taken_up_again(
+    fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One whose file was wrong, and one that met an error of ours; a log that is gone for a while is awaited."""
+    for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
+        monkeypatch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
+    logs = [tmp_path / "logs" / f"wing-{number}.csv" for number in range(3)]
+    (tmp_path / "logs" / "wing-1.txt").write_text("turn,strain_1\n")  # another of that name
+    contents, (at, decisions) = [log.read_bytes() for log in logs], (0, Watch.decisions)
+    logs[1].write_text("turn,strian_1\n")
+    unwell = iter([True])
+
+    def once_unwell(watch: Watch, *given: Any) -> Iterator[dict[str, Any]]:
+        for number, decision in enumerate(decisions(watch, *given)):
+            yield decision
+            if watch.folder.name == "wing-2" and number == 2 and next(unwell, False):
+                raise ZeroDivisionError("division by zero")
+
+    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+        if asset.name == "north/wing-0" and decision["turn"] == 2 and "told_again" not in decision:
+            logs[0].unlink()
+
+    def mend() -> None:
+        nonlocal at
+        at += 1
+        if at == 3:
+            for log, content in zip(logs, contents, strict=True):
+                log.write_bytes(content)
+        fleet.asked = at == 6
+
+    monkeypatch.setattr(Watch, "decisions", once_unwell)
+    notes: list[str] = []
+    file = fleet_of(tmp_path, "logs/*")
+    fleet = FleetWatch(load_fleet(file), tmp_path / "out", tell, notes.append, follow=True)
+    fleet.run(mend)
+    assert journals(tmp_path / "out") == alone
+    assert fleet.failures == {"north/wing-1 of wing-1.txt": "another file has the same name."}
+    said = [note for note in notes if "is not watched" in note]
+    assert sum(note.startswith("north/wing-2 is not watched: ZeroDivisionError") for note in said) == 1
+    assert sum("strian_1" in note for note in said) == 1
+    again = [note for note in notes if note.endswith("is watched again.")]
+    assert sorted(again) == ["north/wing-1 is watched again.", "north/wing-2 is watched again."]
+
+
 @pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
 def test_a_topic_for_each_asset(
     fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -204,6 +252,50 @@ def test_a_topic_for_each_asset(
                 del record["intake"]
         assert found == wanted
     assert {topic for topic, _ in heard} == {"wings/wing-0/decision", "wings/wing-2/decision"}
+
+
+@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
+def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
+    fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
+    monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
+    decisions, unwell = Watch.decisions, iter([True])
+
+    def once_unwell(watch: Watch, *given: Any) -> Iterator[dict[str, Any]]:
+        for decision in decisions(watch, *given):
+            yield decision
+            if decision["turn"] == 2 and next(unwell, False):
+                raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr(Watch, "decisions", once_unwell)
+    broker = Mosquitto(tmp_path)
+    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+    publisher, notes, told, sent = broker.client("publisher"), list[str](), list[int](), list[int]()
+
+    def send() -> None:
+        if notes and not sent:
+            sent.append(1)
+            for turn in range(TURNS):
+                record = {"turn": turn, "control": "2g", "strain": [1e-3] * 24}
+                publisher.publish("wings/wing-0", json.dumps(record), qos=1)
+        inbox = fleet._sources[0]._inboxes.get("wings/wing-0")  # type: ignore[union-attr]
+        if inbox is not None and len(inbox.came) == TURNS - 3:  # all that came while it was lost
+            fleet._again["north/wing-0"] = 0.0
+
+    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+        told.append(decision["turn"])
+        fleet.asked = decision["turn"] == TURNS - 1
+
+    fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
+    fleet.run(send)
+    broker.stop()
+    assert told == [0, 1, 2, 2, 3, 4, 5]
+    assert notes[1:3] == [
+        "north/wing-0 is not watched: ZeroDivisionError: division by zero",
+        "north/wing-0 is watched again.",
+    ]
+    assert fleet.assets["north/wing-0"].keep.intake.counts.missing == 0
 
 
 @pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
@@ -300,6 +392,46 @@ def test_recordings_teach_what_the_flights_taught(fleet_file: Path, tmp_path: Pa
     assert [m.mean for m in first] == [m.mean for m in second]
 
 
+def ensemble_scenario(folder: Path) -> Scenario:
+    return ensemble(str(folder / "wing.toml"), range(60)).groups[0].scenarios[0]
+
+
+def test_the_store_counts_the_notices_that_watches_gave(fleet_file: Path, tmp_path: Path) -> None:
+    """And a watched asset says how probably it leaves its control, as the store does."""
+    wing, log = tmp_path / "wing.toml", tmp_path / "logs" / "wing-1.csv"
+    wing.write_text(wing.read_text() + "\n[notice]\n")
+    header, *rows = log.read_text().splitlines()
+    rows[2] = ",".join([*rows[2].split(",")[:-1], "OL"])
+    log.write_text("\n".join([header, *rows]) + "\n")
+    with fleet_file.open("a") as file:
+        file.write(f"steps = {TURNS}\n")
+    fleet = watched(fleet_file, tmp_path / "out")
+    fly_fleet(load_fleet(fleet_file), tmp_path / "flown", Engine(0))
+    group = fleet_groups(tmp_path / "flown")["north"]
+    alarmed = 0
+    for row in range(3):
+        told = [n for n in fleet.assets[f"north/wing-{row}"].watch.told(0) if n[1].kind != "gauge_back"]
+        for place, kind in enumerate(("alarm", "gauge_left_out")):
+            turns = [turn for turn, notice in told if notice.kind == kind]
+            if row != 2:  # whose late message tells of turns before it
+                assert group["notices"].values[row, place] == len(turns)
+                assert group["first_notice"].values[row, place] == min(turns, default=-1)
+        alarmed += any(notice.kind == "alarm" for _, notice in told)
+        assert fleet.assets[f"north/wing-{row}"].record().alarms == sum(n.kind == "alarm" for _, n in told)
+    assert group["notices"].values[1, 1] >= 1
+    assert alarmed >= 1
+    assert group_figures(group)["raised an alarm"] == alarmed
+    assert learn_fleet(tmp_path / "flown").groups[0].alarmed == alarmed
+    assert "raised an alarm, first in" in write_fleet_report(tmp_path / "flown").read_text()
+    config = json.loads((tmp_path / "flown" / "config.json").read_text())
+    soon = leaving(tmp_path / "flown", config["fleet"]["groups"][0], group)
+    state = json.loads((tmp_path / "out" / "watched.json").read_text())["assets"]
+    found = [state[f"north/wing-{row}"]["leaving"] for row in range(3)]
+    np.testing.assert_allclose(found, soon, atol=1e-6)
+    again = watched(fleet_file, tmp_path / "out")  # of which nothing is left to read
+    assert [again.assets[f"north/wing-{row}"].record().leaving for row in range(3)] == pytest.approx(found)
+
+
 def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
     (tmp_path / "logs" / "wing-0.csv").write_text("turn,colour\n0,red\n")
     (tmp_path / "logs" / "wing-9.csv").write_text("turn,control\n")
@@ -308,7 +440,11 @@ def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
     fly_fleet(ensemble(str(tmp_path / "wing.toml"), range(60)), tmp_path / "flown", Engine(0))
     flown = fleet_view(tmp_path / "flown")
     group = fleet_groups(tmp_path / "flown")["growing_damage"]
-    worst = np.argsort(-group["mean"].values[:, -1].sum(axis=1), kind="stable")
+    knowledge = kept_knowledge(tmp_path / "flown" / "groups" / "growing_damage", ensemble_scenario(tmp_path))
+    belief, control = group["belief"].values.astype(float), group["control_index"].values[:, -1]
+    soon = [attention(knowledge, own[None], int(u))[0] for own, u in zip(belief, control, strict=True)]
+    worst = np.lexsort((-group["mean"].values[:, -1].sum(axis=1), -np.maximum(soon, 0.0)))
+    assert max(soon) > min(soon) + 0.1
     assert re.findall(r"seed-\d+", flown) == [f"seed-{row}" for row in worst[:50]]
     with pytest.raises(FleetError, match="holds no fleet"):
         fleet_view(tmp_path)

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from twin_master.errors import InvalidModelError
+from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
+from twin_master.learning.learning_filter import LearningFilter, LearntPriors
 from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator, Words
+from twin_master.mission.journal import belief_record, line_of
 from twin_master.mission.preparation import Knowledge, prepare_twin
 from twin_master.network.estimator import Carried, Estimate, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
@@ -171,6 +173,36 @@ def test_probabilities_stay_probabilities_whatever_is_lost_or_shown(
         assert 0.0 <= suspicion.none_of_these + suspicion.gauge_off <= 1.0 + 1e-12
         assert np.all(np.isfinite(suspicion.log_evidence_gauge))
         assert np.isfinite(estimate.filtered).all()
+
+
+def twins() -> dict[str, Twin]:
+    """Return twins of two gauges that do not learn, learn, and give notice beside either."""
+    model, sensors = small(2)
+    priors = LearntPriors("e", DRAWS, noise_degrees=10.0, gain=0.1, offset=1.0)
+    inner = {"exact": ExactFilter(model, sensors), "learning": LearningFilter(model, sensors, priors)}
+    own = inner | {f"watchful {name}": WatchfulEstimator(e, sensors, DRAWS) for name, e in inner.items()}
+    return {name: Twin(name, model, sensors, np.ones((3, 1)), estimator=e) for name, e in own.items()}
+
+
+EXTREME = st.floats(allow_nan=False, allow_infinity=False) | st.sampled_from([5e-324, 1e30, -1e154, 1e308])
+
+
+@settings(max_examples=60, deadline=None)
+@given(rows=st.lists(st.tuples(EXTREME, EXTREME), min_size=1, max_size=6), late=st.integers(0, 6))
+def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(
+    rows: list[tuple[float, float]], late: int
+) -> None:
+    ordinary = drawn(np.random.default_rng(2), 4, 2)
+    for twin in twins().values():
+        for number, row in enumerate([ordinary[0], *rows, *ordinary[1:]]):
+            before = twin.save_state()
+            try:
+                turn = twin.revise(0, row) if number and number == late else twin.turn(row)
+            except (ImpossibleObservation, InvalidObservationError):
+                assert twin.save_state() == before
+                turn = twin.turn(np.full(2, np.nan))
+            assert turn.filtered.sum() == pytest.approx(1.0)
+            line_of(belief_record(turn))  # which holds no NaN and no infinity
 
 
 def test_a_turn_without_readings_changes_no_evidence() -> None:

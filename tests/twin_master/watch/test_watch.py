@@ -9,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,10 +22,11 @@ from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import begun, write_csv
-from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of, read_records, whole_record
 from twin_master.mission.loop import Flight
 from twin_master.network.estimator import ExactFilter
+from twin_master.report.reading import open_run as stored_run
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed
@@ -206,6 +207,25 @@ def test_a_watch_that_learns_goes_on_as_if_it_had_never_ended(
     for turn, row in enumerate(mission.observed):
         last = twin.turn(row, int(mission.control_index[turn]))
     assert json.loads(journals[0].splitlines()[-1][65:])["filtered"] == last.filtered.tolist()
+
+
+def test_a_control_that_is_reported_wrongly_ends_no_watch(
+    base: Watch, mission: Flight, tmp_path: Path
+) -> None:
+    """From turn 10 on, for a twin that learns and gives notice, also when it is taken up again."""
+    controls = np.where(np.arange(50) < 10, mission.control_index, 1 - mission.control_index)
+    path = write_csv(tmp_path / "m.csv", mission.observed, controls)
+    given = load_scenario("level_turns_learning").scenario
+    tables = {"learning": given.learning, "notice": given.notice}
+    scenario, ends = base.scenario.model_copy(update=tables), []
+    for name, stops in (("whole", (None,)), ("stopped", (12, 35, None))):
+        watch = begun(base, tmp_path / name)
+        watch.models = [BelievedModel(0, replace(base.models[0].knowledge, scenario=scenario))]
+        for stop in stops:
+            counts = watch.run(CsvFeed(path, scenario), lambda _decision: None, turns=stop)
+        assert (counts.received, counts.rejected, counts.missing) == (50, 0, 0)
+        ends.append((watch.folder / JOURNAL_NAME).read_bytes())
+    assert ends[0] == ends[1]
 
 
 def test_a_long_watch_goes_on_from_its_snapshot(
@@ -424,6 +444,56 @@ def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
         flown(whole, 21, 20, SilentProgress()),
     ):
         raise AssertionError
+
+
+def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
+    scenario: LoadedScenario, mission: Flight, recorded: Path, whole: Path, tmp_path: Path
+) -> None:
+    folder, decisions = tmp_path / "watch", list[dict[str, object]]()
+    opened = []
+
+    def decide(decision: Mapping[str, object]) -> None:
+        decisions.append(dict(decision))
+        if decision["turn"] == 7:
+            before = (folder / JOURNAL_NAME).read_bytes()
+            with pytest.raises(RunFolderError, match=r"holds no run\.nc"):
+                stored_run(folder)
+            opened.append(uav_twin.open_run(folder)["filtered"]["probability"].values)
+            assert (folder / JOURNAL_NAME).read_bytes() == before
+
+    with pytest.raises(RunFolderError, match=r"holds no run\.nc"):
+        uav_twin.open_run(folder)
+    uav_twin.watch(scenario, recorded, folder, decide=decide, turns=20, report=False)
+    np.testing.assert_array_equal(opened[0], mission.filtered[:8])
+    with pytest.raises(MissionInputError, match="give nothing beside --resume"):
+        uav_twin.watch(None, recorded, folder, {"seed": 3}, resume=True)
+    uav_twin.watch(None, recorded, folder, decide=decide, resume=True, turns=30, report=False)
+    (folder / "summary.json").unlink()  # as a kill before the end leaves it
+    uav_twin.watch(None, recorded, folder, decide=decide, resume=True, last=10, report=False)
+    again = [decision["turn"] for decision in decisions if decision.get("told_again")]
+    told = [decision for decision in decisions if not decision.get("told_again")]
+    assert (again, told) == ([29], json.loads((whole / "decisions.json").read_text()))
+    run = uav_twin.open_run(folder)
+    np.testing.assert_array_equal(run["filtered"]["probability"].values, mission.filtered[40:])
+    assert (folder / JOURNAL_NAME).read_text().splitlines()[-1][65:] == (
+        (whole / JOURNAL_NAME).read_text().splitlines()[-1][65:]
+    )
+
+
+def test_an_unknown_column_is_passed_over_on_request(
+    scenario: LoadedScenario, recorded: Path, tmp_path: Path
+) -> None:
+    path, out = tmp_path / "m.csv", tmp_path / "watch"
+    path.write_text(recorded.read_text().replace("strain_24", "strian_24", 1))
+    words = ["watch", str(scenario.path), "--observations", str(path), "--out", str(out), "--no-report"]
+    refused = CliRunner().invoke(app, [*words, "--turns", "2"])
+    assert "the column `strian_24` is no sensor: a sensor is called such as `strain_24`" in str(
+        refused.exception
+    )
+    assert not out.exists()
+    passed = CliRunner().invoke(app, [*words, "--turns", "2", "--allow-unknown"])
+    assert passed.exit_code == 0, passed.output
+    assert [json.loads(line)["lost_sensors"] for line in passed.stdout.splitlines()] == [1, 1]
 
 
 def test_a_slip_of_the_pen_makes_no_folder(scenario: LoadedScenario, tmp_path: Path) -> None:
