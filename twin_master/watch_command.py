@@ -248,7 +248,7 @@ def _feed(
     scenario = watched.scenario
     if is_broker(observations):
         broker = broker_of(observations, ca_file)
-        mqtt = MqttFeed(broker, scenario, watched.folder, lambda text: typer.echo(text, err=True))
+        mqtt = MqttFeed(broker, watched, lambda text: typer.echo(text, err=True))
 
         def publish(decision: Mapping[str, Any]) -> bool:
             _say(watched, decision, flush=True)
@@ -270,6 +270,8 @@ def _say(watched: "Watch", decision: Mapping[str, Any], *, flush: bool) -> bool:
     if terminal.loudness.quiet:
         return True
     people = sys.stdout.isatty()
+    if people and "control" not in decision:  # nothing was decided yet, and nothing comes
+        return True
     line = _line(watched.scenario, decision) if people else json.dumps(decision)
     return _write(line + "\n", flush=flush or people)
 

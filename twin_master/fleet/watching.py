@@ -31,7 +31,7 @@ from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.keeping import Keeper
 from twin_master.watch.message import MessageReader
-from twin_master.watch.mqtt import Session, broker_of, is_broker, placed
+from twin_master.watch.mqtt import Outbox, Session, broker_of, is_broker, placed
 from twin_master.watch.opening import begin_resolved, resume_watch
 
 __all__ = ["KIND", "STATE_NAME", "FleetRecord", "FleetWatch", "WatchedAsset"]
@@ -109,10 +109,9 @@ class WatchedAsset:
         What the operator was told, each sentence once.
     """
 
-    def __init__(
-        self, name: str, watch: Watch, keep: Keeper, tell: Callable[[Mapping[str, Any]], None]
-    ) -> None:
-        self.name, self.watch, self.keep, self.tell = name, watch, keep, tell
+    def __init__(self, name: str, watch: Watch, keep: Keeper) -> None:
+        self.name, self.watch, self.keep = name, watch, keep
+        self.tell: Callable[[Mapping[str, Any]], None] = lambda _decision: None
         model = watch.models[-1].knowledge.model
         self.decision = last_decision(watch.folder / JOURNAL_NAME, watch.scenario, model)
         self.alarms = {notice.sentence for _, notice in watch.told(0)} if self.decision else set()
@@ -215,6 +214,7 @@ class FleetWatch:
                     begin = time.monotonic()
                     turns = sum(source.look() for source in self._sources)
                     if begin - state > STATE_SECONDS:
+                        self._listen()
                         self._write_state()
                         state = begin
                     looked()
@@ -226,10 +226,7 @@ class FleetWatch:
             finally:
                 self._write_state()
 
-    def take_up(
-        self, group: Group, name: str, feed: Callable[[Scenario], Feed],
-        publish: Callable[[Mapping[str, Any]], None] | None = None,
-    ) -> WatchedAsset | None:  # fmt: skip
+    def take_up(self, group: Group, name: str, feed: Callable[[Scenario], Feed]) -> WatchedAsset | None:
         """Begin the watch of an asset, or go on with it; None where that cannot be."""
         key, folder = f"{group.name}/{name}", self.folder / group.name / name
         with ExitStack() as closing:
@@ -251,7 +248,7 @@ class FleetWatch:
                     )
                 closing.callback(os.close, lock)
                 _, keep = closing.enter_context(watch.begun(source))
-                asset = WatchedAsset(key, watch, keep, publish or (lambda _decision: None))
+                asset = WatchedAsset(key, watch, keep)
             except IN_FLIGHT as error:
                 self._lost(key, error)
                 return None
@@ -264,8 +261,15 @@ class FleetWatch:
             self._decided(asset, last)
         return asset
 
+    def _listen(self) -> None:
+        """Tell of assets of which nothing comes any more."""
+        for asset in self.assets.values():
+            if not self.done(asset) and (decision := asset.watch.quiet(asset.keep)) is not None:
+                self._decided(asset, decision)
+
     def _decided(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
-        asset.decision = decision
+        if "control" in decision:
+            asset.decision = decision
         self._tell(asset, decision)
         asset.tell(decision)
         asset.alarms |= {notice["sentence"] for notice in decision["notices"]}
@@ -406,16 +410,22 @@ class _Topics:
 
     def __init__(self, fleet: FleetWatch, group: Group, authority: Path | None) -> None:
         broker = broker_of(group.observations, authority, many=True)
-        self._fleet, self._group = fleet, group
-        self._session = Session(broker, group.name, fleet.folder, fleet.note)
+        self._fleet, self._group, self._topic = fleet, group, broker.topic
+        self._session = Session(broker, group.name, fleet.folder, fleet.note, self._pulse)
         fleet.closing.callback(self._session.close)
         self._messages = self._session.messages(0.0)
+        self._begin = True
         self._assets: dict[str, WatchedAsset] = {}
         self._inboxes: dict[str, _Inbox | None] = {}
 
     def look(self) -> int:
         """Take in what the broker has sent; return the number of turns."""
         turns = 0
+        if self._begin:  # those that were watched before may be quiet, or have decisions to publish
+            for path in sorted((self._fleet.folder / self._group.name).glob(f"*/{CONFIG_NAME}")):
+                topic = self._topic[:-1] + path.parent.name
+                self._inboxes[topic] = self._begun(topic)
+            self._begin = False
         while not self._fleet.asked and (message := next(self._messages)) is not None:
             topic = message.topic
             if topic not in self._inboxes and len(self._inboxes) < LARGEST_FLEET:
@@ -428,12 +438,17 @@ class _Topics:
 
     def _begun(self, topic: str) -> _Inbox | None:
         inbox, name = _Inbox(self._group.scenarios[0]), topic.rpartition("/")[2]
-
-        def publish(decision: Mapping[str, Any]) -> None:
-            self._session.publish(topic, decision)
-
-        asset = self._fleet.take_up(self._group, name, lambda _scenario: inbox, publish)
+        asset = self._fleet.take_up(self._group, name, lambda _scenario: inbox)
         if asset is None:
             return None
         self._assets[topic] = asset
+        asset.tell = Outbox(self._session, topic, asset.watch).tell
         return inbox
+
+    def _pulse(self) -> dict[str, Any]:
+        kept = [asset.keep for asset in self._assets.values()]
+        return {
+            "state": "watching", "assets": len(kept), "turns": sum(keep.twin.turns for keep in kept),
+            "quiet": sum(keep.quiet for keep in kept), "lag": self._session.lag,
+            "refused": sum(keep.intake.counts.rejected for keep in kept),
+        }  # fmt: skip

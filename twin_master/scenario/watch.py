@@ -20,6 +20,8 @@ class WatchSection(Section):
     """Turns that a message may be ahead of the next one; those between are predicted through."""
     seconds_per_turn: Positive | None = None
     """Of messages that have a time in the place of a turn."""
+    quiet_after_seconds: Positive | None = None
+    """Without a turn for so long, a notice says that the last decision grows old."""
 
     @property
     def recording(self) -> Path | None:

@@ -102,7 +102,7 @@ def replay(
         try:
             if "model" in record:
                 adopted += 1
-            elif "verdict" not in record:
+            elif "verdict" not in record and "quiet" not in record:
                 seen = array_of(record["observed"]), int(record["control_index"])
                 tail.seen[int(record["observation_turn"])] = seen
             if "twin_state" in record:
