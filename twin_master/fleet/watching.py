@@ -29,7 +29,6 @@ from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import Fed, file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
-from twin_master.watch.keeping import Keeper
 from twin_master.watch.message import MessageReader
 from twin_master.watch.mqtt import Outbox, Session, broker_of, is_broker, placed
 from twin_master.watch.opening import begin_resolved, resume_watch
@@ -109,8 +108,8 @@ class WatchedAsset:
         What the operator was told, each sentence once.
     """
 
-    def __init__(self, name: str, watch: Watch, keep: Keeper) -> None:
-        self.name, self.watch, self.keep = name, watch, keep
+    def __init__(self, name: str, watch: Watch) -> None:
+        self.name, self.watch, self.keep = name, watch, watch.keep
         self.tell: Callable[[Mapping[str, Any]], None] = lambda _decision: None
         model = watch.models[-1].knowledge.model
         self.decision = last_decision(watch.folder / JOURNAL_NAME, watch.scenario, model)
@@ -247,8 +246,8 @@ class FleetWatch:
                         group.scenarios[0], group.file, folder, SilentProgress(), like=like
                     )
                 closing.callback(os.close, lock)
-                _, keep = closing.enter_context(watch.begun(source))
-                asset = WatchedAsset(key, watch, keep)
+                closing.enter_context(watch.begun(source))
+                asset = WatchedAsset(key, watch)
             except IN_FLIGHT as error:
                 self._lost(key, error)
                 return None
@@ -264,7 +263,7 @@ class FleetWatch:
     def _listen(self) -> None:
         """Tell of assets of which nothing comes any more."""
         for asset in self.assets.values():
-            if not self.done(asset) and (decision := asset.watch.quiet(asset.keep)) is not None:
+            if not self.done(asset) and (decision := asset.watch.quiet()) is not None:
                 self._decided(asset, decision)
 
     def _decided(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
@@ -449,6 +448,6 @@ class _Topics:
         kept = [asset.keep for asset in self._assets.values()]
         return {
             "state": "watching", "assets": len(kept), "turns": sum(keep.twin.turns for keep in kept),
-            "quiet": sum(keep.quiet for keep in kept), "lag": self._session.lag,
+            "quiet": sum(keep.quiet for keep in kept), "lag": len(self._session.came),
             "refused": sum(keep.intake.counts.rejected for keep in kept),
         }  # fmt: skip

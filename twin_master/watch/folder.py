@@ -147,7 +147,7 @@ class Watch:
             Looks for the cause of an alarm, so that the twin is taught.
         """
         with self.begun(feed, patched) as (journal, keep):
-            source = Stopping(keep.intake, turns, lambda: self._look(keep, decide))
+            source = Stopping(keep.intake, turns, lambda: self._look(decide))
             if search is not None:
                 keep.tutor = self._tutor(journal, keep, search, source, wait=feed.replayable)
             with source.listening():
@@ -182,8 +182,9 @@ class Watch:
             decision = decision_of(self.scenario, self.models[-1].knowledge.model, twin, reading, turn)
             yield decision | {"notices": [*decision["notices"], *keep.told]}
 
-    def quiet(self, keep: Keeper) -> dict[str, Any] | None:
+    def quiet(self) -> dict[str, Any] | None:
         """Return the last decision with the notice that it grows old, once no turn has come for too long."""
+        keep = self.keep
         longest, step = self.scenario.watch.quiet_after_seconds, self.scenario.mission.step_name
         if longest is None or keep.quiet or keep.silence < longest:
             return None
@@ -195,9 +196,8 @@ class Watch:
         keep.quiet = True
         return decision
 
-    def _look(self, keep: Keeper, decide: Callable[[Mapping[str, Any]], None]) -> None:
-        """Tell the operator where no turn comes any more."""
-        if (decision := self.quiet(keep)) is not None:
+    def _look(self, decide: Callable[[Mapping[str, Any]], None]) -> None:
+        if (decision := self.quiet()) is not None:
             decide(decision)
 
     def _operate(self, source: Stopping, keep: Keeper, decide: Callable[[Mapping[str, Any]], None]) -> None:

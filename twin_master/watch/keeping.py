@@ -63,7 +63,8 @@ class Keeper:
         record |= belief_record(turn)
         self.told = [] if self.tutor is None else list(self.tutor.teaching.untold)
         if self.quiet:
-            self.told.append(notice_of("heard", f"Observations come again, after {self.silence:.0f} s."))
+            sentence = f"Turn {turn.turn}: observations come again, after {self.silence:.0f} s."
+            self.told.append(notice_of("heard", sentence))
         if self.told:
             record["notices"] = record.get("notices", []) + self.told
         self._journal.append(record)

@@ -125,6 +125,13 @@ class Session:
         What the heartbeat says.
     clean : bool
         Begin anew: what the broker kept for this client is not wanted.
+
+    Attributes
+    ----------
+    came : deque
+        Messages that have come and are not worked off yet.
+    behind : dict
+        Outboxes that have something to publish, as keys.
     """
 
     def __init__(
@@ -138,19 +145,13 @@ class Session:
         self._where = f"broker at {broker.host}:{broker.port}"
         self._heartbeat = broker.topic.replace("+", "fleet") + "/heartbeat"
         self._client: Any = None
-        self._came: deque[Any] = deque()
+        self.came: deque[Any] = deque()
         self._last: Any = None
         self._flying: dict[int, Outbox] = {}
-        self._taken: list[tuple[int, Any]] = []
         self.behind: dict[Outbox, None] = {}
         self._connected = self._begun = False
         self._failure = self._told = ""
         self._retry, self._pause, self._beat = 0.0, _RETRY_SECONDS[0], 0.0
-
-    @property
-    def lag(self) -> int:
-        """Messages that have come and are not worked off yet."""
-        return len(self._came)
 
     @property
     def room(self) -> bool:
@@ -181,10 +182,9 @@ class Session:
         if broker.tls:
             client.tls_set(ca_certs=None if broker.authority is None else str(broker.authority))
         client.will_set(self._heartbeat, json.dumps({"state": "lost"}), qos=1, retain=True)
-        client.on_message = lambda _client, _data, message: self._came.append(message)
-        client.on_publish = lambda _client, _data, mid, reason, _: self._taken.append((mid, reason))
-        client.on_connect, client.on_subscribe = self._on_connect, self._on_subscribe
-        client.on_disconnect = self._on_disconnect
+        client.on_message = lambda _client, _data, message: self.came.append(message)
+        client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
+        client.on_subscribe, client.on_publish = self._on_subscribe, self._on_publish
         client.connect(broker.host, broker.port, 30, clean_start=self._clean, properties=properties)
         self._client = client
 
@@ -222,6 +222,10 @@ class Session:
     def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         self._failure = self._failure or f"the {self._where} is away ({reason})"
 
+    def _on_publish(self, _client: Any, _data: Any, mid: int, reason: Any, _properties: Any) -> None:
+        if (outbox := self._flying.pop(mid, None)) is not None:
+            outbox.answered(mid, str(reason) if reason.is_failure else None)
+
     def _lost(self) -> None:
         """Let go of a connection, to try again later; the first time it ends the watch."""
         failure, self._failure, self._client = self._failure, "", None
@@ -233,12 +237,11 @@ class Session:
         self._told = failure
         self._retry = time.monotonic() + self._pause
         self._pause = min(2.0 * self._pause, _RETRY_SECONDS[1])
-        self._came.clear()  # not acknowledged, so the broker sends them again
+        self.came.clear()  # not acknowledged, so the broker sends them again
         self._last = None
         for outbox in {*self._flying.values()}:
             outbox.go_back()
         self._flying.clear()
-        self._taken.clear()
 
     def _exchange(self, wait: float) -> None:
         """Exchange packets, at most so many seconds where nothing comes; or try to reach the broker again."""
@@ -253,9 +256,9 @@ class Session:
                 self._failure = f"no broker answers at {self._broker.host}:{self._broker.port} ({error})"
                 self._lost()
                 return
-        count, failed = len(self._came), self._client.loop(wait)
-        while not failed and len(self._came) > count:  # all that is here already
-            count, failed = len(self._came), self._client.loop(0.0)
+        count, failed = len(self.came), self._client.loop(wait)
+        while not failed and len(self.came) > count:  # all that is here already
+            count, failed = len(self.came), self._client.loop(0.0)
         if failed or self._failure or self._client.socket() is None:
             self._failure = self._failure or f"the {self._where} is away ({failed.name})"
             self._lost()
@@ -265,10 +268,6 @@ class Session:
             self._client.disconnect()
             self._client, self._clean, self._connected, self._failure = None, False, False, ""
             return
-        for mid, reason in self._taken:
-            if (outbox := self._flying.pop(mid, None)) is not None:
-                outbox.answered(mid, str(reason) if reason.is_failure else None)
-        self._taken.clear()
         for outbox in [*self.behind] if self.room else ():
             outbox.publish()
         if self._connected and time.monotonic() >= self._beat:
@@ -281,15 +280,15 @@ class Session:
         A message is acknowledged when the next one is asked for, or before by `acknowledge`.
         """
         while True:
-            while self._came:
-                self._last = self._came.popleft()
+            while self.came:
+                self._last = self.came.popleft()
                 yield self._last
                 self.acknowledge()
             end = time.monotonic() + wait
             self._exchange(wait)
-            while not self._came and time.monotonic() < end:
+            while not self.came and time.monotonic() < end:
                 self._exchange(wait)
-            if not self._came:
+            if not self.came:
                 yield None
 
     def acknowledge(self) -> None:
@@ -336,7 +335,7 @@ class Outbox:
         self._path, self._journal = watch.folder / PUBLISHED_NAME, watch.folder / JOURNAL_NAME
         self._before = self._journal.stat().st_size  # decisions before may have been published
         if not self._path.is_file():
-            self._write(self._before)
+            atomic_write_text(self._path, f"{self._before:020d}\n")
         self._done = self._read = int(self._path.read_text())
         self._waiting: dict[int, int] = {}
         self.not_before = 0.0
@@ -344,9 +343,8 @@ class Outbox:
 
     def _write(self, done: int) -> None:
         try:
-            descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o666)
-            os.write(descriptor, b"%020d\n" % done)  # in place: whole or as it was
-            os.close(descriptor)
+            with self._path.open("r+b") as file:
+                file.write(b"%020d\n" % done)  # in place: whole, or as it was
         except OSError as error:
             raise write_error(error, self._path) from error
         self._done = done
@@ -419,7 +417,7 @@ class MqttFeed:
         counts = keep.intake.counts
         return {
             "state": "quiet" if keep.quiet else "watching", "turn": keep.twin.turns - 1,
-            "seconds_since_turn": round(keep.silence, 1), "lag": self._session.lag,
+            "seconds_since_turn": round(keep.silence, 1), "lag": len(self._session.came),
             "received": counts.received, "refused": counts.rejected,
         }  # fmt: skip
 

@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,12 @@ def soon_quiet(watch: Watch) -> Watch:
     section = watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2})
     watch.scenario = watch.scenario.model_copy(update={"watch": section})
     return watch
+
+
+def wait_until(found: Callable[[], object]) -> None:
+    limit = time.monotonic() + 60.0
+    while not found() and time.monotonic() < limit:
+        time.sleep(0.02)
 
 
 def lines(watch: Watch) -> list[dict[str, Any]]:
