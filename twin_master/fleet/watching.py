@@ -213,7 +213,9 @@ class FleetWatch:
                     begin = time.monotonic()
                     turns = sum(source.look() for source in self._sources)
                     if begin - state > STATE_SECONDS:
-                        self._listen()
+                        for asset in self.assets.values():
+                            if not self.done(asset) and (decision := asset.watch.quiet()) is not None:
+                                self._decided(asset, decision)
                         self._write_state()
                         state = begin
                     looked()
@@ -259,12 +261,6 @@ class FleetWatch:
         if last is not None and before < last["turn"]:  # a kill may have left it untold
             self._decided(asset, last)
         return asset
-
-    def _listen(self) -> None:
-        """Tell of assets of which nothing comes any more."""
-        for asset in self.assets.values():
-            if not self.done(asset) and (decision := asset.watch.quiet()) is not None:
-                self._decided(asset, decision)
 
     def _decided(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
         if "control" in decision:

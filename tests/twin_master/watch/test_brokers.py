@@ -150,7 +150,6 @@ def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_kil
     assert journalled == list(range(turns))
     assert {decision["turn"] for decision in heard} == {*journalled}
     again = [decision for decision in heard if decision.get("told_again")]
-    Path("/tmp/mqtt_figures.txt").open("a").write(f"{kills} kills, {turns} decisions, {len(heard)} published, {len(again)} again\n")
     assert len(again) >= kills
     assert len(heard) < turns + 100 * kills
 
