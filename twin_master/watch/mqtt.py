@@ -309,7 +309,7 @@ class Session:
         while self._client is not None and (self.behind or self._flying) and time.monotonic() < end:
             self._exchange(0.1)
         if self.behind or self._flying:
-            self.note("The broker has not taken all decisions: the rest is published with --resume.")
+            self.note("The broker has not taken all decisions: the rest is published when the watch goes on.")
         if self._client is not None:
             self._client.publish(self._heartbeat, json.dumps(self._pulse() | {"state": "ended"}), retain=True)
             self._client.disconnect()

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, lines, soon_quiet, wait_until
-from twin_master.assets.resolution import Overrides
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import Flight
@@ -25,8 +25,8 @@ from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import PASSWORD_VARIABLE, Broker, MqttFeed, broker_of
-from twin_master.watch.opening import begin_watch
 from twin_master.watch.snapshot import flown
+from uav_twin.cli import app
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 needs_mosquitto = pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
@@ -200,11 +200,26 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     assert len({*names}) == len(names) == 2  # nobody who knows the folder can guess it
     publish(599)  # to a watch that is no more
     publisher.publish("wing/7", message(598), qos=1, retain=True).wait_for_publish(20)
-    new, lock = begin_watch(scenario, watch.folder, Overrides(), SilentProgress(), replace_run=True)
-    assert watched(new, 1, 0) == Counts(received=1)
-    os.close(lock)
-    assert [path.read_text() for path in new.folder.glob("*.mqtt")] == names[:1]
+    states: list[dict[str, Any]] = []
+    listener = broker.client("listener", states)
+    listener.subscribe("wing/7/heartbeat")
+    wait_until(lambda: states)
+
+    def begin() -> None:
+        wait_until(lambda: states[-1]["state"] == "watching")
+        publish(0)
+
+    beginning = threading.Thread(target=begin)
+    beginning.start()
+    words = ["watch", str(scenario.path), "--observations", f"mqtt://wing@127.0.0.1:{broker.port}/wing/7"]
+    words += ["--out", str(watch.folder), "--replace", "--turns", "1", "--no-report"]
+    result = CliRunner().invoke(app, words)
+    beginning.join()
+    assert [json.loads(line)["turn"] for line in result.stdout.splitlines()] == [0]
+    assert "1 messages." in result.stderr
+    assert [path.read_text() for path in watch.folder.glob("*.mqtt")] == names[:1]
     assert all(note.startswith("Connected") for note in notes)
+    listener.disconnect()
     publisher.disconnect()
 
 
