@@ -241,7 +241,7 @@ def test_a_broker_that_refuses_the_twin_when_it_comes_back(
     broker.stop()
     broker.let_in(PASSWORD)
     broker.start()
-    wait_until(lambda: notes[-1].startswith("Connected"))
+    wait_until(lambda: notes[-1].startswith("Connected") and publisher.is_connected())
     publisher.publish("wing/7", message(1), qos=1).wait_for_publish(60)
     watching.join(60)
     assert not watching.is_alive()
