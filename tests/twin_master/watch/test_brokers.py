@@ -92,6 +92,18 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(
     assert all(decision["probability"] >= 0.5 for decision in heard)
 
 
+@pytest.fixture
+def broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mosquitto]:
+    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
+    broker = Mosquitto(tmp_path)
+    yield broker
+    broker.stop()
+
+
+def where_of(broker: Mosquitto) -> Broker:
+    return broker_of(f"mqtt://wing@127.0.0.1:{broker.port}/wing/7")
+
+
 def killed(where: Broker, watch: Watch, lines: int, turns: int) -> bool:
     """Watch in a process of its own, killed once its journal has grown; return whether it was killed."""
     journal = watch.folder / JOURNAL_NAME
@@ -118,11 +130,9 @@ def killed(where: Broker, watch: Watch, lines: int, turns: int) -> bool:
 @needs_mosquitto
 @pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.long)])
 def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_killed(
-    base: Watch, tmp_path: Path, kills: int, monkeypatch: pytest.MonkeyPatch
+    base: Watch, broker: Mosquitto, tmp_path: Path, kills: int
 ) -> None:
-    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    broker, turns, chance = Mosquitto(tmp_path), 60 * kills, random.Random(kills)
-    where = broker_of(f"mqtt://wing@127.0.0.1:{broker.port}/wing/7")
+    turns, chance, where = 60 * kills, random.Random(kills), where_of(broker)
     watch = begun(base, tmp_path / "watch")
     heard: list[dict[str, Any]] = []
     listener = broker.client("listener", heard)
@@ -145,25 +155,12 @@ def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_kil
     listener = broker.client("listener", heard)
     wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
     listener.disconnect()
-    broker.stop()
     journalled = [line["turn"] for line in lines(watch)]
     assert journalled == list(range(turns))
     assert {decision["turn"] for decision in heard} == {*journalled}
     again = [decision for decision in heard if decision.get("told_again")]
     assert len(again) >= kills
     assert len(heard) < turns + 100 * kills
-
-
-@pytest.fixture
-def broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mosquitto]:
-    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    broker = Mosquitto(tmp_path)
-    yield broker
-    broker.stop()
-
-
-def where_of(broker: Mosquitto) -> Broker:
-    return broker_of(f"mqtt://wing@127.0.0.1:{broker.port}/wing/7")
 
 
 def message(turn: int) -> str:
