@@ -109,7 +109,7 @@ def watch(
             last=last, report=not no_report, otherwise="-", begun=opened, progress=terminal.progress(),
         )  # fmt: skip
         _write("", flush=True)
-        counts = watches[0].counts
+        counts = watches[0].keep.intake.counts
         refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
         typer.echo(f"Watch: {folder}, {counts.received} messages{refused}.", err=True)
         if not no_report and counts.received:
@@ -124,6 +124,8 @@ def _say(watched: "Watch", decision: Mapping[str, Any], *, flush: bool) -> bool:
     if terminal.loudness.quiet:
         return True
     people = sys.stdout.isatty()
+    if people and "control" not in decision:  # nothing was decided yet, and nothing comes
+        return True
     line = _line(watched.scenario, decision) if people else json.dumps(decision)
     return _write(line + "\n", flush=flush or people)
 

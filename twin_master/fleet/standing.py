@@ -11,7 +11,6 @@ from twin_master.fleet.reading import attention
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.watch.decision import last_decision
 from twin_master.watch.folder import Watch
-from twin_master.watch.keeping import Keeper
 
 __all__ = ["STATE_NAME", "FleetRecord", "WatchedAsset"]
 
@@ -86,11 +85,9 @@ class WatchedAsset:
         How many there were before.
     """
 
-    def __init__(
-        self, name: str, watch: Watch, keep: Keeper, tell: Callable[[Mapping[str, Any]], None],
-        before: AssetRecord | None = None,
-    ) -> None:  # fmt: skip
-        self.name, self.watch, self.keep, self.tell = name, watch, keep, tell
+    def __init__(self, name: str, watch: Watch, before: AssetRecord | None = None) -> None:
+        self.name, self.watch, self.keep = name, watch, watch.keep
+        self.tell: Callable[[Mapping[str, Any]], None] = lambda _decision: None
         self.close: Callable[[], None] = lambda: None
         self._knowledge = watch.models[-1].knowledge
         self.decision = last_decision(watch.folder / JOURNAL_NAME, watch.scenario, self._knowledge.model)
@@ -99,7 +96,8 @@ class WatchedAsset:
         told = [notice for _, notice in watch.told(first)] if self.decision else []
         self.alarms = {notice.sentence for notice in told if notice.kind == "alarm"}
         if self.decision is not None:
-            keep.filtered = keep.twin.estimator.smoothed(keep.twin.carried[-1:])[0]
+            twin = self.keep.twin
+            self.keep.filtered = twin.estimator.smoothed(twin.carried[-1:])[0]
 
     @property
     def alarm_count(self) -> int:

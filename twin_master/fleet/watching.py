@@ -30,7 +30,7 @@ from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed, LiveFeed
 from twin_master.watch.message import MessageReader
-from twin_master.watch.mqtt import Session, broker_of, is_broker, placed
+from twin_master.watch.mqtt import Outbox, Session, broker_of, is_broker, placed
 from twin_master.watch.opening import begin_resolved, resume_watch
 
 __all__ = ["KIND", "FleetWatch"]
@@ -142,6 +142,9 @@ class FleetWatch:
                     begin = time.monotonic()
                     turns = sum(source.look() for source in self._sources)
                     if begin - state > STATE_SECONDS:
+                        for asset in self.assets.values():
+                            if not self.done(asset) and (decision := asset.watch.quiet()) is not None:
+                                self._decided(asset, decision)
                         self._write_state()
                         state = begin
                     looked()
@@ -153,10 +156,7 @@ class FleetWatch:
             finally:
                 self._write_state()
 
-    def take_up(
-        self, group: Group, name: str, feed: Callable[[Scenario], Feed],
-        publish: Callable[[Mapping[str, Any]], None] | None = None,
-    ) -> WatchedAsset | None:  # fmt: skip
+    def take_up(self, group: Group, name: str, feed: Callable[[Scenario], Feed]) -> WatchedAsset | None:
         """Begin the watch of an asset, or go on with it; None where that cannot be."""
         key, folder = f"{group.name}/{name}", self.folder / group.name / name
         with ExitStack() as closing:
@@ -175,9 +175,9 @@ class FleetWatch:
                         group.scenarios[0], group.file, folder, SilentProgress(), like=like
                     )
                 closing.callback(os.close, lock)
-                _, keep = closing.enter_context(watch.begun(source))
-                tell, told = publish or (lambda _decision: None), self._told_before.get(key)
-                asset = WatchedAsset(key, watch, keep, tell, told)
+                closing.enter_context(watch.begun(source))
+                told = self._told_before.get(key)
+                asset = WatchedAsset(key, watch, told)
                 asset.close = closing.pop_all().close
             except Exception as error:  # noqa: BLE001 - whatever one asset comes to, the others go on
                 self.lost(key, error)
@@ -194,7 +194,8 @@ class FleetWatch:
         return asset
 
     def _decided(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
-        asset.decision = decision
+        if "control" in decision:
+            asset.decision = decision
         self._tell(asset, decision)
         asset.tell(decision)
         asset.alarms |= {notice["sentence"] for notice in decision["notices"] if notice["kind"] == "alarm"}
@@ -353,10 +354,11 @@ class _Topics:
 
     def __init__(self, fleet: FleetWatch, group: Group, authority: Path | None) -> None:
         broker = broker_of(group.observations, authority, many=True)
-        self._fleet, self._group = fleet, group
-        self._session = Session(broker, group.name, fleet.folder, fleet.note)
+        self._fleet, self._group, self._topic = fleet, group, broker.topic
+        self._session = Session(broker, group.name, fleet.folder, fleet.note, self._pulse)
         fleet.closing.callback(self._session.close)
         self._messages = self._session.messages(0.0)
+        self._begin = True
         self._assets: dict[str, WatchedAsset] = {}
         self._inboxes: dict[str, _Inbox | None] = {}
         self._searched = time.monotonic()
@@ -364,6 +366,11 @@ class _Topics:
     def look(self) -> int:
         """Take in what the broker has sent; return the number of turns."""
         turns = 0
+        if self._begin:  # those that were watched before may be quiet, or have decisions to publish
+            for path in sorted((self._fleet.folder / self._group.name).glob(f"*/{CONFIG_NAME}")):
+                topic = self._topic[:-1] + path.parent.name
+                self._inboxes[topic] = self._begun(topic, None)
+            self._begin = False
         again = time.monotonic() - self._searched >= SEARCH_SECONDS
         self._searched = time.monotonic() if again else self._searched
         for topic in [*self._inboxes] if again else ():
@@ -385,12 +392,17 @@ class _Topics:
 
     def _begun(self, topic: str, before: _Inbox | None) -> _Inbox | None:
         inbox, name = before or _Inbox(self._group.scenarios[0]), topic.rpartition("/")[2]
-
-        def publish(decision: Mapping[str, Any]) -> None:
-            self._session.publish(topic, decision)
-
-        asset = self._fleet.take_up(self._group, name, lambda _scenario: inbox, publish)
+        asset = self._fleet.take_up(self._group, name, lambda _scenario: inbox)
         if asset is None:
             return before
         self._assets[topic] = asset
+        asset.tell = Outbox(self._session, topic, asset.watch).tell
         return inbox
+
+    def _pulse(self) -> dict[str, Any]:
+        kept = [asset.keep for asset in self._assets.values()]
+        return {
+            "state": "watching", "assets": len(kept), "turns": sum(keep.twin.turns for keep in kept),
+            "quiet": sum(keep.quiet for keep in kept), "lag": len(self._session.came),
+            "refused": sum(keep.intake.counts.rejected for keep in kept),
+        }  # fmt: skip

@@ -262,14 +262,15 @@ def records_backwards(path: Path, end: int | None = None) -> Iterator[tuple[dict
                         record_of(path, number, text)
 
 
-def records_behind(path: Path, end: int) -> Iterator[dict[str, Any]]:
-    """Return the records of the whole lines behind the first `end` bytes, the end of some line."""
+def records_behind(path: Path, end: int) -> Iterator[tuple[dict[str, Any], int]]:
+    """Return the record of each whole line behind the first `end` bytes, with the position of its own end."""
     with path.open("rb") as file:
         file.seek(end)
         for line in file:
             if not line.endswith(b"\n") or not _is_whole(line):
                 return
-            yield json.loads(line[_DIGEST + 1 :])
+            end += len(line)
+            yield json.loads(line[_DIGEST + 1 :]), end
 
 
 def _is_whole(line: bytes) -> bool:

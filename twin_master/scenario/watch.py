@@ -22,6 +22,8 @@ class WatchSection(Section):
     """Of messages that have a time in the place of a turn."""
     allow_unknown: bool = False
     """Keys and columns that are no sensor are passed over, and not refused."""
+    quiet_after_seconds: Positive | None = None
+    """Without a turn for so long, a notice says that the last decision grows old."""
 
     @property
     def recording(self) -> Path | None:

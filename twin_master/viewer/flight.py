@@ -18,6 +18,7 @@ from twin_master.learning.expectation import Expected, LearntExpectation
 from twin_master.learning.setup import learning_filter
 from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, kept_knowledge
 from twin_master.mission.preparation import Knowledge
+from twin_master.network.estimator import Notice
 from twin_master.network.inference import known_control, predict
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import parse_scenario
@@ -91,6 +92,7 @@ class Flight:
         # Where in the journal stand belief and observation of each turn; in memory are those last read.
         self._believed, self._observed = array("q"), array("q")
         self._kept: OrderedDict[int, SeenTurn] = OrderedDict()
+        self._told: dict[int, tuple[Notice, ...]] = {}  # behind a turn, where none came
         self.number = 0
 
     def _know(self) -> None:
@@ -119,6 +121,7 @@ class Flight:
         if changed:
             self._believed, self._observed = array("q"), array("q")
             self._kept.clear()
+            self._told.clear()
             self.number += 1
         if (kept := self._kept_at()) != self._knowledge_of:  # a patched model was adopted
             self._knowledge_of = kept
@@ -128,6 +131,9 @@ class Flight:
         news = self._journal.news(TURNS_AT_ONCE)
         for line in news:
             if line.seen is None:
+                if line.notices and self.turns:
+                    self._told[self.turns - 1] = self._told.get(self.turns - 1, ()) + line.notices
+                    self.number += 1
                 continue
             if line.seen.turn == self.turns:
                 self._believed.append(line.place)
@@ -182,6 +188,8 @@ class Flight:
         for turn, seen in zip(missing, believed, strict=True):
             found[turn] = seen
             self._keep(turn, seen)
+        for turn in found.keys() & self._told.keys():
+            found[turn] = replace(found[turn], notices=found[turn].notices + self._told[turn])
         return [found[turn] for turn in range(first, end)]
 
     def observed(self, first: int, end: int) -> Float:

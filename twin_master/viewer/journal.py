@@ -66,10 +66,13 @@ class News:
         Where it begins, in bytes, see `GrowingJournal.read`.
     seen : SeenTurn or None
         The turn that it tells; None where it is of the watch itself, such as a model that was adopted.
+    notices : tuple of Notice
+        What the operator was told where no turn came.
     """
 
     place: int
     seen: SeenTurn | None
+    notices: tuple[Notice, ...] = ()
 
 
 class GrowingJournal:
@@ -122,7 +125,8 @@ class GrowingJournal:
                         break
                     record = self._record(line, self._lines)
                     if self._end:  # not the heading
-                        found.append(News(self._end, _seen(record) if "filtered" in record else None))
+                        seen = _seen(record) if "filtered" in record else None
+                        found.append(News(self._end, seen, () if seen else _notices(record)))
                     self._end += len(line)
                     self._lines += 1
         except FileNotFoundError:
@@ -166,5 +170,9 @@ def _seen(record: Mapping[str, Any]) -> SeenTurn:
         filtered=array_of(record["filtered"]),
         decision_probability=array_of(record["decision_probability"]),
         learnt={name: Learnt(**learnt) for name, learnt in record.get("learnt", {}).items()},
-        notices=tuple(Notice(**notice) for notice in record.get("notices", ())),
+        notices=_notices(record),
     )
+
+
+def _notices(record: Mapping[str, Any]) -> tuple[Notice, ...]:
+    return tuple(Notice(**notice) for notice in record.get("notices", ()))

@@ -1,5 +1,6 @@
 """What the operator is told of a turn, and how well the twin's model has explained turns."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,30 +44,34 @@ def last_decision(path: Path, scenario: Scenario, model: GraphicalModel) -> dict
 
     A kill may have left it untold, and nobody knows: it has `told_again`.
     """
-    last: dict[str, Any] | None = None
     for line, *_ in records_backwards(path):
-        if last is None and "filtered" in line:
-            last = line
-        if last is None or line.get("observation_turn") != last["turn"] or "observed" not in line:
-            continue
-        # The line of the turn itself: one behind it may tell of an earlier turn that was revised.
-        record = {"turn": last["turn"]} | _decided(
-            scenario, model, array_of(last["filtered"]), line["control_index"], last["next_control"],
-            array_of(last["decision_probability"]),
-        )  # fmt: skip
-        record |= {
-            "lost_sensors": last["observed"][: scenario.observation.count].count(None),
-            "log_evidence": last["log_evidence"],
-            "notices": last.get("notices", []),
-        }
-        if "suspicion" in last:
-            record["none_of_these"] = last["suspicion"]["none_of_these"]
-        if last is not line:
-            record["revised_by_turn"] = last["observation_turn"]
-        if "learnt" in last:
-            record["learnt"] = last["learnt"]
-        return record | {"told_again": True}
+        if "filtered" in line:
+            return {**journalled_decision(line, scenario, model), "told_again": True}
     return None
+
+
+def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
+    """Return what the operator was told with a line of a journal; nothing where it tells no decision."""
+    if "quiet" in line:
+        return dict(line["quiet"])
+    if "filtered" not in line:
+        return {}
+    record = {"turn": line["turn"]} | _decided(
+        scenario, model, array_of(line["filtered"]), line.get("control_in_force", line["control_index"]),
+        line["next_control"], array_of(line["decision_probability"]),
+    )  # fmt: skip
+    record |= {
+        "lost_sensors": line["observed"][: scenario.observation.count].count(None),
+        "log_evidence": line["log_evidence"],
+        "notices": line.get("notices", []),
+    }
+    if "suspicion" in line:
+        record["none_of_these"] = line["suspicion"]["none_of_these"]
+    if "control_in_force" in line:
+        record["revised_by_turn"] = line["observation_turn"]
+    if "learnt" in line:
+        record["learnt"] = line["learnt"]
+    return record
 
 
 def _decided(

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
+from select import select
 from typing import IO, Any
 
 import numpy as np
@@ -260,12 +261,33 @@ class JsonLinesFeed(LiveFeed):
     def __init__(self, scenario: Scenario, stream: IO[bytes] | None = None) -> None:
         self._reader = MessageReader(scenario)
         self._stream = stream
+        self._looks = scenario.watch.quiet_after_seconds is not None
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
-        """Return what comes."""
-        for line in _lines(self._stream or sys.stdin.buffer):
-            if line is not None:
-                yield parsed(self._reader, line), shown(line)
+        """Return what comes; where silence is to be noticed, None while nothing does."""
+        stream = self._stream or sys.stdin.buffer
+        for line in _lines(_Pipe(stream) if self._looks else stream):
+            yield (None, "") if line is None else (parsed(self._reader, line), shown(line))
+
+
+class _Pipe:
+    """A stream that is not waited for: its lines are None while nothing has come."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._descriptor, self._came, self._ended = stream.fileno(), b"", False
+
+    def readline(self, most: int) -> bytes | None:
+        """Return a line, or a piece of so many bytes; nothing at the end."""
+        if b"\n" not in self._came and len(self._came) < most and not self._ended:
+            if not select([self._descriptor], [], [], 0.0)[0]:
+                return None
+            self._came += (piece := os.read(self._descriptor, 65_536))
+            self._ended = not piece
+        end = self._came.find(b"\n", 0, most) + 1
+        if not end and not self._ended and len(self._came) < most:
+            return None
+        line, self._came = self._came[: end or most], self._came[end or most :]
+        return line
 
 
 class MappingFeed(LiveFeed):
@@ -330,7 +352,7 @@ def _is_netcdf(path: Path) -> bool:
     return path.suffix.lower() == ".nc"
 
 
-def _lines(file: IO[bytes], *, follow: bool = False) -> Iterator[bytes | Refused | None]:
+def _lines(file: "IO[bytes] | _Pipe", *, follow: bool = False) -> Iterator[bytes | Refused | None]:
     """Return whole lines; one that is too long is skipped in pieces, and the rest of a file is a line.
 
     A file that is followed has no last line: None stands for nothing new, each time that it is asked.
@@ -340,7 +362,7 @@ def _lines(file: IO[bytes], *, follow: bool = False) -> Iterator[bytes | Refused
     while True:
         piece = file.readline(LARGEST_MESSAGE + 1)
         if not piece:
-            if follow:
+            if follow or piece is None:
                 yield None
                 continue
             if part and not too_long:

@@ -37,12 +37,12 @@ from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
 from twin_master.store.writing import store_mission, write_summary
-from twin_master.watch.decision import decision_of
+from twin_master.watch.decision import decision_of, last_decision
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
 from twin_master.watch.keeping import Keeper, Standing
 from twin_master.watch.replay import BelievedModel, Replayed, replay
 from twin_master.watch.stopping import Stopping
-from twin_master.watch.teaching import Search, Teaching, Tutor, both_patches, check_teachable
+from twin_master.watch.teaching import Search, Teaching, Tutor, both_patches, check_teachable, notice_of
 from twin_master.watch.trial import Judge, Outcome, Trial, judged, patched_model
 
 STORED_TURNS = 1_000
@@ -77,9 +77,11 @@ class Watch:
 
     Attributes
     ----------
-    counts : Counts
-        Of the messages, once it has run.
+    keep : Keeper
+        Writes down the turns, from `begun` on.
     """
+
+    keep: Keeper
 
     def __init__(
         self, folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress,
@@ -98,7 +100,6 @@ class Watch:
         self._patches: list[Path | None] = [Path(own) if own else None]  # of these models
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
-        self.counts = Counts()
         self._take_up()
         if like is not None and len(self.models) == len(like.models) == 1:
             share_knowledge(like.folder, folder)
@@ -146,14 +147,13 @@ class Watch:
             Looks for the cause of an alarm, so that the twin is taught.
         """
         with self.begun(feed, patched) as (journal, keep):
-            source = Stopping(keep.intake, turns)
+            source = Stopping(keep.intake, turns, lambda: self._look(decide))
             if search is not None:
                 keep.tutor = self._tutor(journal, keep, search, source, wait=feed.replayable)
             with source.listening():
                 try:
                     self._operate(source, keep, decide)
                 finally:
-                    self.counts = keep.intake.counts
                     if keep.tutor is not None:
                         keep.tutor.end()
         return keep.intake.counts
@@ -173,7 +173,8 @@ class Watch:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            yield journal, Keeper(journal, intake, found.twin, self.standing)
+            self.keep = Keeper(journal, intake, found.twin, self.standing)
+            yield journal, self.keep
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
         """Yield what the operator is told of each turn, once it is written down, until the source ends."""
@@ -181,6 +182,24 @@ class Watch:
         for reading, turn, _ in operate(twin, source, keep):
             decision = decision_of(self.scenario, self.models[-1].knowledge.model, twin, reading, turn)
             yield decision | {"notices": [*decision["notices"], *keep.told]}
+
+    def quiet(self) -> dict[str, Any] | None:
+        """Return the last decision with the notice that it grows old, once no turn has come for too long."""
+        keep = self.keep
+        longest, step = self.scenario.watch.quiet_after_seconds, self.scenario.mission.step_name
+        if longest is None or keep.quiet or keep.silence < longest:
+            return None
+        since = f"since {step} {keep.twin.turns - 1}" if keep.twin.turns else "and none before"
+        sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
+        last = last_decision(self._path, self.scenario, self.models[-1].knowledge.model)
+        decision = {**(last or {"turn": -1}), "notices": [notice_of("quiet", sentence)]}
+        keep.write({"notices": decision["notices"], "quiet": decision})
+        keep.quiet = True
+        return decision
+
+    def _look(self, decide: Callable[[Mapping[str, Any]], None]) -> None:
+        if (decision := self.quiet()) is not None:
+            decide(decision)
 
     def _operate(self, source: Stopping, keep: Keeper, decide: Callable[[Mapping[str, Any]], None]) -> None:
         """Watch with one twin after the other: where it is taught, another one goes on."""
@@ -365,9 +384,7 @@ class _Pupil:
         self._keep, self._judge = keep, judge
 
     def write(self, record: Mapping[str, Any]) -> None:
-        twin = self._keep.twin
-        state = {"next_control": twin.proposed_control, "intake": self._keep.intake.state()}
-        self._keep.write({"turn": twin.turns - 1, **state, **record})
+        self._keep.write(record)
 
     def outcome(self, file: Path, from_turn: int, compared: tuple[int, int]) -> Outcome | None:
         return self._judge.outcome(lambda: self._watch.trial(self._journal, file, from_turn, compared))

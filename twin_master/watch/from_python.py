@@ -204,7 +204,7 @@ def _feed(
 ) -> tuple[Feed, Decide, Callable[[], None]]:  # fmt: skip
     """Return where observations come from, who else is told the decisions, and what ends both."""
     if isinstance(observations, str) and is_broker(observations):
-        mqtt = MqttFeed(broker_of(observations, authority), scenario, watched.folder, progress.note)
+        mqtt = MqttFeed(broker_of(observations, authority), watched, progress.note, scenario)
         return mqtt, mqtt.decide, mqtt.close
     feed: Feed
     if not isinstance(observations, str | Path):

@@ -168,6 +168,11 @@ class Intake:
         self.observation_turn = -1
         self.ended = False
 
+    @property
+    def settled(self) -> bool:
+        """Whether no reading of the last message is still to come."""
+        return not self._pending
+
     def state(self) -> dict[str, Any]:
         """Return what is needed to go on, as JSON."""
         # The message behind a gap is read again, until its own turn is written down.

@@ -1,6 +1,7 @@
 """A turn of a watch as a line of its journal, and what follows from all of its lines."""
 
 import base64
+import time
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from twin_master.mission.journal import (
 from twin_master.mission.loop import Reading
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.watch.intake import Intake
-from twin_master.watch.teaching import Teaching, Tutor
+from twin_master.watch.teaching import Teaching, Tutor, notice_of
 
 SNAPSHOT_TURNS = 32
 """Turns between two lines that also hold the state of the twin and what follows from all lines before."""
@@ -109,6 +110,8 @@ class Keeper:
         Notices that the last line has beside those of its turn.
     filtered : (S,) or None
         What was believed after the last turn; None before the first one of this process.
+    quiet : bool
+        Whether the operator was told that no turn comes any more.
     """
 
     def __init__(self, journal: JournalFile, intake: Intake, twin: Twin, standing: Standing) -> None:
@@ -116,6 +119,12 @@ class Keeper:
         self.tutor: Tutor | None = None
         self.told: list[dict[str, Any]] = []
         self.filtered: NDArray[np.float64] | None = None
+        self.quiet, self._heard = False, time.monotonic()
+
+    @property
+    def silence(self) -> float:
+        """How long no turn has come [s]."""
+        return time.monotonic() - self._heard
 
     def __call__(self, reading: Reading, turn: TwinTurn) -> None:
         """Write down a reading and what became of it."""
@@ -128,6 +137,8 @@ class Keeper:
             "next_control": turn.next_control,
             "intake": self.intake.state(),
         }
+        if reading.revises is not None:
+            record["control_in_force"] = turn.control_index
         if turn.turn % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1 and reading.revises is None:
             record |= self._standing.snapshot(self.twin, self._journal.size)
         record |= belief_record(turn)
@@ -135,11 +146,20 @@ class Keeper:
         self.told = [vars(n) for n in self.intake.notices if (n.kind, n.sensors) not in known]
         if self.tutor is not None:
             self.told += self.tutor.teaching.untold
+        if self.quiet:
+            sentence = f"Turn {turn.turn}: observations come again, after {self.silence:.0f} s."
+            self.told.append(notice_of("heard", sentence))
         if self.told:
             record["notices"] = record.get("notices", []) + self.told
-        self.write(record)
+        self._append(record)
+        self.quiet, self._heard = False, time.monotonic()
 
     def write(self, record: Mapping[str, Any]) -> None:
+        """Write down something else than a turn."""
+        state = {"next_control": self.twin.proposed_control, "intake": self.intake.state()}
+        self._append({"turn": self.twin.turns - 1, **state, **record})
+
+    def _append(self, record: Mapping[str, Any]) -> None:
         """Add a line to the journal, and take it in."""
         self._journal.append(record)
         self._standing.take(record)

@@ -10,27 +10,35 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
+from secrets import token_hex
+from ssl import create_default_context
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
+from reporting.files import atomic_write_text, write_error
 from twin_master.errors import MissionInputError
+from twin_master.mission.journal import JOURNAL_NAME, records_behind
 from twin_master.scenario.schema import Scenario
+from twin_master.watch.decision import journalled_decision
 from twin_master.watch.feeds import Fed, parsed, shown
+from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import LiveFeed
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
 PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
+CLIENT_SUFFIX, PUBLISHED_NAME = ".mqtt", "published"
+"""Of the file with the name of the client, and of that which says how far decisions were published."""
 _WAITING = 200
 """Messages that the broker may send before they are acknowledged."""
 _DECISIONS_WAITING = 1000
-"""Decisions that are kept while the broker is away; further ones are in the journal only."""
+"""Decisions that wait in memory for the broker to acknowledge them; further ones wait in the journal."""
 _SESSION_SECONDS = 7 * 86_400
 """How long the broker keeps what comes while the watch is away."""
 _RETRY_SECONDS = (1.0, 30.0)
+HEARTBEAT_SECONDS = 10.0
 _GOODBYE_SECONDS = 5.0
 """How long the end waits for the broker to take the last decisions."""
 
@@ -42,7 +50,8 @@ class Broker:
     Attributes
     ----------
     host, port, topic : str, int, str
-        Of the broker, and of the observations; decisions go to `TOPIC/decision`.
+        Of the broker, and of the observations; decisions go to `TOPIC/decision`, how the twin is to
+        `TOPIC/heartbeat`.
     user : str or None
         Who the twin is; the password is in the environment, `UAV_TWIN_MQTT_PASSWORD`.
     tls : bool
@@ -72,7 +81,8 @@ def broker_of(address: str, authority: Path | None = None, *, many: bool = False
     Raises
     ------
     MissionInputError
-        paho-mqtt is not installed, or it is no such address, has a password in it, or a topic of many assets.
+        paho-mqtt is not installed, or it is no such address, has a password in it, or a topic of many assets;
+        the authority's file holds no certificate.
     """
     if find_spec("paho") is None:
         raise MissionInputError("observations over MQTT need paho-mqtt: pip install 'uav-twin[mqtt]'.")
@@ -92,155 +102,340 @@ def broker_of(address: str, authority: Path | None = None, *, many: bool = False
     if not many and ("#" in address or "+" in topic):
         raise MissionInputError(f"{address}: a topic of one asset is expected, without `#` and `+`.")
     tls, user = parts.scheme == "mqtts", None if parts.username is None else unquote(parts.username)
-    if authority is not None and not (tls and authority.is_file()):
-        raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
+    if authority is not None:
+        if not (tls and authority.is_file()):
+            raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
+        try:
+            create_default_context(cafile=authority)
+        except OSError as error:
+            raise MissionInputError(f"{authority} holds no certificate: {error}.") from None
     return Broker(parts.hostname, port or (8883 if tls else 1883), topic, user, tls, authority)
 
 
 class Session:
-    """What comes from a topic; the broker keeps it while the watch is away.
+    """What comes from a topic, and what goes out; the broker keeps it while the watch is away.
 
     Parameters
     ----------
     broker : Broker
     name : str
-        Of the mission.
+        Of the mission or group.
     folder : Path
-        Of the watch: with the name of the mission it makes the session its own.
+        Keeps the name of this client, which nobody else can guess.
     note : callable
-        Told when the broker is lost and found.
+        Told when the broker is lost and found, and what it refuses.
+    pulse : callable
+        What the heartbeat says.
+    clean : bool
+        Begin anew: what the broker kept for this client is not wanted.
 
-    Raises
-    ------
-    MissionInputError
-        The authority's file holds no certificate.
+    Attributes
+    ----------
+    came : deque
+        Messages that have come and are not worked off yet.
+    behind : dict
+        Outboxes that have something to publish, as keys.
     """
 
-    def __init__(self, broker: Broker, name: str, folder: Path, note: Callable[[str], None]) -> None:
+    def __init__(
+        self, broker: Broker, name: str, folder: Path, note: Callable[[str], None],
+        pulse: Callable[[], dict[str, Any]], *, clean: bool = False,
+    ) -> None:  # fmt: skip
+        self._broker, self.note, self._pulse = broker, note, pulse
+        self._own = folder / f"{name}{CLIENT_SUFFIX}", f"uav-twin-{name}-{token_hex(8)}"
+        self._clean = clean and self._own[0].is_file()
+        self._kept = not clean and self._own[0].is_file()
+        self._where = f"broker at {broker.host}:{broker.port}"
+        self._heartbeat = broker.topic.replace("+", "fleet") + "/heartbeat"
+        self._client: Any = None
+        self.came: deque[Any] = deque()
+        self._last: Any = None
+        self._flying: dict[int, Outbox] = {}
+        self.behind: dict[Outbox, None] = {}
+        self._connected = self._begun = False
+        self._failure = self._told = ""
+        self._retry, self._pause, self._beat = 0.0, _RETRY_SECONDS[0], 0.0
+
+    @property
+    def room(self) -> bool:
+        """Whether a decision can be sent at once."""
+        return self._connected and len(self._flying) < _DECISIONS_WAITING
+
+    def _connect(self) -> None:
+        """Connect with nothing of the connection before: it is in the outboxes, and at the broker."""
         from paho.mqtt import client as paho
         from paho.mqtt.enums import CallbackAPIVersion
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
 
-        self._broker = broker
-        self._note = note
-        self._came: deque[Any] = deque()
-        self._untold: set[int] = set()
-        self._refusal: str | None = None
-        own = f"uav-twin-{name}-{sha256(str(folder.resolve()).encode()).hexdigest()[:12]}"
-        self._client = paho.Client(
-            CallbackAPIVersion.VERSION2, client_id=own, protocol=paho.MQTTv5, manual_ack=True
-        )
-        self._properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-        self._properties.SessionExpiryInterval = _SESSION_SECONDS
-        self._properties.ReceiveMaximum = _WAITING
-        self._properties.MaximumPacketSize = LARGEST_MESSAGE + 10_000
+        path, own = self._own
+        if not path.is_file():
+            atomic_write_text(path, own + "\n")
+        client = paho.Client(
+            CallbackAPIVersion.VERSION2, client_id=path.read_text(encoding="utf-8").strip(),
+            protocol=paho.MQTTv5, manual_ack=True,
+        )  # fmt: skip
+        properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        properties.SessionExpiryInterval = _SESSION_SECONDS
+        properties.ReceiveMaximum = _WAITING
+        properties.MaximumPacketSize = LARGEST_MESSAGE + 10_000
+        broker = self._broker
         if broker.user is not None:
-            self._client.username_pw_set(broker.user, os.environ.get(PASSWORD_VARIABLE))
+            client.username_pw_set(broker.user, os.environ.get(PASSWORD_VARIABLE))
         if broker.tls:
-            try:
-                self._client.tls_set(ca_certs=None if broker.authority is None else str(broker.authority))
-            except OSError as error:
-                raise MissionInputError(f"{broker.authority} holds no certificate: {error}.") from None
-        self._client.max_queued_messages_set(_DECISIONS_WAITING)
-        self._client.on_message = self._on_message
-        self._client.on_connect = self._on_connect
-        self._client.on_subscribe = self._on_subscribe
-        self._client.on_publish = self._on_publish
+            client.tls_set(ca_certs=None if broker.authority is None else str(broker.authority))
+        client.will_set(self._heartbeat, json.dumps({"state": "lost"}), qos=1, retain=True)
+        client.on_message = lambda _client, _data, message: self.came.append(message)
+        client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
+        client.on_subscribe, client.on_publish = self._on_subscribe, self._on_publish
+        client.connect(broker.host, broker.port, 30, clean_start=self._clean, properties=properties)
+        self._client = client
 
-    def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
-        self._came.append(message)
+    def _on_connect(self, client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:
+        from paho.mqtt.subscribeoptions import SubscribeOptions
 
-    def _on_publish(self, _client: Any, _data: Any, number: int, _reason: Any, _properties: Any) -> None:
-        self._untold.discard(number)
-
-    def _on_connect(self, client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
-            self._refusal = str(reason)
+            self._failure = (
+                f"the {self._where} refuses the twin: {reason}; give a user in the address and the password "
+                f"in {PASSWORD_VARIABLE}"
+            )
             return
-        client.subscribe(self._broker.topic, qos=1)
+        self._connected = True
+        if self._clean:
+            return
+        if self._kept and not flags.session_present:
+            self.note(f"The {self._where} has forgotten this watch: what came meanwhile is lost.")
+        # What is retained was published before the watch, nobody knows when.
+        options = SubscribeOptions(qos=1, retainHandling=SubscribeOptions.RETAIN_DO_NOT_SEND)
+        client.subscribe(self._broker.topic, options=options)
 
-    def _on_subscribe(self, _client: Any, _data: Any, _number: int, _reasons: Any, _properties: Any) -> None:
-        self._note(f"Connected to {self._broker.host}:{self._broker.port}.")
+    def _on_subscribe(self, _client: Any, _data: Any, _mid: Any, reasons: Any, _properties: Any) -> None:
+        if reasons[0].is_failure:
+            self._failure = (
+                f"the {self._where} does not let the twin read {self._broker.topic}: {reasons[0]}; grant its "
+                "user that right"
+            )
+            return
+        self._begun = self._kept = True
+        self._told, self._pause, self._beat = "", _RETRY_SECONDS[0], 0.0
+        for outbox in self.behind:
+            outbox.not_before = 0.0
+        self.note(f"Connected to {self._broker.host}:{self._broker.port}.")
 
-    def _connect(self, *, first: bool) -> None:
-        """Connect, and again until it works; the first time a broker that refuses the user ends the watch."""
-        wait, longest = _RETRY_SECONDS
-        told = False
-        while True:
-            try:
-                self._client.connect(
-                    self._broker.host, self._broker.port, keepalive=30, clean_start=False,
-                    properties=self._properties,
-                )  # fmt: skip
+    def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        self._failure = self._failure or f"the {self._where} is away ({reason})"
+
+    def _on_publish(self, _client: Any, _data: Any, mid: int, reason: Any, _properties: Any) -> None:
+        if (outbox := self._flying.pop(mid, None)) is not None:
+            outbox.answered(mid, str(reason) if reason.is_failure else None)
+
+    def _lost(self) -> None:
+        """Let go of a connection, to try again later; the first time it ends the watch."""
+        failure, self._failure, self._client = self._failure, "", None
+        self._connected = False
+        if not self._begun:
+            raise MissionInputError(f"{failure}.")
+        if failure != self._told:
+            self.note(f"Waiting: {failure}.")
+        self._told = failure
+        self._retry = time.monotonic() + self._pause
+        self._pause = min(2.0 * self._pause, _RETRY_SECONDS[1])
+        self.came.clear()  # not acknowledged, so the broker sends them again
+        self._last = None
+        for outbox in {*self._flying.values()}:
+            outbox.go_back()
+        self._flying.clear()
+
+    def _exchange(self, wait: float) -> None:
+        """Exchange packets, at most so many seconds where nothing comes; or try to reach the broker again."""
+        if self._client is None:
+            pause = self._retry - time.monotonic()
+            if pause > 0.0:
+                time.sleep(min(pause, wait))
                 return
+            try:
+                self._connect()
             except OSError as error:
-                if first:
-                    raise MissionInputError(
-                        f"no broker answers at {self._broker.host}:{self._broker.port}: {error}."
-                    ) from None
-                if not told:
-                    self._note(f"The broker at {self._broker.host} is away ({error}); waiting for it.")
-                told = True
-                time.sleep(wait)
-                wait = min(2.0 * wait, longest)
+                self._failure = f"no broker answers at {self._broker.host}:{self._broker.port} ({error})"
+                self._lost()
+                return
+        count, failed = len(self.came), self._client.loop(wait)
+        while not failed and len(self.came) > count:  # all that is here already
+            count, failed = len(self.came), self._client.loop(0.0)
+        if failed or self._failure or self._client.socket() is None:
+            self._failure = self._failure or f"the {self._where} is away ({failed.name})"
+            self._lost()
+            return
+        if self._clean and self._connected:
+            # The old session has ended. One that begins so is forgotten by brokers that start again.
+            self._client.disconnect()
+            self._client, self._clean, self._connected, self._failure = None, False, False, ""
+            return
+        for outbox in [*self.behind] if self.room else ():
+            outbox.publish()
+        if self._connected and time.monotonic() >= self._beat:
+            self._beat = time.monotonic() + HEARTBEAT_SECONDS
+            self._client.publish(self._heartbeat, json.dumps(self._pulse()), retain=True)
 
     def messages(self, wait: float) -> Iterator[Any | None]:
         """Return what comes, without end, as paho-mqtt has it; None when nothing came for so many seconds.
 
-        A message is acknowledged when the next one is asked for.
+        A message is acknowledged when the next one is asked for, or before by `acknowledge`.
         """
-        self._connect(first=True)
         while True:
-            while self._came:
-                message = self._came.popleft()
-                yield message
-                self._client.ack(message.mid, message.qos)
-            failed = self._client.loop(wait)
-            if self._refusal is not None:
-                raise MissionInputError(
-                    f"the broker at {self._broker.host}:{self._broker.port} refuses the twin: "
-                    f"{self._refusal}; give a user in the address and the password in {PASSWORD_VARIABLE}."
-                )
-            if failed:
-                self._came.clear()  # not acknowledged, so the broker sends them again
-                self._connect(first=False)
-            elif not self._came:
+            while self.came:
+                self._last = self.came.popleft()
+                yield self._last
+                self.acknowledge()
+            end = time.monotonic() + wait
+            self._exchange(wait)
+            while not self.came and time.monotonic() < end:
+                self._exchange(wait)
+            if not self.came:
                 yield None
 
-    def publish(self, topic: str, decision: Mapping[str, Any]) -> None:
-        """Publish a decision about the asset of a topic."""
-        told = self._client.publish(f"{topic}/decision", json.dumps(decision), qos=1)
-        if len(self._untold) < _DECISIONS_WAITING:
-            self._untold.add(told.mid)
-        self._client.loop_write()
+    def acknowledge(self) -> None:
+        """Let the broker forget the last message: what it said is written down."""
+        if self._last is not None and self._client is not None:
+            self._client.ack(self._last.mid, self._last.qos)
+        self._last = None
+
+    def send(self, topic: str, decision: Mapping[str, Any], outbox: "Outbox") -> int:
+        """Send a decision; return the number by which the outbox is told of the answer."""
+        mid: int = self._client.publish(f"{topic}/decision", json.dumps(decision), qos=1).mid
+        self._flying[mid] = outbox
+        return mid
 
     def close(self) -> None:
         """Say goodbye once the broker has the last decisions; it keeps the session."""
         end = time.monotonic() + _GOODBYE_SECONDS
-        while self._untold and time.monotonic() < end and not self._client.loop(0.1):
-            pass
-        self._client.disconnect()
+        while self._client is not None and (self.behind or self._flying) and time.monotonic() < end:
+            self._exchange(0.1)
+        if self.behind or self._flying:
+            self.note("The broker has not taken all decisions: the rest is published when the watch goes on.")
+        if self._client is not None:
+            self._client.publish(self._heartbeat, json.dumps(self._pulse() | {"state": "ended"}), retain=True)
+            self._client.disconnect()
+
+
+class Outbox:
+    """Brings the decisions of an asset to the broker: those in its journal that it has not acknowledged.
+
+    How far the broker has them is on the disk, `published`: in bytes of the journal. After a kill they are
+    published again from there; each one at least once.
+
+    Parameters
+    ----------
+    session : Session
+    topic : str
+        Of the observations of the asset.
+    watch : Watch
+        Of the asset.
+    """
+
+    def __init__(self, session: Session, topic: str, watch: Watch) -> None:
+        self._session, self._topic, self._watch = session, topic, watch
+        self._path, self._journal = watch.folder / PUBLISHED_NAME, watch.folder / JOURNAL_NAME
+        self._before = self._journal.stat().st_size  # decisions before may have been published
+        if not self._path.is_file():
+            atomic_write_text(self._path, f"{self._before:020d}\n")
+        self._done = self._read = int(self._path.read_text())
+        self._waiting: dict[int, int] = {}
+        self.not_before = 0.0
+        session.behind[self] = None
+
+    def _write(self, done: int) -> None:
+        try:
+            with self._path.open("r+b") as file:
+                file.write(b"%020d\n" % done)  # in place: whole, or as it was
+        except OSError as error:
+            raise write_error(error, self._path) from error
+        self._done = done
+
+    def tell(self, _decision: Mapping[str, Any]) -> None:
+        """Publish what was written down."""
+        if self._watch.keep.intake.settled:
+            self._session.acknowledge()
+        self._session.behind[self] = None
+        self.publish()
+
+    def publish(self) -> None:
+        """Publish what is in the journal, as far as the broker takes it."""
+        if time.monotonic() < self.not_before:
+            return
+        scenario, model = self._watch.scenario, self._watch.models[-1].knowledge.model
+        for line, end in records_behind(self._journal, self._read):
+            if not self._session.room:
+                return
+            decision = journalled_decision(line, scenario, model)
+            if decision:
+                decision |= {"told_again": True} if end <= self._before else {}
+                self._waiting[self._session.send(self._topic, decision, self)] = self._read
+            self._read = end
+        self._session.behind.pop(self, None)
+
+    def answered(self, mid: int, refusal: str | None) -> None:
+        """Take in that the broker has a decision, or refuses it."""
+        if refusal is not None and mid in self._waiting:
+            if not self.not_before:
+                self._session.note(f"The broker does not take {self._topic}/decision: {refusal}.")
+            self.not_before = time.monotonic() + _RETRY_SECONDS[1]
+            self.go_back()
+        if self._waiting.pop(mid, None) is not None:
+            self._write(next(iter(self._waiting.values()), self._read))
+
+    def go_back(self) -> None:
+        """Publish again what the broker has not acknowledged."""
+        self._before = max(self._before, self._read)
+        self._read = self._done
+        self._waiting.clear()
+        self._session.behind[self] = None
 
 
 class MqttFeed(LiveFeed):
-    """The observations of the topic of one asset; see `Session` for the parameters, and for errors."""
+    """The observations of the topic of one asset, and its decisions; see `Session` for the errors.
 
-    def __init__(self, broker: Broker, scenario: Scenario, folder: Path, note: Callable[[str], None]) -> None:
-        self._topic = broker.topic
-        self._reader = MessageReader(scenario)
-        self._session = Session(broker, scenario.mission.name, folder, note)
+    Parameters
+    ----------
+    broker : Broker
+    watch : Watch
+        Of the asset; one that was begun before goes on where the broker left off.
+    note : callable
+        Told when the broker is lost and found.
+    scenario : Scenario, optional
+        By which messages are read; that of the watch if left out.
+    """
+
+    def __init__(
+        self, broker: Broker, watch: Watch, note: Callable[[str], None], scenario: Scenario | None = None
+    ) -> None:
+        self._topic, self._watch = broker.topic, watch
+        self._reader = MessageReader(scenario or watch.scenario)
+        clean = not (watch.folder / JOURNAL_NAME).exists()
+        name = watch.scenario.mission.name
+        self._session = Session(broker, name, watch.folder, note, self._pulse, clean=clean)
+        self._outbox: Outbox | None = None
         self.close = self._session.close
 
+    def _pulse(self) -> dict[str, Any]:
+        keep = self._watch.keep
+        counts = keep.intake.counts
+        return {
+            "state": "quiet" if keep.quiet else "watching", "turn": keep.twin.turns - 1,
+            "seconds_since_turn": round(keep.silence, 1), "lag": len(self._session.came),
+            "received": counts.received, "refused": counts.rejected,
+        }  # fmt: skip
+
     def messages(self, place: Place | None) -> Iterator[Fed]:
-        """Return what comes, without end; a message is acknowledged when the next one is asked for."""
+        """Return what comes, without end; a message is acknowledged when it is written down."""
+        self._outbox = Outbox(self._session, self._topic, self._watch)
         for message in self._session.messages(0.1):
-            if message is not None:
-                yield placed(self._reader, message.payload)
+            yield (None, "") if message is None else placed(self._reader, message.payload)
 
     def decide(self, decision: Mapping[str, Any]) -> None:
-        """Publish a decision."""
-        self._session.publish(self._topic, decision)
+        """Publish what was decided since the watch was taken up; what was before follows by itself."""
+        if self._outbox is not None:
+            self._outbox.tell(decision)
 
 
 def placed(reader: MessageReader, payload: bytes) -> Fed:

@@ -25,6 +25,7 @@ from twin_master.run_folder import (
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.folder import Watch
+from twin_master.watch.mqtt import CLIENT_SUFFIX
 
 
 def begin_watch(
@@ -63,7 +64,9 @@ def begin_resolved(
         "scenario_file": dict(file),
         "provenance": collect_provenance(resolved.mission.seed).as_dict(),
     }
-    lock = create_run_folder(folder, config, dict(source.files()), replace=replace_run)
+    # A watch that takes the place of another ends its session at the broker: it comes under the same name.
+    files = dict(source.files()) | {path.name: path.read_bytes() for path in folder.glob(f"*{CLIENT_SUFFIX}")}
+    lock = create_run_folder(folder, config, files, replace=replace_run)
     try:
         located = located_scenario(portable_scenario(resolved), folder)
         return Watch(folder, config, located, progress, like), lock

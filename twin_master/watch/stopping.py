@@ -3,7 +3,7 @@
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -17,25 +17,39 @@ POLL_SECONDS = 0.05
 
 
 class Stopping:
-    """A source that ends when SIGINT or SIGTERM ask for it: between two turns, never within one."""
+    """A source that ends when SIGINT or SIGTERM ask for it: between two turns, never within one.
 
-    def __init__(self, intake: Intake, turns: int | None) -> None:
-        self._intake, self._turns = intake, turns
+    Parameters
+    ----------
+    intake : Intake
+        Of the readings.
+    turns : int or None
+        In all, after which it ends.
+    look : callable
+        Called now and then while nothing comes.
+    """
+
+    def __init__(self, intake: Intake, turns: int | None, look: Callable[[], None]) -> None:
+        self._intake, self._turns, self._look = intake, turns, look
         self.asked = self._waiting = False
 
     def read(self, twin: Twin) -> Reading | None:
         """Return the next reading; None once the watch is to end."""
         if self.asked or (self._turns is not None and twin.turns >= self._turns):
             return None
-        self._waiting = True
         try:
-            while (reading := self._intake.read(twin)) is None and not self._intake.ended:
-                time.sleep(POLL_SECONDS)
-            return reading
+            while not self.asked:
+                self._waiting, begin = True, time.monotonic()
+                if (reading := self._intake.read(twin)) is not None or self._intake.ended:
+                    return reading
+                time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
+                self._waiting = False
+                self._look()
         except _Asked:
-            return None
+            pass
         finally:
             self._waiting = False
+        return None
 
     def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Return what is assimilated in the place of an observation that no state allows."""

@@ -99,7 +99,7 @@ class Outcome:
         twin = self.model.knowledge.twin(lag=self.trial.scenario.watch.lag)
         twin.restore_state(self.state)
         alarms = [*self.alarms]
-        for record in records_behind(self.trial.journal, self.trial.end):
+        for record, _ in records_behind(self.trial.journal, self.trial.end):
             if "observed" not in record:
                 continue
             at, observed = int(record["observation_turn"]), array_of(record["observed"])

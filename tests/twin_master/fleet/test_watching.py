@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
-from tests.twin_master.watch.watches import PASSWORD, Mosquitto, write_csv
+from tests.twin_master.watch.watches import PASSWORD, Mosquitto, wait_until, write_csv
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine
@@ -165,7 +165,7 @@ def test_an_asset_is_lost_alone(fleet_file: Path, alone: list[bytes], tmp_path: 
 def test_an_asset_that_was_lost_is_taken_up_again(
     fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One whose file was wrong, and one that met an error of ours; a log that is gone for a while is awaited."""
+    """One whose file was wrong, and one that met an error of ours; a log that is gone is awaited."""
     for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
         monkeypatch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
     logs = [tmp_path / "logs" / f"wing-{number}.csv" for number in range(3)]
@@ -329,6 +329,54 @@ def test_a_topic_that_jumps_ahead_and_is_left_alone(
     assert told == [*(("north/wing-0", turn, lost[turn]) for turn in range(last + 1)), ("north/last", 0, 24)]
     inboxes = fleet._sources[0]._inboxes  # type: ignore[union-attr]
     assert [len(inbox.came) for inbox in inboxes.values() if inbox] == [0, 0]  # nineteen came too late
+
+
+@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
+def test_an_asset_that_falls_silent_while_another_is_heard(
+    fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one that was watched before; and what was decided of it and never published is."""
+    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
+    monkeypatch.setattr("twin_master.fleet.watching.STATE_SECONDS", 0.0)
+    monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.0)
+    with (tmp_path / "wing.toml").open("a") as file:
+        file.write("\n[watch]\nquiet_after_seconds = 0.5\n")
+    broker, heard = Mosquitto(tmp_path), list[dict[str, Any]]()
+    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+    client, notes, told = broker.client("client", heard), list[str](), list[tuple[str, int, list[str]]]()
+    client.subscribe([("wings/+/decision", 1), ("wings/fleet/heartbeat", 1)])
+    turns = iter(range(1000))
+
+    def send() -> None:
+        record = {"turn": next(turns), "control": "2g", "strain": [1e-3] * 24}
+        for name in ("one", "two") if record["turn"] == 0 else ("one",):
+            client.publish(f"wings/{name}", json.dumps(record), qos=1)
+
+    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+        told.append((asset.name, decision["turn"], [notice["kind"] for notice in decision["notices"]]))
+        fleet.asked = told[-1] == ("north/two", 0, ["quiet"])
+
+    fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
+    fleet.run(lambda: send() if notes else None)
+    assert fleet.asked
+    published = tmp_path / "out" / "north" / "two" / "published"
+    published.write_text("0")  # as if a kill had come before the broker had it
+    client.publish("wings/one", "no observation", qos=1).wait_for_publish(20)
+    again = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", lambda *_: None, notes.append)
+
+    def end() -> None:
+        again.asked = [one["notices"] for one in heard if one.get("turn") == 0][-1:] != [[]]
+
+    again.run(end)
+    wait_until(lambda: [one["state"] for one in heard if "state" in one][-1] == "ended")
+    client.disconnect()
+    broker.stop()
+    assert [said for said in told if said[0] == "north/two"] == [
+        ("north/two", 0, []), ("north/two", 0, ["quiet"]),
+    ]  # fmt: skip
+    assert all(kinds == [] for name, _, kinds in told if name == "north/one")
+    assert [one["state"] for one in heard if "state" in one][-1] == "ended"
+    assert max(one["quiet"] for one in heard if "quiet" in one) == 1
 
 
 def test_the_command(fleet_file: Path, tmp_path: Path) -> None:

@@ -9,9 +9,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,16 +23,18 @@ import uav_twin
 from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
-from tests.twin_master.watch.watches import begun, write_csv
+from tests.twin_master.watch.watches import begun, lines, soon_quiet, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of, read_records, whole_record
 from twin_master.mission.loop import Flight
 from twin_master.network.estimator import ExactFilter
 from twin_master.report.reading import open_run as stored_run
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.watch.decision import last_decision
-from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed
+from twin_master.viewer.flight import Flight as SeenFlight
+from twin_master.watch.decision import journalled_decision, last_decision
+from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, file_feed
 from twin_master.watch.folder import Patched, Watch
+from twin_master.watch.intake import Feed
 from twin_master.watch.message import Message
 from twin_master.watch.opening import resume_watch
 from twin_master.watch.replay import BelievedModel
@@ -301,14 +305,69 @@ def test_the_last_decision_is_read_from_the_journal(base: Watch, whole: Path, tm
         assert last_decision(journal, base.scenario, model) == decisions[-1] | again
     # What came late is told with the control of the last turn, not with that of its own.
     late = json.loads(lines[-1][65:]) | {"observation_turn": 40, "control_index": 0, "observed": [None] * 24}
-    before = json.loads(lines[-1][65:]) | {"control_index": 1}
-    journal.write_bytes(b"".join([*lines[:-1], line_of(before), line_of(late)]))
+    journal.write_bytes(b"".join([*lines, line_of(late | {"control_in_force": 1})]))
     told = last_decision(journal, base.scenario, model)
     changed = {"control": "3g", "lost_sensors": 24, "revised_by_turn": 40}
     assert told == decisions[-1] | changed | again
     journal.write_bytes(lines[0])
     assert last_decision(journal, base.scenario, model) is None
     assert last_decision(tmp_path / "none", base.scenario, model) is None
+
+
+def test_a_line_of_the_journal_says_what_was_told(base: Watch, mission: Flight, tmp_path: Path) -> None:
+    header, *rows = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index).read_text().split()
+    late = [*rows[:20], *rows[21:25], rows[20], rows[25].replace(",", ",,", 1), *rows[26:30], rows[25]]
+    (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
+    watch, told = watchful(base, tmp_path / "watch"), list[dict[str, object]]()
+    feed = CsvFeed(tmp_path / "late.csv", watch.scenario)
+    watch.run(feed, lambda decision: told.append(dict(decision)))
+    model = watch.models[0].knowledge.model
+    assert [journalled_decision(line, watch.scenario, model) for line in lines(watch)] == told
+    assert [decision["revised_by_turn"] for decision in told if "revised_by_turn" in decision] == [20, 25]
+
+
+@pytest.mark.parametrize("source", ["standard input", "a file that grows"])
+def test_silence_is_told_and_journalled(base: Watch, mission: Flight, tmp_path: Path, source: str) -> None:
+    watch, told = soon_quiet(begun(base, tmp_path / "watch")), list[dict[str, Any]]()
+    path = tmp_path / "m.csv"
+    if source == "standard input":
+        read, write = os.pipe()
+        stream = os.fdopen(read, "rb")
+        feed: Feed = JsonLinesFeed(watch.scenario, stream)
+        texts = [json.dumps({"turn": turn, "strain_1": 1e-3}) + "\n" for turn in range(3)]
+    else:
+        header, *rows = write_csv(path, mission.observed[:3], mission.control_index).read_text().split()
+        path.write_text(header + "\n")
+        stream = path.open("rb")
+        write = os.open(path, os.O_WRONLY | os.O_APPEND)
+        feed, texts = CsvFeed(path, watch.scenario, follow=True), [row + "\n" for row in rows]
+    watching = threading.Thread(target=watch.run, args=(feed, told.append), kwargs={"turns": 3})
+    watching.start()
+
+    def kinds(count: int) -> list[tuple[int, list[str]]]:
+        wait_until(lambda: len(told) >= count)
+        return [(said["turn"], [notice["kind"] for notice in said["notices"]]) for said in told]
+
+    assert kinds(1) == [(-1, ["quiet"])]  # nobody has decided anything yet
+    assert "control" not in told[0]
+    os.write(write, texts[0].encode())
+    assert kinds(3)[1:] == [(0, ["heard"]), (0, ["quiet"])]
+    assert told[2] == told[1] | {"notices": told[2]["notices"], "told_again": True}
+    os.write(write, (texts[1] + texts[2][:9]).encode())  # half a message is none
+    assert kinds(5)[3:] == [(1, ["heard"]), (1, ["quiet"])]
+    os.write(write, texts[2][9:].encode())
+    watching.join(60)
+    os.close(write)
+    stream.close()
+    assert kinds(6)[5:] == [(2, ["heard"])]
+    model = watch.models[0].knowledge.model
+    assert [journalled_decision(line, watch.scenario, model) for line in lines(watch)] == told
+    assert watch.run(CsvFeed(write_csv(path, mission.observed, mission.control_index), watch.scenario), str)
+    flight = SeenFlight(watch.folder)  # as the page shows it
+    while flight.update():
+        pass
+    seen = [[notice.kind for notice in turn.notices] for turn in flight.seen(0, 4)]
+    assert seen == [["heard", "quiet"], ["heard", "quiet"], ["heard"], []]
 
 
 def test_a_reader_that_leaves_ends_the_watch_in_order(

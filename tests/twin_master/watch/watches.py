@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+import json
 import shutil
 import socket
 import subprocess
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,6 +50,19 @@ def watchful(base: Watch, folder: Path) -> Watch:
     return watch
 
 
+def soon_quiet(watch: Watch) -> Watch:
+    """Return a watch that notices a silence at once."""
+    section = watch.scenario.watch.model_copy(update={"quiet_after_seconds": 0.2})
+    watch.scenario = watch.scenario.model_copy(update={"watch": section})
+    return watch
+
+
+def wait_until(found: Callable[[], object]) -> None:
+    limit = time.monotonic() + 60.0
+    while not found() and time.monotonic() < limit:
+        time.sleep(0.02)
+
+
 def lines(watch: Watch) -> list[dict[str, Any]]:
     return [record for record, _ in read_records(watch.folder / JOURNAL_NAME)]
 
@@ -58,18 +73,14 @@ PASSWORD = "a password"
 class Mosquitto:
     """A broker on the loopback that wants a user, or TLS, and keeps its sessions when it stops."""
 
-    def __init__(self, folder: Path, *, tls: bool = False) -> None:
+    def __init__(self, folder: Path, *further: str, tls: bool = False) -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
         self.folder, self.tls = folder, tls
         self.authority = folder / "certificate.pem"
-        subprocess.run(
-            ["mosquitto_passwd", "-b", "-c", str(folder / "users"), "wing", PASSWORD],
-            check=True,
-            capture_output=True,
-        )
-        lines = [
+        self.let_in(PASSWORD)
+        self.lines = [
             f"listener {self.port} 127.0.0.1", "allow_anonymous false", f"password_file {folder / 'users'}",
             "persistence true", f"persistence_location {folder}/", "max_queued_messages 10000", "user root",
         ]  # fmt: skip
@@ -81,13 +92,20 @@ class Mosquitto:
                  "-keyout", str(folder / "key.pem"), "-out", str(self.authority)],
                 check=True, capture_output=True,
             )  # fmt: skip
-            lines += [f"certfile {self.authority}", f"keyfile {folder / 'key.pem'}"]
-        (folder / "mosquitto.conf").write_text("\n".join(lines) + "\n")
+            self.lines += [f"certfile {self.authority}", f"keyfile {folder / 'key.pem'}"]
+        self.further = [*further]
         self.start()
 
+    def let_in(self, password: str) -> None:
+        """Let in who knows a password, from the next start on."""
+        users = ["mosquitto_passwd", "-b", "-c", str(self.folder / "users"), "wing", password]
+        subprocess.run(users, check=True, capture_output=True)
+
     def start(self) -> None:
+        (self.folder / "mosquitto.conf").write_text("\n".join([*self.lines, *self.further, ""]))
         self.process = subprocess.Popen(
-            ["mosquitto", "-c", str(self.folder / "mosquitto.conf")], stderr=subprocess.DEVNULL
+            ["mosquitto", "-c", str(self.folder / "mosquitto.conf")],
+            stderr=subprocess.DEVNULL,
         )
         for _ in range(400):
             try:
@@ -100,9 +118,12 @@ class Mosquitto:
         self.process.terminate()
         self.process.wait(20)
 
-    def client(self, name: str) -> Any:
+    def client(self, name: str, heard: list[Any] | None = None) -> Any:
+        """Return a client whose session lasts, and that hears what its topics say."""
         client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id=name, clean_session=False)
         client.username_pw_set("wing", PASSWORD)
+        if heard is not None:
+            client.on_message = lambda _client, _data, told: heard.append(json.loads(told.payload))
         if self.tls:
             client.tls_set(ca_certs=str(self.authority))
         client.connect("localhost" if self.tls else "127.0.0.1", self.port)
