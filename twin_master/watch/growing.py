@@ -5,7 +5,7 @@ import os
 import re
 from collections import deque
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from glob import escape
@@ -39,17 +39,19 @@ def rotated(path: Path) -> list[Path]:
 
 def found(path: Path, place: Place | None, *, follow: bool) -> Path | None:
     """Return the file that a place is in: that of the name, or where it is followed a rotated one."""
-    files = [path, *reversed(rotated(path))] if follow else [path]
-    return next((file for file in files if _holds(file, place, follow)), None)
+    for file in [path, *reversed(rotated(path))] if follow else [path]:
+        with suppress(FileNotFoundError), file.open("rb", buffering=0) as opened:
+            if _holds(opened, place, follow):
+                return file
+    return None
 
 
-def _holds(file: Path, place: Place | None, follow: bool) -> bool:
-    if place is None or not file.is_file():
+def _holds(opened: io.FileIO, place: Place | None, follow: bool) -> bool:
+    if place is None or (follow and os.fstat(opened.fileno()).st_size < place["read"]):
         return False
-    with file.open("rb") as opened:
-        beginning = _beginning(opened.read(min(place["read"], _LONGEST)))
-        cut = follow and file.stat().st_size < place["read"]
-        return not cut and _hash(beginning) == place["beginning"]
+    opened.seek(0)
+    beginning = _beginning(opened.read(min(place["read"], _LONGEST)))
+    return _hash(beginning) == str(place["beginning"])
 
 
 def _beginning(content: bytes) -> bytes:
@@ -96,12 +98,13 @@ class GrowingFile(io.RawIOBase):
         self._length, self.cut = 0, 0
         self._whole, self._torn, self._copied = True, False, False
         self._pieces: deque[_Piece] = deque()
-        self._open(found(path, place, follow=follow) or path, place)
+        self._open((found(path, place, follow=follow) or path).open("rb", buffering=0), place)
 
-    def _open(self, file: Path, place: Place | None) -> None:
+    def _open(self, file: io.FileIO, place: Place | None) -> None:
         """Go on with a file: behind a place, if it is in there."""
         position = place["read"] if place is not None and _holds(file, place, self._follow) else 0
-        self._file = file.open("rb", buffering=0)
+        self._file = file
+        self._file.seek(0)
         beginning = self._file.read(min(position, _LONGEST))
         self._file.seek(position)
         self._pieces.append(_Piece(self._length, position - self._torn, _beginning(beginning)))
@@ -125,12 +128,14 @@ class GrowingFile(io.RawIOBase):
             place = self._place(self._pieces[-1], self._length)
             copy = found(self._path, place, follow=True)
             self.cut = 0 if copy else place["read"]
-            return self._go_on(copy or self._path, buffer, copied=copy is not None)
+            file = (copy or self._path).open("rb", buffering=0)
+            return self._go_on(file, buffer, copied=copy is not None)
         following = self._following() if self._follow and not count else None
         if following is not None:
             count = self._file.readinto(buffer) or 0  # the last that its writer has left
             if not count:
                 return self._go_on(following, buffer)
+            following.close()
         if count:
             self._whole = buffer[count - 1] == ord("\n")
             self._length += count
@@ -147,7 +152,7 @@ class GrowingFile(io.RawIOBase):
         self._file.seek(at)
         return not same or os.fstat(self._file.fileno()).st_size < at
 
-    def _following(self) -> Path | None:
+    def _following(self) -> io.FileIO | None:
         """Return the file to go on with, once it holds something; None where this one still has its name."""
         with suppress(FileNotFoundError):  # in the middle of being renamed
             here = os.fstat(self._file.fileno())
@@ -157,13 +162,19 @@ class GrowingFile(io.RawIOBase):
             own = [number for number, inode in enumerate(listed.values()) if inode == here.st_ino]
             behind = [*listed][own[0] + 1 :] if own else [self._path]
             coming = next((file for file in behind if file.stat().st_size), None)
-            return coming if listed == again == self._listed() else None
+            if coming is None:
+                return None
+            with ExitStack() as closing:
+                opened = closing.enter_context(coming.open("rb", buffering=0))
+                if listed == again == self._listed():  # it still had that name when it was opened
+                    closing.pop_all()
+                    return opened
         return None
 
     def _listed(self) -> dict[Path, int]:
         return {file: file.stat().st_ino for file in (*rotated(self._path), self._path)}
 
-    def _go_on(self, file: Path, buffer: Any, *, copied: bool = False) -> int:
+    def _go_on(self, file: io.FileIO, buffer: Any, *, copied: bool = False) -> int:
         """Read on in another file; a line goes on only into a copy, and from there into what was cut."""
         self._torn = not (self._whole or self._copied or copied)
         self._file.close()
