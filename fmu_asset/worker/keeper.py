@@ -85,18 +85,15 @@ def keep(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -
 
 
 def _work(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -> NoReturn:
-    """Be the worker; it is confined before a library has made a thread, which would not be."""
-    # Here, so that the keeper has nothing of it.
+    """Be the worker."""
+    # Here, so that the keeper has nothing of it; before the sandbox, since some libraries start programs.
     try:
-        confined = False
-        if grants:
-            import json
+        import json
 
-            from .sandbox import Grants, confine
-
-            confined = confine(Grants(**json.loads(grants)), scratch, shared)
+        from .sandbox import Grants, confine
         from .server import serve
 
+        confined = grants != "" and confine(Grants(**json.loads(grants)), scratch, shared)
         serve(incoming, outgoing, confined=confined)
     except BaseException:  # noqa: BLE001 - the twin reads the last words in worker.log
         import traceback

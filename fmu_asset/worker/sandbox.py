@@ -86,6 +86,8 @@ def confine(grants: Grants, own: str, shared: str) -> bool:
     version = landlock_version()
     if not version:
         return False
+    if len(os.listdir("/proc/self/task")) > 1:  # noqa: PTH208
+        raise OSError("the sandbox: another thread runs in this process already, and would not be confined")
     # What a version does not know would be refused: it is left out.
     handled = _ALL >> (3, 2, 1, 1)[version - 1] if version < 5 else _ALL
     attributes = struct.pack("QQQ", handled, _TCP * (version > 3), _SOCKETS_AND_SIGNALS * (version > 5))
