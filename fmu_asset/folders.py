@@ -45,6 +45,16 @@ def plain_folder() -> Path:
     )
 
 
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Give a folder as `plain_folder` makes it for a while."""
+    folder = plain_folder()
+    try:
+        yield folder
+    finally:
+        remove_folder(folder)
+
+
 def _remove_leftovers(parent: Path) -> None:
     """Remove folders of ours whose process is gone, once for each parent."""
     if parent in _tidied:

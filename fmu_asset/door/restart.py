@@ -1,9 +1,9 @@
 """Back to the start: by the FMU's own reset where every start shows that it is as good as a new instance.
 
 Some FMUs return OK from their reset and go on from where they were, or keep a clock that shows later only.
-The first step of the first instance is therefore kept. At every later start that step is
-made again, and where the flight itself begins with it, it is compared once more: the first difference turns
-to the next way of starting for good, a new instance in the same process and then a new process.
+The first step of the first instance is therefore kept. At every later start that step is made again, and
+where the flight itself begins with it, it is compared once more: the first difference turns to the next way
+of starting for good, a new instance in the same process and then a new process.
 """
 
 import logging

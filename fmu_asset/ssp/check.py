@@ -1,12 +1,10 @@
 """An SSP file against its own FMUs: joined, and tried for one step."""
 
 import os
-import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fmu_asset.archive.fmu_file import plain_folder
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.experiment import every_output
 from fmu_asset.coupling.schedule import loop_sentence
@@ -14,6 +12,7 @@ from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import Binding, Header, Vector
 from fmu_asset.door.units import between
 from fmu_asset.errors import FmuError, SspError
+from fmu_asset.folders import scratch_folder
 
 from .reader import SspSystem, read_ssp
 
@@ -111,11 +110,11 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
     file = Path(path)
     if not file.is_file():
         raise SspError(f"There is no SSP file {file}.")
-    folder = plain_folder()
     try:
-        wiring = join_ssp(read_ssp(file, folder))
-        plan = wiring.schedule
-        problems = _trial(wiring)
+        with scratch_folder() as folder:
+            wiring = join_ssp(read_ssp(file, folder))
+            plan = wiring.schedule
+            problems = _trial(wiring)
         return SspCheck(
             path=file,
             problems=tuple(problems),
@@ -126,8 +125,6 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
         )
     except FmuError as error:
         return SspCheck(file, (str(error),))
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _trial(wiring: Wiring) -> list[str]:

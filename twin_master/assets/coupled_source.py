@@ -1,6 +1,5 @@
 """Several FMUs as the asset of a mission: joined in the scenario, or read from an SSP file."""
 
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
@@ -157,8 +156,8 @@ class SeveralSource(FmuSource):
         MissionInputError, SspError, CouplingError, FmuError, InvalidDesignError
             Something cannot be read or does not fit.
         """
-        from fmu_asset.archive.fmu_file import plain_folder
         from fmu_asset.door.binding import load_binding
+        from fmu_asset.folders import scratch_folder
 
         read_calibration(self._scenario.calibration)
         self.files()
@@ -167,12 +166,8 @@ class SeveralSource(FmuSource):
         self._observed(binding)
         self._inner_roles(binding)
         self._check_names(binding)
-        folder = plain_folder()
-        try:
-            with self._told_of_means():
-                self._check_system(binding, folder)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+        with scratch_folder() as folder, self._told_of_means():
+            self._check_system(binding, folder)
 
     def _check_system(self, binding: "Binding", folder: Path) -> None:
         raise NotImplementedError

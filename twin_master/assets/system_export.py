@@ -1,14 +1,12 @@
 """A scenario's asset, or a wing design, as an SSP file."""
 
 import re
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from fe.wing.design import load_design
-from fmu_asset.archive.fmu_file import plain_folder, read_fmu
+from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.coupling.layout import Layout
 from fmu_asset.coupling.roles import resolve_roles
 from fmu_asset.coupling.structure import (
@@ -21,6 +19,7 @@ from fmu_asset.coupling.structure import (
 )
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import INPUT_ROLES, Binding, Parameter, load_binding
+from fmu_asset.folders import scratch_folder
 from fmu_asset.packing.wing_packing import pack_wing
 from fmu_asset.ssp.writer import write_ssp
 from reporting.progress import Progress
@@ -67,7 +66,7 @@ def export_scenario(
             "FMUs can be exported."
         )
     source.check()
-    with _scratch() as scratch:
+    with scratch_folder() as scratch:
         source.prepare(scratch, progress)
         binding = source.binding()
         if isinstance(source, SeveralSource):
@@ -84,7 +83,7 @@ def export_design(design: Path | None, out: Path, *, replace_file: bool, progres
     """Write the wing of a design, the shipped one if absent, as an SSP file with one component."""
     wing = load_design(design)
     binding = load_binding(binding_files()["uav_wing"])
-    with _scratch() as scratch:
+    with scratch_folder() as scratch:
         fmu = pack_wing(wing, scratch / "wing.fmu", progress=progress).path
         wiring, names = _with_values(single_system(wing.name, fmu, binding), binding, {}, {})
         return write_ssp(wiring, out, parameter_names=names, replace=replace_file)
@@ -146,12 +145,3 @@ def _with_values(
         if len(ports) == 1
     }
     return Wiring(replace(wiring.structure, components=components)), names
-
-
-@contextmanager
-def _scratch() -> Iterator[Path]:
-    folder = plain_folder()
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
