@@ -4,26 +4,25 @@ meshio reads such files as well, but neither NSET of *NODE, nor GENERATE over se
 and it loses element sets of a deck of several blocks; nor does it name the line of a fault.
 """
 
+import itertools
+import math
+import operator
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
-from .elements import KINDS, ElementKind
+from .coordinates import GLOBAL, System, frame
+from .deck import Deck, fail, real, shown, whole, words_of
+from .elements import KINDS
 from .mesh import FileMesh
 
-IntArray = NDArray[np.int64]
-
-_KINDS = {
-    "C3D4": "tetra", "C3D10": "tetra10", "C3D8": "hexahedron", "C3D20": "hexahedron20", "C3D6": "wedge",
-}  # fmt: skip
+_KINDS = {kind.calculix: kind for kind in KINDS.values()}
 _VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
 """Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
 _FLAT = {"T3D2": 2, "T3D3": 3, "CPS3": 3, "CPS4": 4, "CPS6": 6, "CPS8": 8}
@@ -32,13 +31,27 @@ _DEEPEST_INCLUDE = 5
 
 
 @dataclass
-class _Lines:
+class _Block:
     """A keyword with its parameters, the lines of data below it, and where it stands."""
 
     keyword: str
     parameters: dict[str, str]
     where: str
     data: list[tuple[str, list[str]]] = field(default_factory=list)
+
+    def name(self, key: str) -> str:
+        """Return a parameter that must be there."""
+        if not self.parameters.get(key):
+            fail(self.where, f"*{self.keyword} must say {key}=a name.")
+        return self.parameters[key]
+
+    def rows(self, least: int, defaults: tuple[int, ...], what: str) -> Iterator[tuple[str, list[int]]]:
+        """Yield the lines of data as whole numbers; of `what`, the first `least` must be given."""
+        for where, values in self.data:
+            if not all(values[:least]) or len(values) < least or any(values[len(defaults) :]):
+                fail(where, f"{what} are expected, but {shown(','.join(values))} came.")
+            given = [whole(where, text) if text else n for text, n in zip(values, defaults, strict=False)]
+            yield where, [*given, *defaults[len(given) :]]
 
 
 def read_abaqus(path: Path) -> FileMesh:
@@ -47,42 +60,45 @@ def read_abaqus(path: Path) -> FileMesh:
     Raises
     ------
     MeshError
-        If it cannot be read; the sentence names the line.
+        If it cannot be read, or holds what the mesh would lose; the sentence names the line.
     """
     reader = _Reader(path)
     for block in _blocks(path, _DEEPEST_INCLUDE):
         reader.take(block)
-    return reader.mesh()
+    return reader.deck.mesh()
 
 
-def _fail(where: str, sentence: str) -> NoReturn:
-    raise MeshError(f"{where}: {sentence}")
-
-
-def _blocks(path: Path, depth: int) -> Iterator[_Lines]:
-    block: _Lines | None = None
-    for number, line in enumerate(read_text(path, MeshError, what="mesh file").splitlines(), start=1):
+def _blocks(path: Path, depth: int) -> Iterator[_Block]:
+    block: _Block | None = None
+    head = ""
+    lines = read_text(path, MeshError, what="mesh file", otherwise="latin-1").splitlines()
+    for number, line in enumerate(lines, start=1):
         text = line.strip()
         where = f"{path}, line {number}"
         if not text or text.startswith("**"):
             continue
-        if text.startswith("*"):
+        if not text.startswith("*") and not head:
             if block is not None:
-                yield block
-            keyword, *rest = (part.strip() for part in text[1:].split(","))
-            pairs = (part.partition("=") for part in rest if part)
-            block = _Lines(
-                " ".join(keyword.upper().split()),
-                {key.strip().upper(): value.strip().strip('"') for key, _, value in pairs},
-                where,
-            )
-            if block.keyword == "INCLUDE":
-                if not depth:
-                    _fail(where, "more than five files include one another.")
-                yield from _blocks(path.parent / block.parameters.get("INPUT", ""), depth - 1)
-                block = None
-        elif block is not None:
-            block.data.append((where, [part.strip() for part in text.split(",")]))
+                block.data.append((where, [part.strip() for part in text.split(",")]))
+            continue
+        head += text
+        if text.endswith(","):  # the parameters go on in the next line
+            continue
+        if block is not None:
+            yield block
+        keyword, *rest = (part.strip() for part in head[1:].split(","))
+        pairs = (part.partition("=") for part in rest if part)
+        block = _Block(
+            " ".join(keyword.upper().split()),
+            {" ".join(key.upper().split()): value.strip().strip('"') for key, _, value in pairs},
+            where,
+        )
+        head = ""
+        if block.keyword == "INCLUDE":
+            if not depth:
+                fail(where, "more than five files include one another.")
+            yield from _blocks(path.parent / block.parameters.get("INPUT", ""), depth - 1)
+            block = None
     if block is not None:
         yield block
 
@@ -91,180 +107,172 @@ class _Reader:
     """Takes the blocks of a deck one after the other."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.nodes: dict[int, tuple[float, ...]] = {}
-        self.elements: dict[int, list[int]] = {}
-        self.kind: ElementKind | None = None
-        self.flat: dict[int, list[int]] = {}
-        self.sets: dict[str, dict[str, list[int]]] = {"NSET": {}, "ELSET": {}}
-        self.surfaces: dict[str, list[tuple[str, str, str]]] = {}
+        self.deck = Deck(path, words_of("abaqus"))
+        self.system = GLOBAL
+        self._unsorted: set[str] = set()
+        self._taken: dict[str, Callable[[_Block], None]] = {
+            "NODE": self._nodes,
+            "ELEMENT": self._elements,
+            "NSET": self._set,
+            "ELSET": self._set,
+            "SURFACE": self._surface,
+            "SYSTEM": self._system,
+            "NGEN": self._ngen,
+            "NFILL": self._nfill,
+            "ELGEN": self._elgen,
+        }
 
-    def take(self, block: _Lines) -> None:
+    def take(self, block: _Block) -> None:
         """Take one keyword with its data."""
-        if block.keyword == "NODE":
-            self._nodes(block)
-        elif block.keyword == "ELEMENT":
-            self._elements(block)
-        elif block.keyword in ("NSET", "ELSET"):
-            self._set(block)
-        elif block.keyword == "SURFACE" and block.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT":
-            name = self._name(block, "NAME")
-            self.surfaces[name] = [(where, values[0], (*values, "")[1]) for where, values in block.data]
-        elif block.keyword in ("PART", "INSTANCE"):
-            _fail(
+        if block.keyword.endswith(" SECTION") and block.parameters.get("ELSET"):
+            self.deck.sections.append((block.where, block.parameters["ELSET"]))
+        if block.keyword not in self._taken:
+            self.deck.word(block.keyword, block.where)
+            return
+        for key in block.parameters:
+            if key not in self.deck.words.read[block.keyword]:
+                fail(
+                    block.where,
+                    f"*{block.keyword} with {shown(key)} is not read; write nodes and elements out.",
+                )
+        self._taken[block.keyword](block)
+
+    def _numbers(self, where: str, values: list[str]) -> list[float]:
+        return [real(where, value) if value else 0.0 for value in values]
+
+    def _system(self, block: _Block) -> None:
+        """Set the system of the nodes below: origin, then a point on x, then one in the plane of x and y."""
+        given = [number for where, values in block.data for number in self._numbers(where, values[:6])]
+        if len(given) not in (0, 3, 6, 9):
+            fail(
                 block.where,
-                f"a deck with *{block.keyword} is not read; write it without parts and instances.",
+                f"one, two or three points are expected below *SYSTEM, but {len(given)} numbers came.",
             )
+        points = np.zeros((3, 3))
+        points[: len(given) // 3] = np.reshape(given, (-1, 3))
+        if len(given) < 6:
+            self.system = System(points[0], np.eye(3))
+            return
+        if len(given) == 6:  # z stays, and x is turned about it
+            points[1, 2] = points[0, 2]
+            points[2] = points[0] + np.cross((0.0, 0.0, 1.0), points[1] - points[0])
+        self.system = System(points[0], frame(block.where, points))
 
-    def _name(self, block: _Lines, key: str) -> str:
-        if not block.parameters.get(key):
-            _fail(block.where, f"*{block.keyword} must say {key}=a name.")
-        return block.parameters[key]
-
-    def _whole(self, where: str, text: str) -> int:
-        try:
-            return int(text)
-        except ValueError:
-            _fail(where, f"a whole number is expected, but {text!r} came.")
-
-    def _nodes(self, block: _Lines) -> None:
+    def _nodes(self, block: _Block) -> None:
+        kind = block.parameters.get("SYSTEM", "R").upper()
+        if kind not in ("R", "C"):
+            fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
+        system = replace(self.system, kind=kind)
         added = []
         for where, values in block.data:
-            number = self._whole(where, values[0])
-            try:
-                place = tuple(float(value.upper().replace("D", "E")) for value in values[1:4] if value)
-            except ValueError:
-                _fail(where, f"the coordinates of a node are expected, but {','.join(values[1:])!r} came.")
-            self.nodes[number] = (*place, *(3 - len(place)) * (0.0,))
-            added.append(number)
-        if block.parameters.get("NSET"):
-            self.sets["NSET"].setdefault(block.parameters["NSET"], []).extend(added)
+            place = self._numbers(where, values[1:4])
+            place += (3 - len(place)) * [0.0]
+            added.append(whole(where, values[0]))
+            plain = kind == "R" and self.system is GLOBAL
+            self.deck.add_node(where, added[-1], place if plain else system.place(place))
+        self._add(block, "NSET", added)
 
-    def _elements(self, block: _Lines) -> None:
-        name = self._name(block, "TYPE").upper()
+    def _add(self, block: _Block, key: str, members: Iterable[int]) -> None:
+        """Add members to the set of nodes (NSET) or elements (ELSET) that a parameter names, if it is there."""
+        if block.parameters.get(key):
+            self.deck.members(key, block.parameters[key]).extend(members)
+
+    def _elements(self, block: _Block) -> None:
+        name = block.name("TYPE").upper()
         variant = _VARIANT.fullmatch(name)
-        kind = KINDS.get(_KINDS.get(variant[1] if variant else "", ""))
+        kind = _KINDS.get(variant[1]) if variant else None
         width = kind.node_count if kind else _FLAT.get(name)
         if width is None:
-            readable = ", ".join(_KINDS)
-            _fail(block.where, f"elements of type {name} cannot be read; {readable} and their variants can.")
-        if kind and self.kind and kind is not self.kind:
-            _fail(
+            fail(
                 block.where,
-                f"{kind.name} ({name}) stand beside {self.kind.name}; a mesh of one kind of elements is "
-                "expected.",
+                f"elements of type {shown(name)} cannot be read; {', '.join(_KINDS)} and their variants can.",
             )
-        self.kind = kind or self.kind
-        values = [(where, self._whole(where, text)) for where, row in block.data for text in row if text]
+        values = [(where, whole(where, text)) for where, row in block.data for text in row if text]
         if len(values) % (width + 1):
-            _fail(
+            fail(
                 block.where,
                 f"{len(values)} numbers below *ELEMENT are not a multiple of {width + 1} ({name}).",
             )
         added = []
         for start in range(0, len(values), width + 1):
             where, number = values[start]
-            if number in self.elements or number in self.flat:
-                _fail(where, f"element {number} is there twice.")
             nodes = [node for _, node in values[start + 1 : start + width + 1]]
-            (self.elements if kind else self.flat)[number] = nodes
+            self.deck.add_element(where, number, kind, nodes)
             added.append(number)
-        if block.parameters.get("ELSET"):
-            self.sets["ELSET"].setdefault(block.parameters["ELSET"], []).extend(added)
+        self._add(block, "ELSET", added)
 
-    def _set(self, block: _Lines) -> None:
-        sets = self.sets[block.keyword]
-        members: list[int] = sets.setdefault(self._name(block, block.keyword), [])
+    def _set(self, block: _Block) -> None:
+        key = block.keyword
+        members = self.deck.members(key, block.name(key))
+        if "GENERATE" in block.parameters:
+            for where, (first, last, step) in block.rows(2, (0, 0, 1), "first, last and step"):
+                members.extend(self.deck.span(where, first, last, step))
+            return
+        if "UNSORTED" in block.parameters:
+            self._unsorted.add(block.parameters[key].casefold())
         for where, values in block.data:
-            given = [value for value in values if value]
-            if "GENERATE" in block.parameters:
-                numbers = [self._whole(where, value) for value in given]
-                if len(numbers) not in (2, 3) or min(numbers) < 1:
-                    _fail(
-                        where,
-                        f"first, last and step are expected with GENERATE, but {','.join(given)!r} came.",
-                    )
-                members.extend(range(numbers[0], numbers[1] + 1, *numbers[2:]))
-                continue
-            for value in given:
-                other = self._other(sets, value)
-                members.extend([self._whole(where, value)] if other is None else other)
+            for value in filter(None, values):
+                members.extend(self._named(key, where, value))
+        if key == "NSET" and "ELSET" in block.parameters:
+            elements = self.deck.found("ELSET", block.name("ELSET"))
+            if elements is None:
+                fail(block.where, f"there is no set of elements {shown(block.parameters['ELSET'])} above.")
+            for number in elements:
+                nodes = self.deck.element(block.where, number)[1]
+                self.deck.take_room(block.where, len(nodes))
+                members.extend(nodes)
 
-    @staticmethod
-    def _other(sets: dict[str, list[int]], name: str) -> list[int] | None:
-        return next((list(sets[key]) for key in sets if key.casefold() == name.casefold()), None)
+    def _named(self, key: str, where: str, text: str) -> list[int]:
+        """Return the members of a set, or a number alone."""
+        found = self.deck.found(key, text)
+        if found is None:
+            return [whole(where, text)]
+        self.deck.take_room(where, len(found))
+        return list(found)
 
-    def mesh(self) -> FileMesh:
-        """Return the mesh of all that was taken."""
-        if self.kind is None:
-            _fail(str(self.path), "the deck holds no whole block of solid elements: was it cut off?")
-        numbers = np.array(list(self.nodes), dtype=np.int64)
-        place = {number: index for index, number in enumerate(self.nodes)}
-        cell = {number: index for index, number in enumerate(self.elements)}
-
-        def node(number: int, what: str) -> int:
-            if number not in place:
-                _fail(str(self.path), f"{what} names node {number}, which is not there.")
-            return place[number]
-
-        cells = [
-            [node(other, f"element {number}") for other in nodes] for number, nodes in self.elements.items()
-        ]
-        node_sets = {
-            name: np.unique(np.array([node(n, f"the set {name!r}") for n in members], dtype=np.int64))
-            for name, members in self.sets["NSET"].items()
-        }
-        cell_sets, face_sets = {}, {}
-        for name, members in self.sets["ELSET"].items():
-            lost = [number for number in members if number not in cell and number not in self.flat]
-            if lost:
-                _fail(str(self.path), f"the set {name!r} names element {lost[0]}, which is not there.")
-            flat = [
-                [node(n, f"element {number}") for n in self.flat[number]]
-                for number in members
-                if number in self.flat
+    def _surface(self, block: _Block) -> None:
+        if block.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT":
+            self.deck.surfaces[block.name("NAME")] = [
+                (where, values[0], (*values, "")[1]) for where, values in block.data
             ]
-            solid = np.unique(np.array([cell[n] for n in members if n in cell], dtype=np.int64))
-            if len(solid) or not flat:
-                cell_sets[name] = solid
-            else:
-                face_sets[name] = frozenset(_corners(nodes) for nodes in flat)
-                node_sets.setdefault(name, np.unique(np.concatenate([np.array(n) for n in flat])))
-        table = np.array(cells, dtype=np.int64)
-        for name, rows in self.surfaces.items():
-            face_sets[name] = self._faces(rows, self.kind, table, cell)
-        return FileMesh(
-            kind=self.kind,
-            points=np.array(list(self.nodes.values()), dtype=np.float64),
-            node_numbers=numbers,
-            cells=table,
-            cell_numbers=np.array(list(self.elements), dtype=np.int64),
-            node_sets=node_sets,
-            cell_sets=cell_sets,
-            face_sets=face_sets,
-        )
 
-    def _faces(
-        self, rows: list[tuple[str, str, str]], kind: ElementKind, cells: IntArray, cell: dict[int, int]
-    ) -> frozenset[tuple[int, ...]]:
-        found = set()
-        for where, member, face in rows:
-            label = face.upper()
-            number = int(label[1:]) if label[:1] == "S" and label[1:].isdigit() else 0
-            if not 1 <= number <= len(kind.faces):
-                _fail(
-                    where, f"a face S1 to S{len(kind.faces)} of {kind.name} is expected, but {face!r} came."
-                )
-            members = self._other(self.sets["ELSET"], member)
-            for element in [self._whole(where, member)] if members is None else members:
-                if element not in cell:
-                    _fail(where, f"the surface names element {element}, which is not a solid element.")
-                corners = cells[cell[element], list(kind.faces[number - 1])]
-                found.add(tuple(sorted(corners.tolist())))
-        return frozenset(found)
+    def _ngen(self, block: _Block) -> None:
+        for where, (first, last, step) in block.rows(2, (0, 0, 1), "two nodes and a step"):
+            numbers = self.deck.span(where, first, last, step)
+            self._between(where, numbers)
+            self._add(block, "NSET", numbers)
 
+    def _between(self, where: str, numbers: Sequence[int]) -> None:
+        """Add the nodes on the straight line between the first and the last of some, at equal distances."""
+        start, end = (self.deck.place(where, number) for number in (numbers[0], numbers[-1]))
+        for share, number in zip(np.linspace(0.0, 1.0, len(numbers))[1:-1], numbers[1:-1], strict=True):
+            self.deck.add_node(where, number, start + share * (end - start))
 
-def _corners(nodes: list[int]) -> tuple[int, ...]:
-    """Corners of a surface element, rising; a line has none that bound a face."""
-    count = {6: 3, 8: 4}.get(len(nodes), len(nodes))
-    return tuple(sorted(nodes[:count]))
+    def _nfill(self, block: _Block) -> None:
+        for where, values in block.data:
+            if len(values) < 3:
+                fail(where, "two sets of nodes, the number of intervals and a step of numbers are expected.")
+            ends = [self._named("NSET", where, name) for name in values[:2]]
+            ends = [
+                part if name.casefold() in self._unsorted else sorted(set(part))
+                for part, name in zip(ends, values, strict=False)
+            ]
+            count, step = whole(where, values[2]), whole(where, (*values, "1")[3] or "1")
+            for first, last in zip(*ends, strict=False):
+                between = self.deck.span(where, first, first + (count - 1) * step, step)
+                self._between(where, (*between, last))
+                self._add(block, "NSET", (*between, last))
+
+    def _elgen(self, block: _Block) -> None:
+        what = "an element, then numbers of elements with the steps of nodes and elements, up to three times"
+        for where, (number, *steps) in block.rows(2, (0, 1, 1, 1, 1, 0, 0, 1, 0, 0), what):
+            kind, nodes = self.deck.element(where, number)
+            counts = steps[::3]
+            if min(counts) < 1:
+                fail(where, f"numbers of elements from 1 on are expected, but {counts} came.")
+            self.deck.take_room(where, math.prod(counts) * len(nodes))
+            for place in itertools.product(*map(range, counts)):
+                shift, further = (sum(map(operator.mul, place, steps[n::3])) for n in (1, 2))
+                if any(place):
+                    self.deck.add_element(where, number + further, kind, [node + shift for node in nodes])
+                self._add(block, "ELSET", [number + further])
