@@ -173,7 +173,7 @@ class _Reader:
         self._add(block, "NSET", added)
 
     def _add(self, block: _Block, key: str, members: Iterable[int]) -> None:
-        """Add members to the set of nodes (NSET) or elements (ELSET) that a parameter names, if it is there."""
+        """Add members to the set of nodes (NSET) or elements (ELSET) that a parameter names, if any."""
         if block.parameters.get(key):
             self.deck.members(key, block.parameters[key]).extend(members)
 

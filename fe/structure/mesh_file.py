@@ -269,7 +269,7 @@ def _dimension(kind: str) -> int:
 
 
 def _named(found: Any, label: str, array: NDArray[Any], dimension: int) -> Iterator[tuple[str, IntArray]]:
-    """Yield the sets that an array of integers stands for: each value, by the names that the file has for it."""
+    """Yield the sets that an array of integers stands for: each value, by the names that the file has."""
     if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
         return
     values = np.unique(array)

@@ -40,6 +40,7 @@ _FLAT = {
 _SECTIONS = re.compile("P(BAR|BEAM|BCOMP|COMP|LPLANE|ROD|SHEAR|SHELL|TUBE)[GL]?")
 _SYSTEM = re.compile(r"CORD([12])([RCS])")
 _BEGIN = re.compile(r"\s*BEGIN\b", re.IGNORECASE)
+_MARKER = re.compile(r"\+(?![\d.])")
 _DEEPEST, _DEEPEST_INCLUDE = 50, 5
 
 
@@ -183,9 +184,11 @@ def _fields(where: str, text: str) -> list[str]:
     if "," in text:
         given = [part.strip() for part in text.split(",")]
         count = 4 if "*" in given[0] else 8
+        marker = given.pop() if _MARKER.match(given[-1]) else ""
         if len(given) > count + 2:
             fail(where, f"a line of at most {count + 2} fields is expected, but {len(given)} came.")
-        return given + [""] * (count + 2 - len(given))
+        given += [""] * (count + 2 - len(given))
+        return [*given[:-1], marker or given[-1]]
     count, width = (4, 16) if "*" in text[:8] else (8, 8)
     middle = [text[8 + width * number : 8 + width * (number + 1)].strip() for number in range(count)]
     return [text[:8].strip(), *middle, text[72:].strip()]
