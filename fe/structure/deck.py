@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _MOST_NUMBERS = 5_000_000
-"""Numbers that sets and generated nodes and elements may hold together: a short line can ask for any."""
+"""Numbers that all sets may hold together: a short line can ask for any."""
 _LARGEST_NUMBER = 2**53
 _SHOWN = 60
 _NO_EXPONENT = re.compile(r"(?<=[\d.])(?=[+-])")
@@ -89,16 +89,12 @@ def real(where: str, text: str) -> float:
 def one_kind(where: str, counts: Mapping[str, int]) -> ElementKind:
     """Return the one kind of elements of a mesh, whose elements of each kind of meshio's are counted."""
     readable = ", ".join(kind.name for kind in KINDS.values())
-    came = ", ".join(
-        f"{count} {KINDS[name].name if name in KINDS else name}" for name, count in counts.items()
-    )
+    names = {name: KINDS[name].name if name in KINDS else name for name in counts}
+    came = ", ".join(f"{counts[name]} {title}" for name, title in names.items())
     if not counts or not counts.keys() <= KINDS.keys():
         fail(where, f"a mesh of {readable} is expected, but {came or 'none that is solid'} came.")
     if len(counts) > 1:
-        fail(
-            where,
-            f"a mesh of one kind of elements is expected, but {came} came; mesh it with tetrahedra alone.",
-        )
+        fail(where, f"one kind of elements is expected, but {came} came; mesh it with tetrahedra alone.")
     return KINDS[next(iter(counts))]
 
 
@@ -111,8 +107,8 @@ class Deck:
         self.elements: dict[int, tuple[ElementKind | None, list[int]]] = {}
         """Kind and nodes of each; those without a kind are flat and only name nodes and a face."""
         self.surfaces: dict[str, list[tuple[str, str, str]]] = {}
-        self.sections: list[tuple[str, str]] = []
-        """Where a set of elements got a thickness, an area or a material, and its name."""
+        self.sections: dict[str, str] = {}
+        """Where a set of elements, by its name in lower case, got a thickness, an area or a material."""
         self.words = words
         self._sets: dict[str, dict[str, tuple[str, list[int]]]] = {"NSET": {}, "ELSET": {}}
         self._kinds: dict[str, str] = {}
@@ -126,38 +122,21 @@ class Deck:
         if word not in self.words.harmless:
             self._unknown.setdefault(word, []).append(where)
 
-    def take_room(self, where: str, count: int) -> None:
-        """Refuse short lines that ask for more numbers than any mesh that can be computed has."""
-        self._room -= count
-        if self._room < 0:
-            fail(where, f"sets and generated numbers hold more than {_MOST_NUMBERS:,} members.")
-
-    def span(self, where: str, first: int, last: int, step: int) -> range:
-        """Return the numbers first, first + step, ..., last."""
-        if first < 1 or step < 1:
-            fail(where, f"first, last and step are expected, but '{first},{last},{step}' came.")
-        self.take_room(where, len(range(first, last + 1, step)))
-        return range(first, last + 1, step)
-
     def members(self, key: str, name: str) -> list[int]:
         """Return the members of a set of nodes (NSET) or elements (ELSET), to be added to."""
         return self._sets[key].setdefault(name.casefold(), (name, []))[1]
 
-    def found(self, key: str, name: str) -> list[int] | None:
-        """Return the members of a set that is there, else nothing."""
-        return self._sets[key].get(name.casefold(), ("", None))[1]
+    def named(self, key: str, where: str, text: str) -> list[int]:
+        """Return a copy of the members of a set, or a number alone."""
+        found = self._sets[key].get(text.casefold())
+        return self.counted(where, [whole(where, text)] if found is None else found[1])
 
-    def place(self, where: str, number: int) -> FloatArray:
-        """Return the place (3,) of a node that must be there by now."""
-        if number not in self.nodes:
-            fail(where, f"node {number} is not there by now; give nodes before what is made of them.")
-        return np.array(self.nodes[number])
-
-    def element(self, where: str, number: int) -> tuple[ElementKind | None, list[int]]:
-        """Return kind and nodes of an element that must be there by now."""
-        if number not in self.elements:
-            fail(where, f"element {number} is not there by now; give elements before what is made of them.")
-        return self.elements[number]
+    def counted(self, where: str, members: Sequence[int]) -> list[int]:
+        """Return members of a set, or refuse: short lines may ask for more numbers than any mesh has."""
+        self._room -= len(members)
+        if self._room < 0:
+            fail(where, f"the sets hold more than {_MOST_NUMBERS:,} members together.")
+        return list(members)
 
     def add_node(self, where: str, number: int, place: Iterable[float]) -> None:
         """Add a node; one that is there twice must be at the same place."""
@@ -178,10 +157,8 @@ class Deck:
         source = str(self.path)
         if not self._kinds:
             fail(source, "the deck holds no whole block of solid elements: was it cut off?")
-        kind = one_kind(
-            list(self._kinds.values())[-1],
-            Counter(kind.file_type for kind, _ in self.elements.values() if kind),
-        )
+        counts = Counter(kind.file_type for kind, _ in self.elements.values() if kind)
+        kind = one_kind(list(self._kinds.values())[-1], counts)
         place = {number: index for index, number in enumerate(self.nodes)}
 
         def places(members: Iterable[int], what: str) -> list[int]:
@@ -203,7 +180,14 @@ class Deck:
             if lost is not None:
                 fail(source, f"the set {name!r} names element {lost}, which is not there.")
             flat = [places(self.elements[n][1], f"element {n}") for n in members if n not in cell]
-            self._check_section(name, len(flat))
+            if flat and name.casefold() in self.sections:
+                what = (
+                    f"{len(flat)} bars, membranes or shells of the set {name!r} have a section and bear loads"
+                )
+                fail(
+                    self.sections[name.casefold()],
+                    f"{what}, but solids alone are read; delete one or the other.",
+                )
             inside = np.unique(np.array([cell[n] for n in members if n in cell], dtype=np.int64))
             if len(inside) or not flat:
                 cell_sets[name] = inside
@@ -228,16 +212,6 @@ class Deck:
             ),
         )
 
-    def _check_section(self, name: str, flat: int) -> None:
-        for where, section in self.sections:
-            if flat and section.casefold() == name.casefold():
-                fail(
-                    where,
-                    f"{flat} bars, membranes or shells of the set {name!r} have a section, so that they bear "
-                    "loads, but only solid elements are read; delete them, or their section where they only "
-                    "name faces.",
-                )
-
     def _faces(
         self, rows: list[tuple[str, str, str]], kind: ElementKind, cells: IntArray, cell: dict[int, int]
     ) -> frozenset[tuple[int, ...]]:
@@ -246,14 +220,9 @@ class Deck:
             label = face.upper()
             number = int(label[1:]) if re.fullmatch("S[1-6]", label) else 0
             if not 1 <= number <= len(kind.faces):
-                fail(
-                    where,
-                    f"a face S1 to S{len(kind.faces)} of {kind.name} is expected, but {shown(face)} came.",
-                )
-            members = self.found("ELSET", member)
-            members = [whole(where, member)] if members is None else members
-            self.take_room(where, len(members))
-            for element in members:
+                last = len(kind.faces)
+                fail(where, f"a face S1 to S{last} of {kind.name} is expected, but {shown(face)} came.")
+            for element in self.named("ELSET", where, member):
                 if element not in cell:
                     fail(where, f"the surface names element {element}, which is not a solid element.")
                 corners = cells[cell[element], list(kind.faces[number - 1])]

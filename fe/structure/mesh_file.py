@@ -77,18 +77,15 @@ def _each_once(found: FileMesh, path: Path) -> FileMesh:
     """Merge elements that Gmsh writes once for each physical group; refuse doubled ones of other files."""
     rows = np.sort(found.cells, axis=1)
     _, first, back = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    if len(first) == len(rows):
+    twins = found.cell_numbers[np.setdiff1d(np.arange(len(rows)), first)]
+    if not len(twins):
         return found
-    first_alike = first[back.ravel()]
     if path.suffix.lower() != ".msh":
-        twin = np.flatnonzero(first_alike != np.arange(len(rows)))
-        one, other = found.cell_numbers[[first_alike[twin[0]], twin[0]]]
         raise MeshError(
-            f"{path}: {len(twin)} elements are there twice, such as {one} and {other}, which have the same "
-            "nodes; delete one of each."
+            f"{path}: {len(twins)} elements, such as {twins[0]}, have the nodes of another; delete them."
         )
     kept = np.sort(first)
-    place = np.searchsorted(kept, first_alike)
+    place = np.searchsorted(kept, first[back.ravel()])
     return replace(
         found,
         cells=found.cells[kept],
@@ -190,7 +187,8 @@ def _from_meshio(path: Path) -> FileMesh:
             found = meshio.read(path)
     except meshio.ReadError as error:
         raise MeshError(
-            f"The mesh file {path} cannot be read: {str(error).strip('. ') or 'its format is not known'}."
+            f"The mesh file {path} cannot be read: {str(error).strip('. ') or 'its format is not known'}; "
+            "write it as .msh, .inp, .med or .bdf."
         ) from None
     except OSError as error:
         raise MeshError(f"The mesh file {path} cannot be read: {error.strerror}.") from None

@@ -22,11 +22,8 @@ from .mesh import FileMesh
 
 FloatArray = NDArray[np.float64]
 
-_SOLIDS = {
-    "CTETRA": ("tetra", "tetra10"),
-    "CHEXA": ("hexahedron", "hexahedron20"),
-    "CPENTA": ("wedge", "wedge15"),
-}
+_SOLIDS = {"CTETRA": 4, "CHEXA": 8, "CPENTA": 6}
+"""Solid elements with the number of their corners."""
 _ORDER = {
     "hexahedron20": (*range(12), *range(16, 20), *range(12, 16)),
     "wedge15": (*range(9), *range(12, 15), *range(9, 12)),
@@ -77,7 +74,8 @@ def read_nastran(path: Path) -> FileMesh:
     for card in _cards(path, _DEEPEST_INCLUDE):
         word = card.word
         if word == "GRID":
-            points.grids[card.whole(0)] = card
+            if points.grids.setdefault(card.whole(0), card).fields != card.fields:
+                fail(card.where, f"the grid point {card.whole(0)} is there twice; delete one.")
         elif word == "GRDSET":
             points.system_of_grids = card.whole(1)
         elif _SYSTEM.fullmatch(word):
@@ -85,9 +83,9 @@ def read_nastran(path: Path) -> FileMesh:
                 points.systems[card.whole(first)] = card._replace(fields=card.fields[first:])
         elif word in _SOLIDS or word in _FLAT:
             _add_element(deck, card)
+        elif _SECTIONS.fullmatch(word):
+            deck.sections[f"nastran:ref={card.whole(0)}"] = card.where
         else:
-            if _SECTIONS.fullmatch(word):
-                deck.sections.append((card.where, f"nastran:ref={card.whole(0)}"))
             deck.word(word, card.where)
     for number, card in points.grids.items():
         deck.add_node(card.where, number, points.place(number, card.where))
@@ -96,16 +94,15 @@ def read_nastran(path: Path) -> FileMesh:
 
 def _add_element(deck: Deck, card: _Card) -> None:
     number = card.whole(0)
-    nodes = [whole(card.where, text) for text in card.fields[2:] if text not in ("", "0")]
+    nodes = [card.whole(field) for field in range(2, 2 + _FLAT.get(card.word, len(card.fields)))]
     kind = None
-    if card.word in _FLAT:
-        nodes = [card.whole(2 + corner) for corner in range(_FLAT[card.word])]
-    else:
-        kinds = [KINDS[name] for name in _SOLIDS[card.word]]
-        kind = next((kind for kind in kinds if kind.node_count == len(nodes)), None)
-        if kind is None:
-            counts = " or ".join(str(kind.node_count) for kind in kinds)
+    if card.word in _SOLIDS:
+        nodes = [node for node in nodes if node]
+        kinds = {kind.node_count: kind for kind in KINDS.values() if len(kind.corners) == _SOLIDS[card.word]}
+        if len(nodes) not in kinds:
+            counts = " or ".join(map(str, kinds))
             fail(card.where, f"{card.word} {number} must have {counts} nodes, but {len(nodes)} came.")
+        kind = kinds[len(nodes)]
         nodes = [nodes[place] for place in _ORDER.get(kind.file_type, range(len(nodes)))]
     deck.add_element(card.where, number, kind, nodes)
     deck.members("ELSET", f"nastran:ref={card.whole(1, number)}").append(number)
@@ -132,10 +129,7 @@ class _Points:
             if number not in self.systems:
                 fail(where, f"the coordinate system {number} is not there.")
             if depth > _DEEPEST:
-                fail(
-                    where,
-                    f"the coordinate system {number} rests on itself, or on too long a chain of others.",
-                )
+                fail(where, f"the coordinate system {number} rests on itself, or on too many others.")
             card = self.systems[number]
             if card.word[4] == "1":
                 given = [self.place(card.whole(field), card.where, depth + 1) for field in (1, 2, 3)]

@@ -64,7 +64,13 @@ def ring(box: Callable[..., Any], write: Callable[..., Path], kind: str, count: 
 
 @pytest.mark.parametrize(
     ("kind", "order", "error"),
-    [("hexahedron", 1.7, 2e-2), ("tetra", 1.6, 5e-2), ("tetra10", 3.7, 1e-4), ("hexahedron20", 3.7, 1e-4)],
+    [
+        ("hexahedron", 1.7, 2e-2),
+        ("tetra", 1.6, 5e-2),
+        ("tetra10", 3.7, 1e-4),
+        ("hexahedron20", 3.7, 1e-4),
+        ("wedge15", 3.7, 1e-4),
+    ],
 )
 def test_a_thick_ring_under_pressure_converges_to_lame(
     kind: str, order: float, error: float, box: Callable[..., Any], write: Callable[..., Path]
@@ -380,4 +386,4 @@ def test_memory_is_estimated_before_it_is_taken(beam: Callable[..., Structure]) 
     check_memory(mesh)
     with pytest.raises(MeshError, match=r"744 unknowns would take about 0\.\d GiB, but 0\.1 GiB are allowed"):
         check_memory(mesh, 0.1 * 2**30)
-    assert set(KINDS) == {"tetra", "tetra10", "hexahedron", "hexahedron20", "wedge"}
+    assert set(KINDS) == {"tetra", "tetra10", "hexahedron", "hexahedron20", "wedge", "wedge15"}
