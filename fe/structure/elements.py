@@ -11,6 +11,7 @@ takes the points of the stiffness for it. Element arrays are contracted for many
 import itertools
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,6 +202,15 @@ KINDS = {
     for kind in (TETRAHEDRA_4, TETRAHEDRA_10, HEXAHEDRA_8, HEXAHEDRA_20, WEDGES_6, WEDGES_15)
 }
 """The kinds by their names in meshio."""
+
+
+def meshio_with_wedges() -> Any:
+    """Return meshio, whose version 5.3 forgets of how many dimensions a wedge of 15 nodes is."""
+    import meshio
+    from meshio._mesh import topological_dimension
+
+    topological_dimension.setdefault("wedge15", 3)
+    return meshio
 
 
 def jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from fe.runtime.errors import MeshError
 
 from .abaqus_file import read_abaqus
 from .deck import one_kind
-from .elements import BATCH, jacobians
+from .elements import BATCH, jacobians, meshio_with_wedges
 from .mesh import FileMesh, StructureMesh
 from .nastran_file import read_nastran
 
@@ -169,12 +169,9 @@ def _check_parts(mesh: StructureMesh) -> None:
 
 
 def _from_meshio(path: Path) -> FileMesh:
-    import meshio
-    from meshio._mesh import topological_dimension
-
+    meshio = meshio_with_wedges()
     if not path.is_file():
         raise MeshError(f"The mesh file {path} is not there.")
-    topological_dimension.setdefault("wedge15", 3)  # which meshio 5.3 forgets
     said = io.StringIO()
     try:
         # meshio writes what it thinks of a file to the terminal, and ends the program where it fails.

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fe.runtime.errors import MeshError
-from fe.structure.elements import KINDS
+from fe.structure.elements import KINDS, meshio_with_wedges
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import load_and_assemble
@@ -36,7 +36,7 @@ def test_formats_agree(
     if file_format.startswith("gmsh"):
         tags = np.zeros(len(cells), dtype=np.int32)
         data = {"cell_data": {"gmsh:physical": [tags], "gmsh:geometrical": [tags]}}
-    meshio.write(path, meshio.Mesh(points, [(kind, cells)], **data), file_format=file_format)
+    meshio_with_wedges().write(path, meshio.Mesh(points, [(kind, cells)], **data), file_format=file_format)
     mesh = read_mesh(path, 1e-3, "mm")
     assert mesh.kind is KINDS[kind]
     np.testing.assert_allclose(mesh.nodes, 1e-3 * points[cells], atol=1e-9)
