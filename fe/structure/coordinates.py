@@ -33,12 +33,15 @@ class System:
 
     def place(self, coordinates: ArrayLike) -> FloatArray:
         """Place in space (..., 3) of coordinates (..., 3)."""
-        x, y, z = np.moveaxis(np.asarray(coordinates, dtype=np.float64), -1, 0)
-        if self.kind == "S":
-            x, y, z = x * np.sin(np.deg2rad(y)), z, x * np.cos(np.deg2rad(y))
+        given = np.asarray(coordinates, dtype=np.float64)
         if self.kind != "R":
-            x, y = x * np.cos(np.deg2rad(y)), x * np.sin(np.deg2rad(y))
-        return np.asarray(self.origin + np.stack((x, y, z), axis=-1) @ self.axes)
+            radius, angle, height = np.moveaxis(given, -1, 0)
+            if self.kind == "S":
+                polar, angle = np.deg2rad(angle), height
+                radius, height = radius * np.sin(polar), radius * np.cos(polar)
+            turn = np.deg2rad(angle)
+            given = np.stack((radius * np.cos(turn), radius * np.sin(turn), height), axis=-1)
+        return np.asarray(self.origin + given @ self.axes)
 
 
 GLOBAL = System(np.zeros(3), np.eye(3))
