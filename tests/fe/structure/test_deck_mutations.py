@@ -1,4 +1,4 @@
-"""Decks, meshes and TOML with faults drawn at random: read or refused in one sentence, and never for long."""
+"""Decks, meshes, TOML, JSON and tables with faults, or of one long word: read or refused, never for long."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.structure.deck import words_of
 from fe.structure.design import parse_structure
 from fe.structure.mesh_file import read_mesh
+from reporting.json_file import parse_json
+from reporting.table_file import TableErrors, parse_table
 from reporting.toml_file import parse_toml
 from scenarios import structure_files
 
@@ -164,6 +166,7 @@ HOSTILE = {
     "a key in quotes": '"a".' * (LONG // 4),
     "texts that stay open": '"""\\' * (LONG // 4),
     "keys below the limit": "\n".join("a.a.a.a.a." * 3 + f"k{n} = 1" for n in range(LONG // 40)),
+    "an object": "{" + ", ".join(f'"k{n}": 1' for n in [*range(60_000), 59_999]) + "}",
     "many keys": "\n".join(f"k{n} = {n}" for n in range(LONG // 15)),
 }
 
@@ -173,6 +176,9 @@ HOSTILE = {
 def test_a_long_text_is_read_or_refused(what: str, tmp_path: Path) -> None:
     """None of these takes a time that grows with the square of its length."""
     check(lambda: parse_toml(HOSTILE[what], "f", DesignFileError), DesignFileError)
+    check(lambda: parse_json(HOSTILE[what], "f", DesignFileError), DesignFileError)
+    errors = TableErrors(DesignFileError, InvalidDesignError)
+    check(lambda: parse_table(HOSTILE[what], "f", errors), DesignFileError)
     for name, before in itertools.product(
         ("m.inp", "m.bdf"), ("", "*NODE\n", "*ELEMENT, TYPE=C3D8\n", "GRID,")
     ):
