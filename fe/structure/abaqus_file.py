@@ -16,7 +16,7 @@ from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
 from .coordinates import GLOBAL, System, frame
-from .deck import Deck, fail, real, shown, whole, words_of
+from .deck import Deck, fail, included, real, shown, whole, words_of
 from .elements import KINDS
 from .mesh import FileMesh
 
@@ -25,7 +25,6 @@ _VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
 """Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
 _FLAT = {"T3D2": 2, "T3D3": 3, "CPS3": 3, "CPS4": 4, "CPS6": 6, "CPS8": 8}
 """Elements by which Gmsh and others hand on lines and surfaces: they only name nodes and faces here."""
-_DEEPEST_INCLUDE = 5
 
 
 class _Block(NamedTuple):
@@ -52,17 +51,17 @@ def read_abaqus(path: Path) -> FileMesh:
         If it cannot be read, or holds what the mesh would lose; the sentence names the line.
     """
     reader = _Reader(path)
-    for block in _blocks(path, _DEEPEST_INCLUDE):
+    for block in _blocks((path,)):
         reader.take(block)
     return reader.deck.mesh()
 
 
-def _blocks(path: Path, depth: int) -> Iterator[_Block]:
+def _blocks(files: tuple[Path, ...]) -> Iterator[_Block]:
     found: list[tuple[str, list[str], list[tuple[str, list[str]]]]] = []
-    lines = read_text(path, MeshError, what="mesh file", otherwise="latin-1").splitlines()
+    lines = read_text(files[-1], MeshError, what="mesh file", otherwise="latin-1").splitlines()
     for number, line in enumerate(lines, start=1):
         text = line.strip()
-        where = f"{path}, line {number}"
+        where = f"{files[-1]}, line {number}"
         if not text or text.startswith("**"):
             continue
         if text.startswith("*"):
@@ -77,10 +76,8 @@ def _blocks(path: Path, depth: int) -> Iterator[_Block]:
         given = {key.strip().upper(): value.strip().strip('"') for key, _, value in pairs}
         if keyword.upper() != "INCLUDE":
             yield _Block(where, keyword.upper(), given, data)
-        elif not depth:
-            fail(where, "more than five files include one another.")
         else:
-            yield from _blocks(path.parent / given.get("INPUT", ""), depth - 1)
+            yield from _blocks(included(where, files, given.get("INPUT", "")))
 
 
 class _Reader:

@@ -62,6 +62,14 @@ def fail(where: str, sentence: str) -> NoReturn:
     raise MeshError(f"{where}: {sentence}")
 
 
+def included(where: str, files: tuple[Path, ...], name: str) -> tuple[Path, ...]:
+    """Return files that include one another and one that the last of them includes; none may come twice."""
+    inner = (files[-1].parent / name).resolve()
+    if inner in files:
+        fail(where, f"{inner} includes itself.")
+    return (*files, inner)
+
+
 def shown(text: str) -> str:
     """Return what came as it stands in a sentence, cut where it is long."""
     return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
@@ -215,18 +223,19 @@ class Deck:
     def _faces(
         self, rows: list[tuple[str, str, str]], kind: ElementKind, cells: IntArray, cell: dict[int, int]
     ) -> frozenset[tuple[int, ...]]:
-        found = set()
+        found: set[tuple[int, ...]] = set()
         for where, member, face in rows:
             label = face.upper()
             number = int(label[1:]) if re.fullmatch("S[1-6]", label) else 0
             if not 1 <= number <= len(kind.faces):
                 last = len(kind.faces)
                 fail(where, f"a face S1 to S{last} of {kind.name} is expected, but {shown(face)} came.")
-            for element in self.named("ELSET", where, member):
-                if element not in cell:
-                    fail(where, f"the surface names element {element}, which is not a solid element.")
-                corners = cells[cell[element], list(kind.faces[number - 1])]
-                found.add(tuple(sorted(corners.tolist())))
+            members = set(self.named("ELSET", where, member))
+            for lost in members - cell.keys():
+                fail(where, f"the surface names element {lost}, which is not a solid element.")
+            inside = np.array([cell[element] for element in members], dtype=np.int64)
+            corners = np.sort(cells[inside][:, kind.faces[number - 1]], axis=1)
+            found.update(map(tuple, corners.tolist()))
         return frozenset(found)
 
 

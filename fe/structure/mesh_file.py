@@ -235,14 +235,13 @@ def _sets(
                 if chosen is not None and len(chosen):
                     members.setdefault(name, []).append((number, np.asarray(chosen, dtype=np.int64)))
     for label, arrays in found.cell_data.items():
-        for number, array in enumerate(arrays):
-            dimension = _dimension(found.cells[number].type)
-            for name, chosen in _named(found, label, np.asarray(array), dimension):
+        for number in range(len(arrays)):
+            for name, chosen in _named(found, label, arrays, number):
                 if name not in found.cell_sets:
                     members.setdefault(name, []).append((number, chosen))
     nodes = {name: np.unique(np.asarray(chosen, dtype=np.int64)) for name, chosen in found.point_sets.items()}
     for label, array in found.point_data.items():
-        for name, chosen in _named(found, label, np.asarray(array), 0):
+        for name, chosen in _named(found, label, [array], 0):
             nodes[name] = np.union1d(nodes.get(name, chosen), chosen)
     cells: dict[str, IntArray] = {}
     faces: dict[str, frozenset[tuple[int, ...]]] = {}
@@ -263,8 +262,9 @@ def _dimension(kind: str) -> int:
     return {1: 0, 2: 1}.get(_FLAT.get(kind, 5), 2 if kind in _FLAT else 3)
 
 
-def _named(found: Any, label: str, array: NDArray[Any], dimension: int) -> Iterator[tuple[str, IntArray]]:
-    """Yield the sets that an array of integers stands for: each value, by the names that the file has."""
+def _named(found: Any, label: str, arrays: list[Any], number: int) -> Iterator[tuple[str, IntArray]]:
+    """Yield the sets of one of several arrays of integers: each value, by the names that the file has."""
+    array = np.asarray(arrays[number])
     if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
         return
     values = np.unique(array)
@@ -272,12 +272,12 @@ def _named(found: Any, label: str, array: NDArray[Any], dimension: int) -> Itera
         return
     # MED counts families of named groups; meshio writes a set alone as 0 and -1, others write 1 and 0.
     families = getattr(found, label, {}) if label in ("cell_tags", "point_tags") else {}
-    mask = {(-1, 0): 0, (0, 1): 1}.get(tuple(values.tolist()))
+    mask = {(-1, 0): 0, (0, 1): 1}.get(tuple(np.unique(np.concatenate(arrays)).tolist()))
     for value in values.tolist():
         names = families.get(value, [f"{label}={value}"])
         if label == "gmsh:physical":
-            titles = [name for name, tag in found.field_data.items() if tag.tolist() == [value, dimension]]
-            names = titles or names
+            place = [value, _dimension(found.cells[number].type)]
+            names = [name for name, tag in found.field_data.items() if tag.tolist() == place] or names
         if value == mask and ":" not in label:
             names = [*names, label]
         for name in names:

@@ -16,7 +16,7 @@ from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
 from .coordinates import GLOBAL, System, frame
-from .deck import Deck, fail, real, shown, whole, words_of
+from .deck import Deck, fail, included, real, shown, whole, words_of
 from .elements import KINDS
 from .mesh import FileMesh
 
@@ -38,7 +38,7 @@ _SECTIONS = re.compile("P(BAR|BEAM|BCOMP|COMP|LPLANE|ROD|SHEAR|SHELL|TUBE)[GL]?"
 _SYSTEM = re.compile(r"CORD([12])([RCS])")
 _BEGIN = re.compile(r"\s*BEGIN\b", re.IGNORECASE)
 _MARKER = re.compile(r"\+(?![\d.])")
-_DEEPEST, _DEEPEST_INCLUDE = 50, 5
+_DEEPEST = 50
 
 
 class _Card(NamedTuple):
@@ -71,7 +71,7 @@ def read_nastran(path: Path) -> FileMesh:
     """
     deck = Deck(path, words_of("nastran"))
     points = _Points()
-    for card in _cards(path, _DEEPEST_INCLUDE):
+    for card in _cards((path,)):
         word = card.word
         if word == "GRID":
             if points.grids.setdefault(card.whole(0), card).fields != card.fields:
@@ -142,20 +142,18 @@ class _Points:
         return self._found[number]
 
 
-def _cards(path: Path, depth: int) -> Iterator[_Card]:
-    lines = read_text(path, MeshError, what="mesh file", otherwise="latin-1").splitlines()
+def _cards(files: tuple[Path, ...]) -> Iterator[_Card]:
+    lines = read_text(files[-1], MeshError, what="mesh file", otherwise="latin-1").splitlines()
     start = next((number for number, line in enumerate(lines, start=1) if _BEGIN.match(line)), 0)
     card: _Card | None = None
     marker = ""
     for number, line in enumerate(lines[start:], start=start + 1):
-        where = f"{path}, line {number}"
+        where = f"{files[-1]}, line {number}"
         text = line.partition("$")[0].expandtabs(8).rstrip()
         if not text:
             continue
         if text.strip().upper().startswith("INCLUDE"):
-            if not depth:
-                fail(where, "more than five files include one another.")
-            yield from _cards(path.parent / text.strip()[7:].strip(" '\""), depth - 1)
+            yield from _cards(included(where, files, text.strip()[7:].strip(" '\"")))
             continue
         head, *fields, end = _fields(where, text)
         if not head or head[0] in "+*":

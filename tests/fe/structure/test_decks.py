@@ -15,7 +15,7 @@ from fe.runtime.errors import MeshError
 from fe.structure.deck import words_of
 from fe.structure.elements import jacobians, meshio_with_wedges
 from fe.structure.mesh import StructureMesh
-from fe.structure.mesh_file import read_mesh
+from fe.structure.mesh_file import _from_meshio, read_mesh
 
 ORIGIN = np.array([0.3, -1.2, 0.7])
 TURN = Rotation.from_rotvec([0.4, -0.9, 1.3])
@@ -129,7 +129,7 @@ BULK = ["GRID,1,,0.,0.,0.", "GRID,2,,1.,0.,0.", "GRID,3,,0.,1.,0.", "GRID,4,,0.,
         ("GRID,1", ",5.\nGRID,1", "line 1: the continuation '' stands behind no line that it continues"),
         ("2,3,4", "2,3,4,+A\n+B", r"line 6: the continuation '\+B' stands behind no line that it continues"),
         ("2,3,4", "2,3,4,,,,9", "line 5: a line of at most 10 fields is expected, but 11 came"),
-        ("GRID,1", "INCLUDE 'm.bdf'\nGRID,1", "more than five files include one another"),
+        ("GRID,1", "INCLUDE 'm.bdf'\nGRID,1", r"m\.bdf, line 1: .*m\.bdf includes itself"),
         ("CTETRA,8,1,1,2,3,4", "", "the deck holds no whole block of solid elements"),
     ],
 )
@@ -207,6 +207,17 @@ def test_nodes_of_abaqus_in_a_system_of_their_own(kind: str, box: Callable[..., 
     np.testing.assert_allclose(turned.nodes[0], [[0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-15)
 
 
+def test_decks_that_include_others(tmp_path: Path) -> None:
+    (tmp_path / "nodes.inp").write_text("\n".join(SOLID[:5]))
+    mesh = written(tmp_path / "m.inp", "*INCLUDE, INPUT=nodes.inp", *SOLID[5:])
+    assert volume(mesh) == pytest.approx(1.0 / 6.0)
+    (tmp_path / "grids.bdf").write_text("\n".join(BULK[:4]))
+    mesh = written(tmp_path / "m.bdf", "BEGIN BULK", "include 'grids.bdf'", *BULK[4:])
+    assert volume(mesh) == pytest.approx(1.0 / 6.0)
+    with pytest.raises(MeshError, match=r"m\.inp, line 1: .*m\.inp includes itself"):
+        written(tmp_path / "m.inp", *["*INCLUDE, INPUT=../" + tmp_path.name + "/m.inp"] * 100, *SOLID)
+
+
 def test_an_element_of_two_physical_groups_counts_once(box: Callable[..., Any], tmp_path: Path) -> None:
     """As Gmsh writes it in version 2: the element again for each group."""
     points, cells = box("tetra", (1, 1, 1))
@@ -258,6 +269,14 @@ def test_arrays_of_a_vtu_that_are_sets(box: Callable[..., Any], tmp_path: Path) 
     mesh.point_sets_to_data()
     meshio.write(tmp_path / "m.vtu", mesh)
     found = read_mesh(tmp_path / "m.vtu", 1.0, "m")
+    far = points + 10.0
+    blocks = [("hexahedron", cells), ("hexahedron", cells + len(points))]
+    parted = {"part": [[0, 1], [1, 1]], "set": [[-1, 0], [0, 0]]}  # all of the second block
+    meshio.write(tmp_path / "n.vtu", meshio.Mesh(np.vstack((points, far)), blocks, cell_data=parted))
+    with pytest.raises(MeshError, match="falls into 2 parts"):
+        read_mesh(tmp_path / "n.vtu", 1.0, "m")
+    sets = _from_meshio(tmp_path / "n.vtu").cell_sets
+    assert sets["part"].tolist() == sets["set"].tolist() == [1, 2, 3]
     for name, cell in {"left": 0, "left=0": 0, "left=-1": 1, "right": 1, "right=1": 1}.items():
         assert found.cells_of(name, "here").tolist() == [cell]
     np.testing.assert_array_equal(found.points[found.nodes_of("root", "here"), 0], 0.0)
