@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
+from math import isfinite, nan
 from pathlib import Path
 from typing import NoReturn
 
@@ -89,9 +90,12 @@ def whole(where: str, text: str) -> int:
 def real(where: str, text: str) -> float:
     """Return a real number, or refuse; Fortran writes D for E, and Nastran leaves the E out."""
     try:
-        return float(_NO_EXPONENT.sub("E", text.upper().replace("D", "E")))
+        number = float(_NO_EXPONENT.sub("E", text.upper().replace("D", "E")))
     except ValueError:
+        number = nan
+    if not isfinite(number):
         fail(where, f"a real number is expected, but {shown(text)} came.")
+    return number
 
 
 def one_kind(where: str, counts: Mapping[str, int]) -> ElementKind:
@@ -149,7 +153,7 @@ class Deck:
     def add_node(self, where: str, number: int, place: Iterable[float]) -> None:
         """Add a node; one that is there twice must be at the same place."""
         point = tuple(map(float, place))
-        if self.nodes.setdefault(number, point) != point and not np.isnan(point).any():
+        if self.nodes.setdefault(number, point) != point:
             fail(where, f"node {number} is there twice, at different places; delete one.")
 
     def add_element(self, where: str, number: int, kind: ElementKind | None, nodes: list[int]) -> None:
