@@ -95,10 +95,8 @@ class _Reader:
         if readable is None:
             self.deck.word(block.keyword, block.where)
             return
-        for key in block.parameters.keys() - set(readable):
-            fail(
-                block.where, f"*{block.keyword} with {shown(key)} is not read; write nodes and elements out."
-            )
+        for key in (key for key in block.parameters if key not in readable):
+            fail(block.where, f"*{block.keyword} with {shown(key)} is not read; write what it makes out.")
         if block.keyword == "NODE":
             self._nodes(block)
         elif block.keyword == "ELEMENT":
@@ -113,12 +111,10 @@ class _Reader:
 
     def _system(self, block: _Block) -> None:
         """Set the system of the nodes below: origin, then a point on x, then one in the plane of x and y."""
-        given = [real(where, text) for where, values in block.data for text in values if text]
+        rows = [(where, ",".join(values).rstrip(",").split(",")) for where, values in block.data]
+        given = [real(where, text or "0") for where, values in rows for text in values]
         if len(given) not in (0, 3, 6, 9):
-            fail(
-                block.where,
-                f"below *SYSTEM one, two or three points are expected, but {len(given)} numbers came.",
-            )
+            fail(block.where, f"*SYSTEM needs one, two or three points, but {len(given)} numbers came.")
         points = np.zeros((3, 3))
         points.flat[: len(given)] = given
         if len(given) < 6:
@@ -149,16 +145,10 @@ class _Reader:
         width = kind.node_count if kind else _FLAT.get(name)
         if width is None:
             readable = ", ".join(_KINDS)
-            fail(
-                block.where,
-                f"elements of type {shown(name)} cannot be read; {readable} and their variants can.",
-            )
+            fail(block.where, f"elements of type {shown(name)} cannot be read; {readable} and variants can.")
         numbers = [(where, whole(where, text)) for where, row in block.data for text in row if text]
         if len(numbers) % (width + 1):
-            fail(
-                block.where,
-                f"{len(numbers)} numbers below *ELEMENT are not a multiple of {width + 1} ({name}).",
-            )
+            fail(block.where, f"{len(numbers)} numbers are not a multiple of {width + 1}, as {name} needs.")
         rows = [numbers[start : start + width + 1] for start in range(0, len(numbers), width + 1)]
         for (where, number), *nodes in rows:
             self.deck.add_element(where, number, kind, [node for _, node in nodes])

@@ -192,14 +192,12 @@ class Deck:
             if lost is not None:
                 fail(source, f"the set {name!r} names element {lost}, which is not there.")
             flat = [places(self.elements[n][1], f"element {n}") for n in members if n not in cell]
-            if flat and name.casefold() in self.sections:
+            section = self.sections.get(name.casefold())
+            if flat and section:
                 what = (
                     f"{len(flat)} bars, membranes or shells of the set {name!r} have a section and bear loads"
                 )
-                fail(
-                    self.sections[name.casefold()],
-                    f"{what}, but solids alone are read; delete one or the other.",
-                )
+                fail(section, f"{what}, but solids alone are read; delete one or the other.")
             inside = np.unique(np.array([cell[n] for n in members if n in cell], dtype=np.int64))
             if len(inside) or not flat:
                 cell_sets[name] = inside

@@ -203,7 +203,7 @@ def test_nodes_of_abaqus_in_a_system_of_their_own(kind: str, box: Callable[..., 
     shifted = written(tmp_path / "m.inp", "*SYSTEM", "1, 2, 3", *SOLID)
     np.testing.assert_allclose(shifted.nodes[0, 0], (1.0, 2.0, 3.0))
     # A point on x alone turns x about z, after its height is left out.
-    turned = written(tmp_path / "m.inp", "*SYSTEM", "0, 0, 0, 0, 3, 4", *SOLID)
+    turned = written(tmp_path / "m.inp", "*SYSTEM", ",, 0, , 3, 4,", *SOLID)
     np.testing.assert_allclose(turned.nodes[0], [[0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-15)
 
 
