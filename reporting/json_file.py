@@ -1,6 +1,7 @@
 """The one reader of JSON: whatever is wrong with a file becomes one sentence of the caller's exception."""
 
 import json
+from collections import Counter
 from math import isfinite
 from pathlib import Path
 from typing import Any, NoReturn
@@ -48,13 +49,13 @@ def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return an object of JSON; of a key that comes twice Python would take the last."""
     table = dict(pairs)
     if len(table) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"the key {next(name for name in names if names.count(name) > 1)!r} comes twice")
+        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key {twice!r} comes twice")
     return table
 
 
 def _refuse(number: str) -> NoReturn:
-    raise ValueError(f"{number} is no number in JSON")
+    raise ValueError(f"{number[:40]} is no number in JSON")
 
 
 def _decimal(text: str) -> float:

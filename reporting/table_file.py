@@ -7,6 +7,7 @@ and a number is written with the digits 0 to 9 and a point.
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
@@ -223,7 +224,7 @@ def parse_table(
         raise errors.layout(
             f"{name} is not separated by commas: write it with commas between cells and points in numbers."
         )
-    twice = sorted({column for column in columns if columns.count(column) > 1})
+    twice = sorted(column for column, count in Counter(columns).items() if count > 1)
     if twice:
         raise errors.layout(f"{name} has more than one column {twice[0]!r}: rename or remove one.")
     if not found:

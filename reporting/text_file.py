@@ -6,7 +6,9 @@ DEEPEST_NESTING = 32
 """Tables and lists within each other that a document may hold; no format of this project needs a third."""
 
 
-def read_text(path: Path | str, error: type[Exception], *, what: str = "file") -> str:
+def read_text(
+    path: Path | str, error: type[Exception], *, what: str = "file", otherwise: str | None = None
+) -> str:
     """Return the text of a file without its byte order mark.
 
     Parameters
@@ -17,6 +19,8 @@ def read_text(path: Path | str, error: type[Exception], *, what: str = "file") -
         What is raised, with one sentence.
     what : str
         What the file is to be, for the sentence: "wing design".
+    otherwise : str, optional
+        The encoding to take where the file is not UTF-8.
 
     Raises
     ------
@@ -29,17 +33,20 @@ def read_text(path: Path | str, error: type[Exception], *, what: str = "file") -
         raise error(f"The {what} {path} cannot be read: {cause.strerror or cause}.") from cause
     except ValueError:
         raise error(f"{str(path)!r} is no name of a {what}.") from None
-    return decoded(content, f"The {what} {path}", error)
+    return decoded(content, f"The {what} {path}", error, otherwise)
 
 
-def decoded(content: bytes, subject: str, error: type[Exception]) -> str:
+def decoded(content: bytes, subject: str, error: type[Exception], otherwise: str | None = None) -> str:
     """Return bytes as text; `subject` begins the sentence of the `error` where they are not UTF-8."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as cause:
-        raise error(
-            f"{subject} is not text in UTF-8 ({cause.reason} at byte {cause.start + 1}): save it as UTF-8."
-        ) from cause
+        if otherwise is None:
+            raise error(
+                f"{subject} is not text in UTF-8 ({cause.reason} at byte {cause.start + 1}): save it as "
+                "UTF-8."
+            ) from cause
+        text = content.decode(otherwise)
     if "\0" in text:
         raise error(f"{subject} is not text: it holds a zero byte; save it as UTF-8.")
     return text

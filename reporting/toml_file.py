@@ -6,10 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from reporting.text_file import check_nesting, decoded, read_text, too_deep
+from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
 
-_LONGEST_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){1000}""", re.ASCII)
-"""A dotted key of so many parts; `tomllib` takes a time that grows with their square."""
+_PART = r"""(?:[\w-]++|"(?:[^"\\\n]++|\\.)*+"?+|'[^'\n]*+'?+)"""
+_TEXT = (
+    r'''#[^\n]*+|"""(?:[^"\\]++|\\[\s\S]|"(?!""))*+(?:"""|\Z)|''' + r"""'''(?:[^']++|'(?!''))*+(?:'''|\Z)"""
+)
+_KEYS = re.compile(rf"{_TEXT}|({_PART}(?:[ \t]*+\.[ \t]*+{_PART})*+)")
+"""Comments and texts of several lines, then words and dotted keys; each is gone over once, however long."""
 
 
 def read_toml(
@@ -57,8 +61,11 @@ def parse_toml(
 def _parsed(
     text: str, subject: str, error: type[Exception], parse_float: Callable[[str], Any]
 ) -> dict[str, Any]:
-    if _LONGEST_KEY.search(text):
-        raise error(too_deep(subject))
+    # The time that `tomllib` takes for a dotted key grows with the square of its parts.
+    if any(line.count(".") >= DEEPEST_NESTING for line in text.split("\n")):
+        keys = (found[1] or "" for found in _KEYS.finditer(text))
+        if any(key.count(".") >= DEEPEST_NESTING < len(re.findall(_PART, key)) for key in keys):
+            raise error(too_deep(subject))
     try:
         content = tomllib.loads(text, parse_float=parse_float)
     except tomllib.TOMLDecodeError as cause:
@@ -70,20 +77,22 @@ def _parsed(
             f"{subject} holds an integer of thousands of digits; 64 bits are what TOML allows."
         ) from None
     check_nesting(content, subject, error)
-    _check_integers(content, (), subject, error)
+    _check_integers(content, "", subject, error)
     return content
 
 
-def _check_integers(node: object, place: tuple[str, ...], subject: str, error: type[Exception]) -> None:
+def _check_integers(
+    node: dict[str, Any] | list[Any], place: str, subject: str, error: type[Exception]
+) -> None:
     """Refuse what TOML refuses (its specification, "Integer") and `tomllib` lets through."""
-    if isinstance(node, dict):
-        for key, item in node.items():
-            _check_integers(item, (*place, key), subject, error)
-    elif isinstance(node, list):
-        for number, item in enumerate(node, start=1):
-            _check_integers(item, (*place[:-1], f"{place[-1]}[{number}]"), subject, error)
-    elif isinstance(node, int) and not -(2**63) <= node < 2**63:
-        raise error(
-            f"{subject}: `{'.'.join(place)}` is an integer of {node.bit_length()} bits, and 63 beside the "
-            "sign are what TOML allows."
-        )
+    for key, item in node.items() if isinstance(node, dict) else enumerate(node, start=1):
+        large = isinstance(item, int) and not -(2**63) <= item < 2**63
+        if not large and not isinstance(item, dict | list):
+            continue
+        here = f"{place}.{key}".lstrip(".") if isinstance(node, dict) else f"{place}[{key}]"
+        if large:
+            raise error(
+                f"{subject}: `{here}` is an integer of {item.bit_length()} bits, and 63 beside the sign are "
+                "what TOML allows."
+            )
+        _check_integers(item, here, subject, error)

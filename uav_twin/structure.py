@@ -40,6 +40,8 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
         return
     console = terminal.console()
     console.print(console_table(("fact", "value", "unit"), _facts(record), console.width))
+    for remark in record["remarks"]:
+        console.print(f"Note: {remark}", soft_wrap=True)
     parts = [
         (part["what"], part["name"], part["set"], f"{part['count']:,} {part['of']}", part["note"])
         for part in record["parts"]
@@ -107,6 +109,7 @@ def structure_record(structure: "Structure", modes: int) -> dict[str, Any]:
     return {
         "name": design.name,
         "mesh": design.mesh,
+        "remarks": list(mesh.remarks),
         "design_hash": structure.design_hash,
         "kind": mesh.kind.name,
         "linear_elements": not mesh.kind.edges,

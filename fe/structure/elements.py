@@ -11,6 +11,7 @@ takes the points of the stiffness for it. Element arrays are contracted for many
 import itertools
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ _HEX_EDGES = (
 )  # fmt: skip
 _HEX_FACES = ((0, 1, 2, 3), (4, 7, 6, 5), (0, 4, 5, 1), (1, 5, 6, 2), (2, 6, 7, 3), (3, 7, 4, 0))
 _WEDGE = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
+_WEDGE_EDGES = ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5))
 _WEDGE_FACES = ((0, 1, 2), (3, 5, 4), (0, 3, 4, 1), (1, 4, 5, 2), (2, 5, 3, 0))
 _POWERS = tuple(itertools.product(range(3), repeat=3))
 _LINEAR = tuple(power for power in _POWERS if sum(power) <= 1)
@@ -43,6 +45,8 @@ _TRILINEAR = tuple(power for power in _POWERS if max(power) <= 1)
 # D. N. Arnold and G. Awanou (2011): degree at most two, factors of degree one not counted.
 _SERENDIPITY = tuple(power for power in _POWERS if sum(p for p in power if p > 1) <= 2)
 _PRISMATIC = tuple(power for power in _POWERS if power[0] + power[1] <= 1 and power[2] <= 1)
+# Quadratic in the triangle and linear along it, or the other way round.
+_PRISMATIC_QUADRATIC = tuple(power for power in _POWERS if power[0] + power[1] + power[2] // 2 <= 2)
 
 
 def _tetrahedron_rule(order: int) -> Rule:
@@ -122,6 +126,12 @@ class ElementKind:
         )
 
     @property
+    def mirrored(self) -> IntArray:
+        """Places (k,) in the order of MED, whose cells are those of VTK in a mirror, of the nodes."""
+        mirror = self.places[:, [1, 0, 2]]
+        return np.asarray(np.abs(self.places[:, None] - mirror).sum(axis=2).argmin(axis=1))
+
+    @property
     def is_tetrahedron(self) -> bool:
         """Whether the reference cell is the unit tetrahedron."""
         return len(self.corners) == 4
@@ -183,8 +193,24 @@ WEDGES_6 = ElementKind(
     "6-node wedges", "wedge", "C3D6", _PRISMATIC, _WEDGE, (), _WEDGE_FACES,
     _wedge_rule(2, 2), _wedge_rule(4, 3),
 )  # fmt: skip
-KINDS = {kind.file_type: kind for kind in (TETRAHEDRA_4, TETRAHEDRA_10, HEXAHEDRA_8, HEXAHEDRA_20, WEDGES_6)}
+WEDGES_15 = ElementKind(
+    "15-node wedges", "wedge15", "C3D15", _PRISMATIC_QUADRATIC, _WEDGE, _WEDGE_EDGES, _WEDGE_FACES,
+    _wedge_rule(2, 3), _wedge_rule(4, 3),
+)  # fmt: skip
+KINDS = {
+    kind.file_type: kind
+    for kind in (TETRAHEDRA_4, TETRAHEDRA_10, HEXAHEDRA_8, HEXAHEDRA_20, WEDGES_6, WEDGES_15)
+}
 """The kinds by their names in meshio."""
+
+
+def meshio_with_wedges() -> Any:
+    """Return meshio, whose version 5.3 forgets of how many dimensions a wedge of 15 nodes is."""
+    import meshio
+    from meshio._mesh import topological_dimension
+
+    topological_dimension.setdefault("wedge15", 3)
+    return meshio
 
 
 def jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> FloatArray:

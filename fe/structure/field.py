@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fe.full.statics import Factorisation
 
+from .elements import meshio_with_wedges
 from .operators import Structure
 
 FloatArray = NDArray[np.float64]
@@ -59,8 +60,6 @@ def write_structure_vtu(
     OSError
         If the file cannot be written.
     """
-    import meshio
-
     given = dict(values or {})
     parameters, losses, masses = (
         {name: given[name] for name in names if name in given}
@@ -74,6 +73,7 @@ def write_structure_vtu(
     loss = np.zeros(len(structure.mesh.cells))
     for number, name in enumerate(structure.regions):
         loss[structure.region_of == number] = losses.get(name, 0.0)
+    meshio = meshio_with_wedges()
     mesh = meshio.Mesh(
         structure.mesh.points,
         [(structure.mesh.kind.file_type, structure.mesh.cells)],

@@ -40,6 +40,8 @@ class FileMesh:
         Nodes and cells of each set.
     face_sets : dict of str to tuple of corner tuples
         Faces, each by its corner nodes in rising order.
+    remarks : tuple of str
+        What a user should know of the file: words that were passed over though nobody knows what they do.
     """
 
     kind: ElementKind
@@ -50,6 +52,7 @@ class FileMesh:
     node_sets: dict[str, IntArray]
     cell_sets: dict[str, IntArray]
     face_sets: dict[str, frozenset[tuple[int, ...]]]
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,8 @@ class StructureMesh:
         Numbers of the nodes that no cell uses.
     loose_in : dict of str to int
         For each node set, how many of its nodes were left out.
+    remarks
+        As of `FileMesh`.
     """
 
     source: str
@@ -106,6 +111,7 @@ class StructureMesh:
     face_sets: dict[str, frozenset[tuple[int, ...]]]
     loose: IntArray
     loose_in: dict[str, int]
+    remarks: tuple[str, ...] = ()
 
     @property
     def unknowns(self) -> int:

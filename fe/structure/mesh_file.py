@@ -3,8 +3,10 @@
 import contextlib
 import io
 import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,10 @@ from scipy.sparse import csgraph
 from fe.runtime.errors import MeshError
 
 from .abaqus_file import read_abaqus
-from .elements import BATCH, KINDS, ElementKind, jacobians
+from .deck import one_kind
+from .elements import BATCH, jacobians, meshio_with_wedges
 from .mesh import FileMesh, StructureMesh
+from .nastran_file import read_nastran
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -25,11 +29,16 @@ _FLAT = {
     "vertex": 1, "line": 2, "line3": 2, "triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4,
 }  # fmt: skip
 """Cells that only name nodes and faces, with the number of their corners."""
+_READERS: dict[str, Callable[[Path], FileMesh]] = {
+    ".inp": read_abaqus, ".bdf": read_nastran, ".nas": read_nastran, ".fem": read_nastran,
+}  # fmt: skip
+"""Readers of this project; meshio reads what has another ending."""
 _MOST_VALUES = 1000
 LARGEST_EDGE_SHIFT = 0.3
 """A mid-edge node may lie so far from the middle of its edge, in lengths of the edge."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what overflows has no Jacobian that is positive and finite
 def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
     """Read a mesh file and check it.
 
@@ -54,15 +63,36 @@ def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
         )
     if path.is_file() and not path.stat().st_size:
         raise MeshError(f"The mesh file {path} is empty; write it anew.")
-    found = read_abaqus(path) if path.suffix.lower() == ".inp" else _from_meshio(path)
+    found = _READERS.get(path.suffix.lower(), _from_meshio)(path)
     if not np.isfinite(found.points).all():
         number = int(found.node_numbers[~np.isfinite(found.points).all(axis=1)][0])
         raise MeshError(f"{path}: the coordinates of node {number} are not finite numbers.")
-    mesh = _without_loose_nodes(found, path, unit, unit_name)
+    mesh = _without_loose_nodes(_each_once(found, path), path, unit, unit_name)
     _check_edges(mesh)
     _check_jacobians(mesh)
     _check_parts(mesh)
     return mesh
+
+
+def _each_once(found: FileMesh, path: Path) -> FileMesh:
+    """Merge elements that Gmsh writes once for each physical group; refuse doubled ones of other files."""
+    rows = np.sort(found.cells, axis=1)
+    _, first, back = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    twins = found.cell_numbers[np.setdiff1d(np.arange(len(rows)), first)]
+    if not len(twins):
+        return found
+    if path.suffix.lower() != ".msh":
+        raise MeshError(
+            f"{path}: {len(twins)} elements, such as {twins[0]}, have the nodes of another; delete them."
+        )
+    kept = np.sort(first)
+    place = np.searchsorted(kept, first[back.ravel()])
+    return replace(
+        found,
+        cells=found.cells[kept],
+        cell_numbers=found.cell_numbers[kept],
+        cell_sets={name: np.unique(place[members]) for name, members in found.cell_sets.items()},
+    )
 
 
 def _without_loose_nodes(found: FileMesh, path: Path, unit: float, unit_name: str) -> StructureMesh:
@@ -86,6 +116,7 @@ def _without_loose_nodes(found: FileMesh, path: Path, unit: float, unit_name: st
         },
         loose=found.node_numbers[~used],
         loose_in={name: int((~used[nodes]).sum()) for name, nodes in found.node_sets.items()},
+        remarks=found.remarks,
     )
 
 
@@ -109,7 +140,7 @@ def _check_jacobians(mesh: StructureMesh) -> None:
     local = np.vstack((mesh.kind.places, mesh.kind.stiffness_rule[0]))
     for start in range(0, len(mesh.cells), BATCH):
         least = np.linalg.det(jacobians(mesh.kind, mesh.nodes[start : start + BATCH], local)).min(axis=1)
-        count += int((least <= 0.0).sum())
+        count += int((~((least > 0.0) & (least < np.inf))).sum())
         if least.min() < worst:
             worst, where = float(least.min()), start + int(least.argmin())
     if count:
@@ -138,20 +169,8 @@ def _check_parts(mesh: StructureMesh) -> None:
         )
 
 
-def _bulk_data(path: Path) -> Any:
-    """Return a Nastran deck as meshio reads it, also one of bulk data alone, as Gmsh writes it."""
-    import meshio
-
-    text = path.read_text(encoding="utf-8", errors="replace")
-    with TemporaryDirectory() as folder:
-        copy = Path(folder) / "deck.bdf"
-        copy.write_text(text if "BEGIN BULK" in text.upper() else f"BEGIN BULK\n{text}", encoding="utf-8")
-        return meshio.read(copy)
-
-
 def _from_meshio(path: Path) -> FileMesh:
-    import meshio
-
+    meshio = meshio_with_wedges()
     if not path.is_file():
         raise MeshError(f"The mesh file {path} is not there.")
     said = io.StringIO()
@@ -163,10 +182,11 @@ def _from_meshio(path: Path) -> FileMesh:
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
-            found = _bulk_data(path) if path.suffix.lower() == ".bdf" else meshio.read(path)
+            found = meshio.read(path)
     except meshio.ReadError as error:
         raise MeshError(
-            f"The mesh file {path} cannot be read: {str(error).strip('. ') or 'its format is not known'}."
+            f"The mesh file {path} cannot be read: {str(error).strip('. ') or 'its format is not known'}; "
+            "write it as .msh, .inp, .med or .bdf."
         ) from None
     except OSError as error:
         raise MeshError(f"The mesh file {path} cannot be read: {error.strerror}.") from None
@@ -178,10 +198,16 @@ def _from_meshio(path: Path) -> FileMesh:
             f"The mesh file {path} cannot be read as {path.suffix}: the reader (meshio) says {str(error)!r}; "
             "it is damaged, cut off, or of another dialect. Write it anew, or as .msh or .inp."
         ) from None
-    kind = _one_kind(path, found)
+    counts = Counter[str]()
+    for block in found.cells:
+        if block.type not in _FLAT:
+            counts[block.type] += len(block.data)
+    kind = one_kind(str(path), counts)
     numbers = np.cumsum([0, *(len(block.data) for block in found.cells)])
     solid = [number for number, block in enumerate(found.cells) if block.type == kind.file_type]
     cells = np.concatenate([found.cells[number].data for number in solid]).astype(np.int64)
+    if path.suffix.lower() == ".med":
+        cells = cells[:, kind.mirrored]
     ids = np.concatenate([np.arange(numbers[number], numbers[number + 1]) + 1 for number in solid])
     points = np.zeros((len(found.points), 3))
     points[:, : found.points.shape[1]] = found.points
@@ -198,19 +224,6 @@ def _from_meshio(path: Path) -> FileMesh:
     )
 
 
-def _one_kind(path: Path, found: Any) -> ElementKind:
-    kinds = {block.type: len(block.data) for block in found.cells if block.type not in _FLAT}
-    unknown = [name for name in kinds if name not in KINDS]
-    if unknown or not kinds:
-        readable = ", ".join(KINDS)
-        came = ", ".join(unknown) or "none that is solid"
-        raise MeshError(f"{path}: cells of the kinds {readable} are expected, but {came} came.")
-    if len(kinds) > 1:
-        came = ", ".join(f"{count} {KINDS[name].name}" for name, count in kinds.items())
-        raise MeshError(f"{path}: a mesh of one kind of elements is expected, but {came} came.")
-    return KINDS[next(iter(kinds))]
-
-
 def _sets(
     found: Any, solid: list[int]
 ) -> tuple[dict[str, IntArray], dict[str, IntArray], dict[str, frozenset[tuple[int, ...]]]]:
@@ -222,23 +235,15 @@ def _sets(
             for number, chosen in enumerate(blocks):
                 if chosen is not None and len(chosen):
                     members.setdefault(name, []).append((number, np.asarray(chosen, dtype=np.int64)))
-    titles = (
-        {(int(dimension), int(tag)): name for name, (tag, dimension) in found.field_data.items()}
-        if all(len(value) == 2 for value in found.field_data.values())
-        else {}
-    )
     for label, arrays in found.cell_data.items():
-        for number, values in enumerate(np.asarray(array) for array in arrays):
-            for value, chosen in _values(values):
-                name = f"{label}={value}"
-                if label == "gmsh:physical":
-                    name = titles.get((_dimension(found.cells[number].type), value), name)
+        for number in range(len(arrays)):
+            for name, chosen in _named(found, label, arrays, number):
                 if name not in found.cell_sets:
                     members.setdefault(name, []).append((number, chosen))
     nodes = {name: np.unique(np.asarray(chosen, dtype=np.int64)) for name, chosen in found.point_sets.items()}
     for label, array in found.point_data.items():
-        for value, chosen in _values(np.asarray(array)):
-            nodes.setdefault(f"{label}={value}", chosen)
+        for name, chosen in _named(found, label, [array], 0):
+            nodes[name] = np.union1d(nodes.get(name, chosen), chosen)
     cells: dict[str, IntArray] = {}
     faces: dict[str, frozenset[tuple[int, ...]]] = {}
     for name, parts in members.items():
@@ -258,11 +263,23 @@ def _dimension(kind: str) -> int:
     return {1: 0, 2: 1}.get(_FLAT.get(kind, 5), 2 if kind in _FLAT else 3)
 
 
-def _values(array: NDArray[Any]) -> list[tuple[int, IntArray]]:
-    """Return the values of an array of integers and where each stands; none where it does not name sets."""
+def _named(found: Any, label: str, arrays: list[Any], number: int) -> Iterator[tuple[str, IntArray]]:
+    """Yield the sets of one of several arrays of integers: each value, by the names that the file has."""
+    array = np.asarray(arrays[number])
     if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
-        return []
+        return
     values = np.unique(array)
     if len(values) > _MOST_VALUES:
-        return []
-    return [(int(value), np.flatnonzero(array == value)) for value in values]
+        return
+    # MED counts families of named groups; meshio writes a set alone as 0 and -1, others write 1 and 0.
+    families = getattr(found, label, {}) if label in ("cell_tags", "point_tags") else {}
+    mask = {(-1, 0): 0, (0, 1): 1}.get(tuple(np.unique(np.concatenate(arrays)).tolist()))
+    for value in values.tolist():
+        names = families.get(value, [f"{label}={value}"])
+        if label == "gmsh:physical":
+            place = [value, _dimension(found.cells[number].type)]
+            names = [name for name, tag in found.field_data.items() if tag.tolist() == place] or names
+        if value == mask and ":" not in label:
+            names = [*names, label]
+        for name in names:
+            yield name, np.flatnonzero(array == value)

@@ -29,6 +29,7 @@ DECK = """*NODE
 1, 4, 5, 8
 *SURFACE, NAME=END
 BAR, S4
+*INITIAL CONDITIONS, TYPE=STRESS
 """
 STRUCTURE = """
 name = "bar"
@@ -94,6 +95,7 @@ def test_info_says_what_a_structure_is(
     for part in (
         "1 8-node hexahedra, 8 nodes",
         "linear: far too stiff in bending",
+        "line 17: *INITIAL CONDITIONS is not known and was passed over; make sure that the model may do",
         "1 touch no element, among them 9",
         "scaled by e",
         "holds x, y, z",

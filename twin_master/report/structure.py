@@ -8,7 +8,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from fe.structure.elements import KINDS
+from fe.structure.elements import KINDS, meshio_with_wedges
 from reporting import figures as style
 
 FloatArray = NDArray[np.float64]
@@ -34,9 +34,7 @@ def structure_figure(run_folder: Path) -> StructurePicture | None:
     path = run_folder / FIELD_NAME
     if not path.is_file():
         return None
-    import meshio
-
-    mesh = meshio.read(path)
+    mesh = meshio_with_wedges().read(path)
     kind = KINDS[mesh.cells[0].type]
     loss = np.asarray(mesh.cell_data["stiffness_loss"][0], dtype=np.float64)
     region = np.asarray(mesh.cell_data["region"][0])

@@ -7,12 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import meshio
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fe.structure.elements import KINDS
+from fe.structure.elements import KINDS, meshio_with_wedges
 
 FloatArray = NDArray[np.float64]
 Divisions = tuple[int, int, int]
@@ -50,6 +49,7 @@ def write(tmp_path: Path) -> Callable[..., Path]:
     def make(
         points: FloatArray, kind: str, cells: Any, text: str, mesh: str = "mesh.vtu", **sets: Any
     ) -> Path:
+        meshio = meshio_with_wedges()
         meshio.write(tmp_path / mesh, meshio.Mesh(points, [(kind, cells)], **sets))
         file = tmp_path / "structure.toml"
         file.write_text(f'name = "test"\nmesh = "{mesh}"\n{text}', encoding="utf-8")

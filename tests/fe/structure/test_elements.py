@@ -49,7 +49,7 @@ def distorted(
     return read_mesh(write(moved, request.param, cells, "").parent / "mesh.vtu", 1.0, "m")
 
 
-@pytest.mark.parametrize("name", sorted(KINDS))
+@pytest.mark.parametrize("name", sorted(SKFEM))  # which has no wedge of 15 nodes; CalculiX has
 def test_shape_functions_are_those_of_scikit_fem(name: str) -> None:
     kind, other = KINDS[name], SKFEM[name]
     local = np.random.default_rng(0).random((7, 3)) / 3.0

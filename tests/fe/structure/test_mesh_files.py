@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fe.runtime.errors import MeshError
-from fe.structure.elements import KINDS
+from fe.structure.elements import KINDS, meshio_with_wedges
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import load_and_assemble
@@ -21,7 +21,7 @@ from fe.structure.solution import static_responses
 DECKS = Path("/usr/share/doc/calculix-ccx-test/examples/test")
 
 
-@pytest.mark.parametrize("kind", ["tetra", "tetra10", "hexahedron", "hexahedron20", "wedge"])
+@pytest.mark.parametrize("kind", ["tetra", "tetra10", "hexahedron", "hexahedron20", "wedge", "wedge15"])
 @pytest.mark.parametrize(
     ("name", "file_format"),
     [("m.vtu", "vtu"), ("m.msh", "gmsh"), ("o.msh", "gmsh22"), ("m.inp", "abaqus"), ("m.bdf", "nastran")],
@@ -36,7 +36,7 @@ def test_formats_agree(
     if file_format.startswith("gmsh"):
         tags = np.zeros(len(cells), dtype=np.int32)
         data = {"cell_data": {"gmsh:physical": [tags], "gmsh:geometrical": [tags]}}
-    meshio.write(path, meshio.Mesh(points, [(kind, cells)], **data), file_format=file_format)
+    meshio_with_wedges().write(path, meshio.Mesh(points, [(kind, cells)], **data), file_format=file_format)
     mesh = read_mesh(path, 1e-3, "mm")
     assert mesh.kind is KINDS[kind]
     np.testing.assert_allclose(mesh.nodes, 1e-3 * points[cells], atol=1e-9)
@@ -140,20 +140,35 @@ def test_a_deck_is_read_with_its_sets(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("type=C3D8,", "type=S4R,", r"m\.inp, line 21: elements of type S4R cannot be read; C3D4, "),
-        ("type=C3D8,", "type=C3D20,", r"line 21: 20-node hexahedra \(C3D20\) stand beside 8-node hexahedra"),
-        ("12, 13, 16, 15", "12, 13, 16", r"line 21: 8 numbers below \*ELEMENT are not a multiple of 9"),
-        ("2, 1, 0., 0\n", "2, 1, O., 0\n", r"line 6: the coordinates of a node .* '1,O\.,0' came"),
-        ("2, 1, 0., 0\n", "2, nan, 0., 0\n", r"the coordinates of node 2 are not finite"),
+        ("type=C3D8,", "type=S4R,", r"m\.inp, line 21: elements of type 'S4R' cannot be read; C3D4, "),
+        (
+            "*NSET, NSET=root",
+            "*ELEMENT, TYPE=C3D6\n7, 1, 2, 4, 11, 12, 14\n8, 2, 5, 4, 12, 15, 14\n"
+            "*NSET, NSET=root",
+            "line 24: one kind of elements is expected, but 2 8-node hexahedra, 2 6-node wedges "
+            "came; mesh it with tetrahedra alone",
+        ),
+        ("20, 2, 3", "12, 12, 15, 14, 1, 2, 5, 4, 11\n20, 2, 3", "1 elements, such as 12, have the"),
+        ("3, 2, 0\n", "3, 2, 0\n3, 2, 1\n", "line 8: node 3 is there twice, at different places; delete one"),
+        ("*MATERIAL", "*SOLID SECTION, ELSET=end\n*MATERIAL", "line 35: 1 bars, membranes or .* 'END'"),
+        ("*Node, nset", "*Node, input=x, nset", r"line 4: \*NODE with 'INPUT' is not read; write"),
+        ("*Node, nset", "*Node, system=s, nset", r"line 4: \*NODE with SYSTEM=S is not read"),
+        ("*MATERIAL", "*SYSTEM\n0, 0, 0, 1, 0, 0\n2, 0, 0\n*MATERIAL", "line 35: the three points"),
+        ("*MATERIAL", "*SYSTEM\n0, 0\n*MATERIAL", r"line 35: \*SYSTEM needs one, two or three points"),
+        ("1, 4, 3\n", "1, 9999999999, 3\n", "line 24: the sets hold more than 5,000,000"),
+        ("12, 13, 16, 15", "12, 13, 16", "line 21: 8 numbers are not a multiple of 9, as C3D8 needs"),
+        ("2, 1, 0., 0\n", "2, 1, O., 0\n", r"line 6: a real number is expected, but 'O\.' came"),
+        ("2, 1, 0., 0\n", "2, nan, 0., 0\n", "line 6: a real number is expected, but 'nan' came"),
+        ("3, 2, 0\n", "3, 1e200, 1e200, 1e200\n", "1 of 2 elements are inside out or flat"),
         ("20, 2, 3", "20, 2, 77", "element 20 names node 77, which is not there"),
         ("20, 2, 3", "10, 2, 3", "line 22: element 10 is there twice"),
         ("20, 2, 3", "x, 2, 3", "line 22: a whole number is expected, but 'x' came"),
         ("1, 4, 3\n", "1, 7, 3\n", "the set 'root' names node 7, which is not there"),
         ("left, RIGHT", "left, 55", "the set 'BODY' names element 55, which is not there"),
         ("20, S2", "20, S7", r"line 32: a face S1 to S6 of 8-node hexahedra is expected, but 'S7' came"),
-        ("1, 4, 3\n", "1\n", r"line 24: first, last and step are expected with GENERATE, but '1' came"),
-        ("1, 4, 3\n", "1, 4, 0\n", r"first, last and step are expected with GENERATE, but '1,4,0' came"),
-        ("*HEADING", "*PART", r"line 1: a deck with \*PART is not read"),
+        ("1, 4, 3\n", "1\n", r"line 24: first, last and step are expected, but '1' came"),
+        ("1, 4, 3\n", "1, 4, 0\n", r"first, last and step are expected, but '1,4,0' came"),
+        ("*HEADING", "*PART", r"line 1: \*PART makes a deck of parts, which is not read; write it without"),
         ("*NSET, NSET=Both", "*NSET", r"line 26: \*NSET must say NSET=a name"),
         ("11, 12, 15, 14\n", "11, 14, 15, 12\n", r"1 of 2 elements .* flat .* element 10 at \(0\.5, "),
         ("2, 3, 6, 5, 12, 13, 16, 15", "3, 2, 5, 6, 13, 12, 15, 16", "1 of 2 elements are inside out"),
@@ -196,10 +211,11 @@ def test_other_files_that_cannot_be_read_are_refused(
     assert "m.vtu cannot be read as .vtu: Couldn't read file" in sentence("m.vtu")
     assert capsys.readouterr() == ("", "")
     points, cells = box("hexahedron", (1, 1, 1))
-    meshio.write(tmp_path / "p.vtu", meshio.Mesh(points, [("hexahedron", cells), ("wedge", cells[:, :6])]))
-    assert "one kind of elements is expected, but 1 8-node hexahedra, 1 6-node wedges" in sentence("p.vtu")
+    kinds = (("hexahedron", 8), ("wedge", 6), ("hexahedron", 8))
+    meshio.write(tmp_path / "p.vtu", meshio.Mesh(points, [(k, cells[:, :n]) for k, n in kinds]))
+    assert "one kind of elements is expected, but 2 8-node hexahedra, 1 6-node wedges" in sentence("p.vtu")
     meshio.write(tmp_path / "q.vtu", meshio.Mesh(points, [("pyramid", cells[:, :5])]))
-    assert "are expected, but pyramid came" in sentence("q.vtu")
+    assert "is expected, but 1 pyramid came" in sentence("q.vtu")
     meshio.write(tmp_path / "s.vtu", meshio.Mesh(points, [("quad", cells[:, :4])]))
     assert "but none that is solid came" in sentence("s.vtu")
     points, cells = box("tetra10", (1, 1, 1))

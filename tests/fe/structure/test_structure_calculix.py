@@ -102,9 +102,9 @@ direction = [0, 0, 1]
 def body(
     box: Callable[..., Any], write: Callable[..., Path], kind: str, text: str = BODY, **options: bool
 ) -> Structure:
-    points, cells = box(kind, (4, 2, 1) if kind in ("hexahedron20", "tetra10") else (4, 2, 2))
+    points, cells = box(kind, (4, 2, 1) if kind in ("hexahedron20", "tetra10", "wedge15") else (4, 2, 2))
     bent = points * (100, 25, 10)
-    if kind in ("hexahedron20", "tetra10"):  # curved edges, in the plane of the top
+    if kind in ("hexahedron20", "tetra10", "wedge15"):  # curved edges, in the plane of the top
         bent[:, 1] += 12.0 * (bent[:, 0] / 100.0) ** 2 * (bent[:, 1] / 25.0)
     data = {"top": (points[:, 2] == 1.0).astype(np.int64), "tip": (points[:, 0] == 1.0).astype(np.int64)}
     return load_and_assemble(write(bent, kind, cells, text, point_data=data), **options)
@@ -122,6 +122,7 @@ FLANGE = 'set = "root"\nrigid_about = [-5, 10, 3]\nhold = ["x", "rz"]\nsprings =
         ("tetra10", HELD),
         ("hexahedron", HELD),
         ("hexahedron20", HELD),
+        ("wedge15", HELD),
         ("hexahedron", FLANGE),
     ],
 )

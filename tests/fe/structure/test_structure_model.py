@@ -11,7 +11,9 @@ import pytest
 
 from fe.runtime.errors import InvalidDesignError, InvalidStateError, MeshError
 from fe.structure.elements import KINDS
+from fe.structure.field import write_structure_vtu
 from fe.structure.memory import analysed_estimate, check_memory, upper_estimate
+from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import Structure, load_and_assemble
 from fe.structure.solution import natural_frequencies, static_responses, weighed
 
@@ -64,7 +66,13 @@ def ring(box: Callable[..., Any], write: Callable[..., Path], kind: str, count: 
 
 @pytest.mark.parametrize(
     ("kind", "order", "error"),
-    [("hexahedron", 1.7, 2e-2), ("tetra", 1.6, 5e-2), ("tetra10", 3.7, 1e-4), ("hexahedron20", 3.7, 1e-4)],
+    [
+        ("hexahedron", 1.7, 2e-2),
+        ("tetra", 1.6, 5e-2),
+        ("tetra10", 3.7, 1e-4),
+        ("hexahedron20", 3.7, 1e-4),
+        ("wedge15", 3.5, 1e-4),
+    ],
 )
 def test_a_thick_ring_under_pressure_converges_to_lame(
     kind: str, order: float, error: float, box: Callable[..., Any], write: Callable[..., Path]
@@ -85,6 +93,17 @@ def test_a_thick_ring_under_pressure_converges_to_lame(
     assert errors[1] < error
     assert np.log2(errors[0] / errors[1]) > order
     assert np.log2(lost[0] / lost[1]) > order
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_the_field_of_every_kind_is_written(
+    kind: str, box: Callable[..., Any], write: Callable[..., Path], tmp_path: Path
+) -> None:
+    structure = ring(box, write, kind, 2)
+    write_structure_vtu(tmp_path / "field.vtu", structure)
+    found = read_mesh(tmp_path / "field.vtu", 1.0, "m")
+    assert found.kind is KINDS[kind]
+    np.testing.assert_array_equal(found.cells, structure.mesh.cells)
 
 
 BEAM = """
@@ -380,4 +399,4 @@ def test_memory_is_estimated_before_it_is_taken(beam: Callable[..., Structure]) 
     check_memory(mesh)
     with pytest.raises(MeshError, match=r"744 unknowns would take about 0\.\d GiB, but 0\.1 GiB are allowed"):
         check_memory(mesh, 0.1 * 2**30)
-    assert set(KINDS) == {"tetra", "tetra10", "hexahedron", "hexahedron20", "wedge"}
+    assert set(KINDS) == {"tetra", "tetra10", "hexahedron", "hexahedron20", "wedge", "wedge15"}

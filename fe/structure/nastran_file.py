@@ -1,0 +1,186 @@
+"""Reading the mesh of a Nastran deck: grid points in any coordinate system, solid elements, properties.
+
+meshio reads such decks as well, but takes every grid point for Cartesian, passes rigid elements over and does
+not name the line of a fault.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.runtime.errors import MeshError
+from reporting.text_file import read_text
+
+from .coordinates import GLOBAL, System, frame
+from .deck import Deck, fail, included, real, shown, whole, words_of
+from .elements import KINDS
+from .mesh import FileMesh
+
+FloatArray = NDArray[np.float64]
+
+_SOLIDS = {"CTETRA": 4, "CHEXA": 8, "CPENTA": 6}
+"""Solid elements with the number of their corners."""
+_ORDER = {
+    "hexahedron20": (*range(12), *range(16, 20), *range(12, 16)),
+    "wedge15": (*range(9), *range(12, 15), *range(9, 12)),
+}
+"""Nastran counts the middles of the upright edges before those of the top."""
+_FLAT = {
+    "CTRIA3": 3, "CTRIAR": 3, "CTRIA6": 6, "CQUAD4": 4, "CQUADR": 4, "CQUAD8": 8,
+    "CBAR": 2, "CBEAM": 2, "CROD": 2, "CTUBE": 2,
+}  # fmt: skip
+"""Shells and bars, by which Gmsh and others hand on surfaces and lines: without a property they only name."""
+_SECTIONS = re.compile("P(BAR|BEAM|BCOMP|COMP|LPLANE|ROD|SHEAR|SHELL|TUBE)[GL]?")
+_SYSTEM = re.compile(r"CORD([12])([RCS])")
+_BEGIN = re.compile(r"\s*BEGIN\b", re.IGNORECASE)
+_MARKER = re.compile(r"\+(?![\d.])")
+_DEEPEST = 50
+
+
+class _Card(NamedTuple):
+    """A word of the bulk data, where it stands, and its fields from the second on, without continuations."""
+
+    word: str
+    where: str
+    fields: list[str]
+
+    def whole(self, number: int, default: int = 0) -> int:
+        """Return a field as a whole number."""
+        text = self.fields[number] if number < len(self.fields) else ""
+        return whole(self.where, text) if text else default
+
+    def reals(self, first: int, count: int) -> list[float]:
+        """Return fields as real numbers; what is left out is zero."""
+        given = [real(self.where, text) if text else 0.0 for text in self.fields[first : first + count]]
+        return given + [0.0] * (count - len(given))
+
+
+def read_nastran(path: Path) -> FileMesh:
+    """Read the mesh of a deck: its bulk data, with or without the sections above it.
+
+    The elements of a property are the set `nastran:ref=` and its number.
+
+    Raises
+    ------
+    MeshError
+        If it cannot be read, or holds what the mesh would lose; the sentence names the line.
+    """
+    deck = Deck(path, words_of("nastran"))
+    points = _Points()
+    for card in _cards((path,)):
+        word = card.word
+        if word == "GRID":
+            if points.grids.setdefault(card.whole(0), card).fields != card.fields:
+                fail(card.where, f"the grid point {card.whole(0)} is there twice; delete one.")
+        elif word == "GRDSET":
+            points.system_of_grids = card.whole(1)
+        elif _SYSTEM.fullmatch(word):
+            for first in (0, 4) if word[4] == "1" and card.whole(4) else (0,):
+                points.systems[card.whole(first)] = card._replace(fields=card.fields[first:])
+        elif word in _SOLIDS or word in _FLAT:
+            _add_element(deck, card)
+        elif _SECTIONS.fullmatch(word):
+            deck.sections[f"nastran:ref={card.whole(0)}"] = card.where
+        else:
+            deck.word(word, card.where)
+    for number, card in points.grids.items():
+        deck.add_node(card.where, number, points.place(number, card.where))
+    return deck.mesh()
+
+
+def _add_element(deck: Deck, card: _Card) -> None:
+    number = card.whole(0)
+    nodes = [card.whole(field) for field in range(2, 2 + _FLAT.get(card.word, len(card.fields)))]
+    kind = None
+    if card.word in _SOLIDS:
+        nodes = [node for node in nodes if node]
+        kinds = {kind.node_count: kind for kind in KINDS.values() if len(kind.corners) == _SOLIDS[card.word]}
+        if len(nodes) not in kinds:
+            counts = " or ".join(map(str, kinds))
+            fail(card.where, f"{card.word} {number} must have {counts} nodes, but {len(nodes)} came.")
+        kind = kinds[len(nodes)]
+        nodes = [nodes[place] for place in _ORDER.get(kind.file_type, range(len(nodes)))]
+    deck.add_element(card.where, number, kind, nodes)
+    deck.members("ELSET", f"nastran:ref={card.whole(1, number)}").append(number)
+
+
+class _Points:
+    """Grid points and the coordinate systems that they are given in, which may be given by grid points."""
+
+    def __init__(self) -> None:
+        self.grids: dict[int, _Card] = {}
+        self.systems: dict[int, _Card] = {}
+        self.system_of_grids = 0
+        self._found: dict[int, System] = {0: GLOBAL}
+
+    def place(self, number: int, where: str, depth: int = 0) -> FloatArray:
+        """Return the place (3,) of a grid point."""
+        if number not in self.grids:
+            fail(where, f"the grid point {number} is not there.")
+        card = self.grids[number]
+        return self._system(card.whole(1, self.system_of_grids), card.where, depth).place(card.reals(2, 3))
+
+    def _system(self, number: int, where: str, depth: int) -> System:
+        if number not in self._found:
+            if number not in self.systems:
+                fail(where, f"the coordinate system {number} is not there.")
+            if depth > _DEEPEST:
+                fail(where, f"the coordinate system {number} rests on itself, or on too many others.")
+            card = self.systems[number]
+            if card.word[4] == "1":
+                given = [self.place(card.whole(field), card.where, depth + 1) for field in (1, 2, 3)]
+                points = np.array(given)
+            else:
+                reference = self._system(card.whole(1), card.where, depth + 1)
+                points = reference.place(np.reshape(card.reals(2, 9), (3, 3)))
+            axes = frame(card.where, points, (1, 2, 0))  # origin, a point on z, one in the plane of x and z
+            self._found[number] = System(points[0], axes, card.word[5])
+        return self._found[number]
+
+
+def _cards(files: tuple[Path, ...]) -> Iterator[_Card]:
+    lines = read_text(files[-1], MeshError, what="mesh file", otherwise="latin-1").splitlines()
+    start = next((number for number, line in enumerate(lines, start=1) if _BEGIN.match(line)), 0)
+    card: _Card | None = None
+    marker = ""
+    for number, line in enumerate(lines[start:], start=start + 1):
+        where = f"{files[-1]}, line {number}"
+        text = line.partition("$")[0].expandtabs(8).rstrip()
+        if not text:
+            continue
+        if text.strip().upper().startswith("INCLUDE"):
+            yield from _cards(included(where, files, text.strip()[7:].strip(" '\"")))
+            continue
+        head, *fields, end = _fields(where, text)
+        if not head or head[0] in "+*":
+            if card is None or (len(head) > 1 and marker and head[1:] != marker):
+                fail(where, f"the continuation {shown(head)} stands behind no line that it continues.")
+            card.fields.extend(fields)
+        else:
+            if card is not None:
+                yield card
+            card = _Card(head.upper().rstrip("*_"), where, fields)  # meshio writes CTETRA_
+            if card.word.startswith("ENDDATA"):
+                return
+        marker = end.lstrip("+*")
+    if card is not None:
+        yield card
+
+
+def _fields(where: str, text: str) -> list[str]:
+    """Return the word of a line, its four (wide) or eight fields, and the marker of its continuation."""
+    if "," in text:
+        given = [part.strip() for part in text.split(",")]
+        count = 4 if "*" in given[0] else 8
+        marker = given.pop() if _MARKER.match(given[-1]) else ""
+        if len(given) > count + 2:
+            fail(where, f"a line of at most {count + 2} fields is expected, but {len(given)} came.")
+        given += [""] * (count + 2 - len(given))
+        return [*given[:-1], marker or given[-1]]
+    count, width = (4, 16) if "*" in text[:8] else (8, 8)
+    middle = [text[8 + width * number : 8 + width * (number + 1)].strip() for number in range(count)]
+    return [text[:8].strip(), *middle, text[72:].strip()]
