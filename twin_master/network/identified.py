@@ -51,7 +51,9 @@ class IdentifiedSensorModel(GaussianSensorModel):
             np.broadcast_to(covariance[np.ix_(seen, seen)], (self.state_count, seen.size, seen.size))
         )
         place = np.arange(seen.size)
-        total[:, place, place] += self.total_standard_deviation[:, control_index, seen] ** 2
+        total[:, place, place] += self.independent_standard_deviation[:, control_index, seen] ** 2
+        interval = self.interval[:, control_index, seen]
+        total += interval @ interval.swapaxes(1, 2)
         try:
             factor = np.linalg.cholesky(total)
         except np.linalg.LinAlgError:
