@@ -23,6 +23,8 @@ Index = NDArray[np.int64]
 _WORST_SHOWN = 3
 LARGEST = 1e140
 """Its square is still a number."""
+LEAST_LEFT = 1e-12
+"""What rounding leaves of the share of a sensor that alone tells where in the interval the truth is."""
 LOG_ROOT_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
 
 
@@ -385,9 +387,10 @@ class GaussianSensorModel(QuantityModel):
         place = np.einsum("sfh,sgh,esg->esf", inverse, scaled, residual, optimize=True)
         moved = np.einsum("sgf,esf->esg", self.interval[:, control_index], place, optimize=True)
         left = 1.0 - np.einsum("sgf,sfh,sgh->sg", scaled, inverse, scaled, optimize=True)
+        left = left.clip(LEAST_LEFT)
         return Nearest(
             value=value + moved,
-            alone=value + distance - (distance - moved) / left,
+            alone=value + (distance - (distance - moved) / left),
             left=left,
             log_density=0.5 * (np.linalg.slogdet(inverse)[1] - np.sum(place**2, axis=-1)),
         )

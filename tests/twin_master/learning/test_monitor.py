@@ -1,5 +1,6 @@
 """What is noticed, against sums over every course of events, an exact mean, and faults that are put in."""
 
+from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
@@ -17,6 +18,7 @@ from twin_master.network.estimator import Carried, Estimate, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import Twin
+from twin_master.scenario.reading import load_scenario
 
 Float = NDArray[np.float64]
 
@@ -237,9 +239,17 @@ def test_too_many_states_are_refused_in_a_sentence(monkeypatch: pytest.MonkeyPat
         watchful()
 
 
+def at_levels(name: str, between: bool) -> Knowledge:
+    loaded = load_scenario(name)
+    observation = loaded.scenario.observation.model_copy(update={"between_levels": between})
+    return prepare_twin(
+        replace(loaded, scenario=loaded.scenario.model_copy(update={"observation": observation}))
+    )
+
+
 @pytest.fixture(scope="module")
 def wing() -> Knowledge:
-    return prepare_twin("level_turns")
+    return at_levels("level_turns", False)
 
 
 def fly(
@@ -321,3 +331,23 @@ def test_an_absurd_gauge_is_left_out_with_a_word(wing: Knowledge) -> None:
     left_out = [bool(e.suspicion.left_out[11]) for e in estimates if e.suspicion is not None]
     assert left_out == [3 <= turn < 10 for turn in range(12)]
     assert estimates[-1].filtered[0] > 0.3  # today's twin: 80 % damage, with certainty
+
+
+@pytest.mark.parametrize(("between", "alarmed"), [(True, 0), (False, 10)])
+def test_damage_between_two_levels_raises_no_alarm(between: bool, alarmed: int) -> None:
+    """Ten flights of the panel with a stiffener that grows soft between two levels, and nothing else."""
+    panel = at_levels("stiffened_panel", between)
+    sensors, shape = panel.sensor_model, panel.model.states.shape
+    table = sensors.mean[:, 1].reshape(*shape, -1)[:, 0, 0]  # (levels, sensors), at full pressure
+    estimator = WatchfulEstimator(panel.twin().estimator, sensors, panel.draws.values)
+    alarms = 0
+    for flight in range(10):
+        random, before, raised = np.random.default_rng(flight), None, False
+        for turn in range(30):
+            loss = min(0.25 + 0.01 * turn, 0.4) / 0.25
+            shown = [np.interp(loss, np.arange(shape[0]), column) for column in table.T]
+            seen = shown + sensors.standard_deviation * random.normal(size=len(shown))
+            estimate = estimator.turn(before, seen, 1, turn)
+            before, raised = estimate.carried, raised or any(n.kind == "alarm" for n in estimate.notices)
+        alarms += raised
+    assert alarms == alarmed
