@@ -45,17 +45,23 @@ def _log_mean_exp(exponent: Float, log_weight: Float) -> float:
 
 @compiled
 def _log_density(
-    seen: Float, value: Float, inverse_deviation: Float, log_scale: Float, interval: Float, exponent: Float
-) -> float:
-    """Fill exponent (E,) with the log density of an observation (G,) in a state; return what draws share.
+    sensors: range,
+    seen: Float,
+    value: Float,
+    inverse_deviation: Float,
+    log_scale: Float,
+    interval: Float,
+) -> tuple[float, Float]:
+    """Return the log density of what sensors see in a state: what all draws share, and of each draw (E,).
 
-    value is (G, E), inverse_deviation and its logarithm (G,), interval (G, F) in units of the deviation: the
-    covariance is the unit matrix plus interval times its transpose, inverted by Woodbury's identity.
+    seen is (G,), value (G, E), inverse_deviation and its logarithm (G,), interval (G, F) in units of the
+    deviation: the covariance is the unit matrix plus interval times its transpose, inverted by Woodbury's
+    identity.
     """
-    sensors, factors = interval.shape
-    exponent[:] = 0.0
+    factors = interval.shape[1]
+    exponent = np.zeros(value.shape[1])
     projected, matrix, shared = np.zeros((factors, len(exponent))), np.eye(factors), 0.0
-    for g in range(sensors):
+    for g in sensors:
         if np.isnan(seen[g]):
             continue
         shared += log_scale[g] - LOG_ROOT_TWO_PI
@@ -81,7 +87,7 @@ def _log_density(
             projected[f, e] /= matrix[f, f]
             if exponent[e] > -np.inf:
                 exponent[e] += 0.5 * projected[f, e] * projected[f, e]
-    return float(shared)
+    return shared, exponent
 
 
 @compiled
@@ -102,7 +108,6 @@ def _log_densities(
     inverse_deviation are (U, S, G), interval (U, S, G, F) is in units of the deviation.
     """
     steps, sensors = observation.shape
-    exponent = np.empty(value.shape[3])
     for t in range(steps):
         u = control[t]
         if np.all(np.isnan(observation[t])):
@@ -110,20 +115,19 @@ def _log_densities(
             continue
         together = 1 if inside else sensors  # how many sensors share a draw
         for s in range(value.shape[1]):
-            total = 0.0
+            result[t, s] = 0.0
             for first in range(0, sensors, together):
-                those = slice(first, first + together)
                 if inside and np.isnan(observation[t, first]):
                     continue
-                total += _log_density(
-                    observation[t, those], value[u, s, those], inverse_deviation[u, s, those],
-                    log_scale[u, s, those], interval[u, s, those], exponent,
+                shared, exponent = _log_density(
+                    range(first, first + together), observation[t], value[u, s], inverse_deviation[u, s],
+                    log_scale[u, s], interval[u, s],
                 )  # fmt: skip
+                result[t, s] += shared
                 if result.shape[2] == 1:
-                    total += _log_mean_exp(exponent, log_weight)
-                    exponent[:] = 0.0
-            for e in range(result.shape[2]):
-                result[t, s, e] = total + exponent[e]
+                    result[t, s] += _log_mean_exp(exponent, log_weight)
+                else:
+                    result[t, s] += exponent
 
 
 @dataclass(frozen=True)

@@ -27,14 +27,15 @@ GAINS = SETTINGS.gauge_gain * np.array([-2.5, -1.0, 1.0, 2.5])
 DRAWS = np.array([1.0, 2.0])
 
 
-def small(gauges: int = 3) -> tuple[GraphicalModel, GaussianSensorModel]:
+def small(gauges: int = 3, width: float = 0.0) -> tuple[GraphicalModel, GaussianSensorModel]:
     model = GraphicalModel.from_tables({"z": [0, 1, 2]}, {"u": {"z": worsening_table(3, 0.2)}})
     value = np.random.default_rng(1).normal(10.0, 3.0, size=(2, 3, 1, gauges))
-    return model, GaussianSensorModel(value, 1.0)
+    interval = width * np.random.default_rng(2).normal(size=(3, 1, gauges, 1)) if width else None
+    return model, GaussianSensorModel(value, 1.0, interval=interval)
 
 
-def watchful(gauges: int = 3, given: MonitorSettings = SETTINGS) -> WatchfulEstimator:
-    model, sensors = small(gauges)
+def watchful(gauges: int = 3, given: MonitorSettings = SETTINGS, width: float = 0.0) -> WatchfulEstimator:
+    model, sensors = small(gauges, width)
     return WatchfulEstimator(ExactFilter(model, sensors), sensors, DRAWS, given)
 
 
@@ -47,14 +48,16 @@ def run(estimator: WatchfulEstimator, seen: Float) -> list[Estimate]:
     return estimates
 
 
-def drawn(random: np.random.Generator, turns: int, gauges: int = 3) -> Float:
+def drawn(random: np.random.Generator, turns: int, gauges: int = 3, width: float = 0.0) -> Float:
     """Return observations of the model itself, with noise scales drawn from their prior."""
-    model, sensors = small(gauges)
+    model, sensors = small(gauges, width)
     half = 0.5 * SETTINGS.noise_degrees
     scale = np.sqrt(half / random.gamma(half, size=gauges))
     draw, state, rows = random.integers(2), 0, []
     for _ in range(turns):
         rows.append(sensors.value_per_draw[draw, state, 0] + scale * random.normal(size=gauges))
+        if width:
+            rows[-1] += sensors.interval[state, 0] @ random.normal(size=1)
         state = random.choice(3, p=model.transition.matrix[0, state])
     return np.array(rows)
 
@@ -145,12 +148,13 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
         assert mean == pytest.approx(np.exp(getattr(today.suspicion, name)), rel=1e-4)
 
 
-def test_false_alarms_are_rarer_than_the_threshold_says() -> None:
+@pytest.mark.parametrize("width", [0.0, 1.0, 10.0])
+def test_false_alarms_are_rarer_than_the_threshold_says(width: float) -> None:
     """The noise is what the model says, and its sums of squares are expected ones: what that costs."""
-    estimator, random = watchful(), np.random.default_rng(5)
+    estimator, random = watchful(width=width), np.random.default_rng(5)
     largest = []
     for _ in range(120):
-        turns = [estimate.suspicion for estimate in run(estimator, drawn(random, 15))]
+        turns = [estimate.suspicion for estimate in run(estimator, drawn(random, 15, width=width))]
         largest.append([(s.log_evidence_any_gauge, s.log_evidence_none) for s in turns if s is not None])
     values = np.exp(np.array(largest))  # (missions, turns, 2)
     assert np.all(values.mean(axis=0) < 1.5)
