@@ -296,6 +296,9 @@ def main() -> int:
         f"each gauge, or `{SCALED}` for none and predictions that are right for the undamaged wing; with "
         f"--combinations by default 0, 3, {MISFIT} and {SCALED}",
     )  # fmt: skip
+    parser.add_argument(
+        "--at-levels", action="store_true", help="a twin that takes damage to be at levels, as the paper's"
+    )
     parser.add_argument("--markdown", action="store_true", help="print the tables for a page")
     given = parser.parse_args()
     if given.combinations and (given.strain_library is None or given.fmu):
@@ -311,6 +314,9 @@ def main() -> int:
             )
     library = None if given.combinations else given.strain_library
     scenario = resolve_scenario(load_scenario("level_turns"), Overrides(strain_library=library))
+    if given.at_levels:
+        observation = scenario.observation.model_copy(update={"between_levels": False})
+        scenario = scenario.model_copy(update={"observation": observation})
     if given.decide_on:
         planner = scenario.planner.model_copy(update={"decide_on": given.decide_on})
         scenario = scenario.model_copy(update={"planner": planner})

@@ -74,27 +74,11 @@ def _on_nodes(
     source: Unsigned,
     probability: Float,
     control: Index,
-    observed: Float,
-    value: Float,
-    inverse_deviation: Float,
+    exponent: Float,
     result: Float,
 ) -> None:
-    """Fill result (E,) for predicted values (U, S, G, E) of E nodes, up to what all nodes share."""
-    steps, sensors = observed.shape
-    size, nodes = value.shape[1], value.shape[3]
-    exponent = np.empty((steps, size, nodes))
-    for t in range(steps):
-        u = control[t]
-        for s in range(size):
-            exponent[t, s, :] = 0.0
-            for g in range(sensors):
-                if np.isnan(observed[t, g]):
-                    continue
-                scale = inverse_deviation[u, s, g]
-                shift = np.log(scale)
-                for e in range(nodes):
-                    residual = (observed[t, g] - value[u, s, g, e]) * scale
-                    exponent[t, s, e] += shift - 0.5 * residual * residual
+    """Fill result (E,) for log densities (T, S, E) at E nodes, up to what all nodes share."""
+    steps, size, nodes = exponent.shape
     likelihood = np.empty((steps, size))
     for e in range(nodes):
         common = 0.0
@@ -220,12 +204,7 @@ def transition_evidence(worsening: Worsening, points: Float, likelihood: Float, 
 
 
 def node_evidence(
-    worsening: Worsening,
-    probability: Float,
-    values: Float,
-    deviation: Float,
-    observed: Float,
-    control: Index,
+    worsening: Worsening, probability: Float, model: GaussianSensorModel, observed: Float, control: Index
 ) -> Float:
     """Return the log evidence of B twins at E values of a parameter that does not change in time: (B, E).
 
@@ -234,20 +213,16 @@ def node_evidence(
     worsening : Worsening
     probability : (K,)
         To worsen.
-    values : (E, S, U, G)
-        Predicted observations at each node, SI.
-    deviation : (S, U, G)
-        Of noise and model error, SI.
+    model : GaussianSensorModel
+        Its draws are the values of the parameter.
     observed, control
         (B, T, G), SI, NaN where lost, and (B, T).
     """
-    by_control = np.ascontiguousarray(values.transpose(2, 1, 3, 0))
-    inverse = np.ascontiguousarray(1.0 / deviation.transpose(1, 0, 2))
     entries = worsening.probability(probability[None])[0]
-    result = np.empty((len(control), len(values)))
-    for twin in range(len(control)):
+    result = np.empty((len(control), model.draw_count))
+    for twin, (seen, in_force) in enumerate(zip(observed, control, strict=True)):
         _on_nodes(
-            worsening.prior, worsening.start, worsening.source, entries, control[twin], observed[twin],
-            by_control, inverse, result[twin],
+            worsening.prior, worsening.start, worsening.source, entries, in_force,
+            model.log_density_of_draws(seen, in_force), result[twin],
         )  # fmt: skip
     return result

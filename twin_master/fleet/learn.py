@@ -196,8 +196,8 @@ def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
         )
     own = None
     if nodes is not None:
-        spread, seen = models[0].total_standard_deviation, (parts[0].observed, parts[0].control)
-        each = node_evidence(worsening, learnt, nodes.predicted, spread, *seen)
+        at_nodes = _noisier(models[0], 1.0, nodes)
+        each = node_evidence(worsening, learnt, at_nodes, parts[0].observed, parts[0].control)
         own = population(nodes.values, each, parts[0].knowledge.draws.standard_deviation)
     left_out = sum(len(kept) for kept in explained) - twins
     parameter = parts[0].knowledge.draws.name
@@ -256,13 +256,14 @@ def _nodes(parts: list[_Seen]) -> _Nodes | None:
     return _Nodes(values, prior / prior.sum(), predicted)
 
 
-def _noisier(model: GaussianSensorModel, factor: float) -> GaussianSensorModel:
-    """Return a sensor model with a factor on its noise."""
+def _noisier(model: GaussianSensorModel, factor: float, nodes: _Nodes | None = None) -> GaussianSensorModel:
+    """Return a sensor model with a factor on its noise, and nodes in the place of its draws."""
     return GaussianSensorModel(
-        model.value_per_draw,
+        model.value_per_draw if nodes is None else nodes.predicted,
         model.standard_deviation * factor,
         average="inside" if model.averages_inside else "outside",
         model_error=model.model_error,
+        interval=model.interval,
     )
 
 
@@ -276,13 +277,12 @@ def _noise(part: _Seen, worsening: Worsening, nodes: _Nodes | None) -> Line:
     assumed = worsening.assumed.clip(1e-3, 0.9)
 
     def log_likelihood(factor: float) -> float:
-        model = _noisier(part.knowledge.sensor_model, factor)
+        model = _noisier(part.knowledge.sensor_model, factor, nodes)
         if nodes is None:
             scaled, common = scaled_likelihood(model, observed, control)
             evidence = transition_evidence(worsening, assumed[None], scaled, control)[:, 0] + common
         else:
-            spread = model.total_standard_deviation
-            each = node_evidence(worsening, assumed, nodes.predicted, spread, observed, control)
+            each = node_evidence(worsening, assumed, model, observed, control)
             best = each.max(axis=1, keepdims=True)
             evidence = best[:, 0] + np.log(np.exp(each - best) @ nodes.prior)
         return float(evidence[np.isfinite(evidence)].sum())

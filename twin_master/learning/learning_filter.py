@@ -156,7 +156,7 @@ class LearningFilter:
             for control in range(sensor_model.control_count)
         ]
         self._inverse = [
-            np.ascontiguousarray(1.0 / sensor_model.total_standard_deviation[:, control])
+            np.ascontiguousarray(1.0 / sensor_model.independent_standard_deviation[:, control])
             for control in range(sensor_model.control_count)
         ]
         self._log_scale = [np.log(scale) for scale in self._inverse]
@@ -194,7 +194,9 @@ class LearningFilter:
         """
         seen = self._sensor_model.checked(observation)
         forecast, statistics, count = self._forecast(before)
-        log_belief = forecast + self._log_likelihood(seen, control_index, statistics, count)
+        near = self._sensor_model.nearest(seen, control_index, self._value[control_index])
+        log_belief = forecast + near.log_density[self._draw]
+        log_belief += self._log_likelihood(seen, near.value, control_index, statistics, count)
         filtered = np.empty_like(log_belief)
         evidence = normalise(log_belief, filtered)
         if evidence == -np.inf:
@@ -204,7 +206,7 @@ class LearningFilter:
         statistics = statistics.copy()
         if self._learns_gauges:
             gauge_statistics(
-                seen, self._draw, self._value[control_index], self._inverse[control_index],
+                seen, self._draw, near.alone, self._inverse[control_index] * np.sqrt(near.left),
                 self._offset, self._gain, log_belief, statistics,
             )  # fmt: skip
         count = count + ~np.isnan(seen)
@@ -236,7 +238,7 @@ class LearningFilter:
         return forecast, before.arrays["statistics"], before.arrays["count"]
 
     def _log_likelihood(
-        self, observation: Float, control_index: int, statistics: Float, count: Float
+        self, observation: Float, value: Float, control_index: int, statistics: Float, count: Float
     ) -> Float:
         """Return log p(o_t | D_t, k, o_0..o_t-1) for each hypothesis and state: (K, S)."""
         fitted = np.zeros_like(statistics)
@@ -244,7 +246,7 @@ class LearningFilter:
             regression(statistics, fitted)
         result = np.empty((len(self._draw), self._model.states.size))
         log_likelihood(
-            observation, self._draw, self._value[control_index], self._inverse[control_index],
+            observation, self._draw, value, self._inverse[control_index],
             self._log_scale[control_index], self._offset, self._gain, fitted, count,
             self.priors.noise_degrees, result,
         )  # fmt: skip

@@ -181,7 +181,8 @@ class WatchfulEstimator:
         self._key = np.frombuffer(sha256(np.ascontiguousarray(table).tobytes()).digest()[:8], dtype=np.uint64)
         controls = range(sensor_model.control_count)
         self._value = [np.ascontiguousarray(table[:, :, u]) for u in controls]
-        self._inverse = [np.ascontiguousarray(1.0 / deviation[:, u]) for u in controls]
+        independent = sensor_model.independent_standard_deviation
+        self._inverse = [np.ascontiguousarray(1.0 / independent[:, u]) for u in controls]
         reach = settings.absurd_deviations * deviation
         self._low = (sensor_model.value_per_draw.min(axis=0) - reach).min(axis=0)  # (U, G)
         self._high = (sensor_model.value_per_draw.max(axis=0) + reach).max(axis=0)
@@ -296,9 +297,10 @@ class WatchfulEstimator:
         return (1.0 - _FROM_THE_START) / (1.0 + turn / self._settings.onset_turns)
 
     def _assimilate(self, own: Arrays, seen: Float, control_index: int) -> None:
-        value, inverse = self._value[control_index], self._inverse[control_index]
+        near = self._sensor_model.nearest(seen, control_index, self._value[control_index])
+        value, inverse = near.value, self._inverse[control_index]
         degrees, count = self._settings.noise_degrees, own["count"]
-        known, log_likelihood = np.ones(value.shape), np.empty(value.shape[:2])
+        known, log_likelihood = np.ones(value.shape), near.log_density
         before = own["model_squares"].copy()
         log_model = weigh_model(
             seen, value, inverse, degrees, count, own["model_squares"], own["model"], known, log_likelihood

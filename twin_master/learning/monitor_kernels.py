@@ -75,13 +75,13 @@ def weigh_model(
 
     value is (E, S, G), inverse_deviation (S, G); squares (G,), the expected sums of squares of the residuals
     in units of the assumed noise, and belief (E, S), the forecast, are brought up to date. known (E, S, G)
-    becomes 1 + x² / (degrees + squares), log_likelihood (E, S) the sum over the gauges.
+    becomes 1 + x² / (degrees + squares); the sum over the gauges is added to log_likelihood (E, S).
     """
     draws, states, sensors = value.shape
     best = -np.inf
     for e in range(draws):
         for s in range(states):
-            total = 0.0
+            total = log_likelihood[e, s]
             for g in range(sensors):
                 if np.isnan(observation[g]):
                     continue

@@ -182,6 +182,7 @@ def knowledge_of(
         section.standard_deviation,
         average=section.average_over_draws,
         model_error=section.model_error,
+        interval=model.states.within_interval(predicted.mean(axis=0)) if section.between_levels else None,
     )
     rewards = RewardModel(sensor_model, reward_settings(scenario))
     transition, discount = model.transition, scenario.planner.gamma

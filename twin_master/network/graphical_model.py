@@ -134,6 +134,26 @@ class StateSpace:
         result: Float = np.sqrt(np.einsum("...s,...sf->...f", belief, deviation**2))
         return result
 
+    def within_interval(self, table: ArrayLike) -> Float:
+        """Return what a table over the states (S, ...) changes by inside each state's interval: (S, ..., F).
+
+        A level stands for the values nearest to it: half way to its neighbours, and at the ends to one side.
+        The truth lies anywhere in there; between levels the table is taken for piecewise linear. The result
+        is what it changes by where each factor is one standard deviation off its level, by the straight line
+        that fits best; zero for a factor of one level.
+        """
+        table = np.asarray(table, dtype=np.float64)
+        grid, result = table.reshape(*self.shape, *table.shape[1:]), []
+        for axis, factor in enumerate(self.factors):
+            along = np.moveaxis(grid, axis, -1)
+            step = np.pad(np.diff(factor.levels), 1)  # no neighbour beyond an end: no interval there
+            change = np.pad(np.diff(along), [(0, 0)] * (along.ndim - 1) + [(1, 1)])
+            moment = step**2 * change
+            scale = np.sqrt(12.0 * (step[1:] + step[:-1]) * (step[1:] ** 3 + step[:-1] ** 3))
+            both = (moment[..., 1:] + moment[..., :-1]) / np.where(scale > 0.0, scale, 1.0)
+            result.append(np.moveaxis(both, -1, axis).reshape(table.shape))
+        return np.stack(result, axis=-1)
+
     def marginal(self, belief: ArrayLike, name: str) -> Float:
         """Return the marginal of the factor `name`: (..., S) -> (..., levels of that factor).
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twin_master.errors import InvalidObservationError
-from twin_master.network.sensor_model import LOG_ROOT_TWO_PI, GaussianSensorModel
+from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI
+from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.modes import row_width
 
 __all__ = ["IdentifiedSensorModel", "packed_row"]
@@ -51,7 +52,9 @@ class IdentifiedSensorModel(GaussianSensorModel):
             np.broadcast_to(covariance[np.ix_(seen, seen)], (self.state_count, seen.size, seen.size))
         )
         place = np.arange(seen.size)
-        total[:, place, place] += self.total_standard_deviation[:, control_index, seen] ** 2
+        total[:, place, place] += self.independent_standard_deviation[:, control_index, seen] ** 2
+        interval = self.interval[:, control_index, seen]
+        total += interval @ interval.swapaxes(1, 2)
         try:
             factor = np.linalg.cholesky(total)
         except np.linalg.LinAlgError:

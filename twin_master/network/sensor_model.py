@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
-from fe.compilation import compiled
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.quantity import QuantityModel
+from twin_master.network.sensor_kernels import log_densities
 
 __all__ = ["GaussianSensorModel", "PredictiveCheck", "check_noise"]
 
@@ -21,69 +21,10 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _WORST_SHOWN = 3
-LOG_ROOT_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
-
-
-@compiled
-def _log_mean_exp(exponent: Float, log_weight: Float) -> float:
-    """Return log sum_e exp(log_weight_e + exponent_e)."""
-    largest = -np.inf
-    for e in range(len(exponent)):
-        exponent[e] += log_weight[e]
-        largest = max(largest, exponent[e])
-    if largest == -np.inf:
-        return largest
-    total = 0.0
-    for e in range(len(exponent)):
-        total += np.exp(exponent[e] - largest)
-    return float(largest + np.log(total))
-
-
-@compiled
-def _log_likelihood(
-    observation: Float,
-    control: Index,
-    value: Float,
-    inverse_deviation: Float,
-    log_scale: Float,
-    log_weight: Float,
-    inside: bool,
-    result: Float,
-) -> None:
-    """Fill result (T, S); value is (U, S, G, E) so that the loop over the draws is contiguous.
-
-    inverse_deviation and log_scale = log inverse_deviation are (U, S, G).
-    """
-    steps, sensors = observation.shape
-    states, draws = value.shape[1], value.shape[3]
-    exponent = np.empty(draws)
-    for t in range(steps):
-        u = control[t]
-        observed = 0
-        for g in range(sensors):
-            if not np.isnan(observation[t, g]):
-                observed += 1
-        for s in range(states):
-            if observed == 0:
-                result[t, s] = 0.0
-                continue
-            total = 0.0
-            exponent[:] = 0.0
-            for g in range(sensors):
-                seen = observation[t, g]
-                if np.isnan(seen):
-                    continue
-                scale = inverse_deviation[u, s, g]
-                total += log_scale[u, s, g] - LOG_ROOT_TWO_PI
-                for e in range(draws):
-                    residual = (seen - value[u, s, g, e]) * scale
-                    exponent[e] -= 0.5 * residual * residual
-                if inside:
-                    total += _log_mean_exp(exponent, log_weight)
-                    exponent[:] = 0.0
-            if not inside:
-                total += _log_mean_exp(exponent, log_weight)
-            result[t, s] = total
+LARGEST = 1e140
+"""Its square is still a number."""
+LEAST_LEFT = 1e-12
+"""What rounding leaves of the share of a sensor that alone tells where in the interval the truth is."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +59,27 @@ class PredictiveCheck:
         return result
 
 
+@dataclass(frozen=True)
+class Nearest:
+    """Predictions where in the interval of each state they fit an observation best.
+
+    Attributes
+    ----------
+    value, alone : (E, S, G)
+        At the most probable place by all sensors, and for each sensor at that by all the others, SI.
+    left : (S, G) dimensionless
+        Variance of a sensor's noise over that of its observation, given all the others.
+    log_density : (E, S)
+        Of the place, with all that it might have been: what is to be added to the log density of independent
+        sensors at `value`.
+    """
+
+    value: Float
+    alone: Float
+    left: Float
+    log_density: Float
+
+
 class GaussianSensorModel(QuantityModel):
     """Sensors that show a value plus independent Gaussian noise.
 
@@ -125,6 +87,9 @@ class GaussianSensorModel(QuantityModel):
     state, control and sensor: sqrt(standard_deviation² + (model_error * mean)²), the mean over the draws. It
     is an error that is drawn anew for each sensor and step; a real one stays the same from step to step, so
     that the term is a safeguard and no description of it.
+
+    A state may stand for an interval of each factor. Where the truth is inside it moves all sensors together,
+    so that it adds to the covariance of a state and control one term for each factor, of rank one.
 
     Parameters
     ----------
@@ -140,12 +105,22 @@ class GaussianSensorModel(QuantityModel):
         the mean over e, as if each sensor had parameters of its own.
     model_error : float or (G,) dimensionless
         Standard deviation of the predicted value as a share of it; none by default.
+    interval : (S, U, G, F), optional
+        What each sensor changes by, SI, when a factor moves by one standard deviation inside the interval
+        that the state stands for (`StateSpace.within_interval`); without it the truth is at the levels.
 
     Raises
     ------
     InvalidModelError, InvalidDistributionError
         If shapes do not fit, a value is not finite, a standard deviation not positive or an error negative.
     """
+
+    interval: Float
+    """What each sensor changes by within the interval of a state (S, U, G, F), SI."""
+    independent_standard_deviation: Float
+    """Noise and model error of each state, control and sensor (S, U, G), SI, independent; read-only."""
+    total_standard_deviation: Float
+    """The same with what a sensor changes by within the interval of a state (S, U, G), SI; read-only."""
 
     def __init__(
         self,
@@ -154,6 +129,7 @@ class GaussianSensorModel(QuantityModel):
         draw_weight: ArrayLike | None = None,
         average: Literal["outside", "inside"] = "outside",
         model_error: ArrayLike = 0.0,
+        interval: ArrayLike | None = None,
     ) -> None:
         super().__init__(strain_per_draw, draw_weight)
         deviation = np.array(standard_deviation, dtype=np.float64)
@@ -174,14 +150,23 @@ class GaussianSensorModel(QuantityModel):
             raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
         self._deviation: Float = np.broadcast_to(deviation, (self.sensor_count,)).copy()
         self._model_error: Float = np.broadcast_to(error, (self.sensor_count,)).copy()
-        # Through the root only where there is an error: x is not always sqrt(x²) to the last bit.
-        total = np.where(
-            self._model_error > 0.0, np.hypot(self._deviation, self._model_error * self.mean), self._deviation
-        )
-        total.setflags(write=False)
-        self._total_deviation: Float = total
-        by_control = np.ascontiguousarray(1.0 / total.transpose(1, 0, 2))
+        independent = np.hypot(self._deviation, self._model_error * self.mean)  # a root of a square rounds
+        shape = independent.shape
+        self.interval = np.zeros((*shape, 0)) if interval is None else np.array(interval, dtype=np.float64)
+        if self.interval.shape[:-1] != shape or not np.all(np.isfinite(self.interval)):
+            raise InvalidModelError(
+                f"expected finite changes within intervals of shape {(*shape, 'factors')}, "
+                f"got {self.interval.shape}"
+            )
+        self.independent_standard_deviation = independent
+        self.total_standard_deviation = np.hypot(independent, np.linalg.norm(self.interval, axis=-1))
+        for array in (independent, self.total_standard_deviation, self.interval):
+            array.setflags(write=False)
+        by_control = np.ascontiguousarray(1.0 / independent.transpose(1, 0, 2))
         self._inverse_deviation, self._log_scale = by_control, np.log(by_control)
+        self._scaled_interval = np.ascontiguousarray(
+            self.interval.transpose(1, 0, 2, 3) * by_control[..., None]
+        )
         self._inside = average == "inside"
         with np.errstate(divide="ignore"):
             self._log_weight: Float = np.log(self.draw_weight)
@@ -201,11 +186,6 @@ class GaussianSensorModel(QuantityModel):
     def model_error(self) -> Float:
         """Relative standard deviation of the predicted value of each sensor (G,), dimensionless."""
         return self._model_error.copy()
-
-    @property
-    def total_standard_deviation(self) -> Float:
-        """Noise and model error of each state, control and sensor (S, U, G), SI, read-only."""
-        return self._total_deviation
 
     def checked(self, observation: ArrayLike) -> Float:
         """Return observations (..., G) in which NaN stands for a lost sensor.
@@ -247,9 +227,7 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             If the shape is another one or a value is infinite; if there is no such control.
         """
-        rows = self.log_likelihood_sequence(self.checked(observation)[None], [control_index])
-        result: Float = rows[0]
-        return result
+        return np.asarray(self.log_likelihood_sequence(self.checked(observation)[None], [control_index])[0])
 
     def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t) for a sequence: (T, G) and (T,) -> (T, S).
@@ -259,6 +237,20 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             As `log_likelihood`.
         """
+        return np.asarray(self._densities(observations, control_index, 1)[..., 0])
+
+    def log_density_of_draws(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
+        """Return log p(o_t | D_t, u_t, e) of a sequence for each draw e: (T, G) and (T,) -> (T, S, E).
+
+        Raises
+        ------
+        InvalidObservationError, InvalidModelError
+            As `log_likelihood`.
+        """
+        return self._densities(observations, control_index, self.draw_count)
+
+    def _densities(self, observations: ArrayLike, control_index: ArrayLike, draws: int) -> Float:
+        """Return log densities (T, S, E) of each draw, or of their average where `draws` is one."""
         observations = self.checked(observations)
         control = np.array(control_index, dtype=np.int64)
         if observations.ndim != 2 or control.shape != observations.shape[:1]:
@@ -268,18 +260,39 @@ class GaussianSensorModel(QuantityModel):
             )
         if control.size and (control.min() < 0 or control.max() >= self.control_count):
             raise InvalidModelError(f"expected control indices between 0 and {self.control_count - 1}")
-        result = np.empty((len(observations), self.state_count))
-        _log_likelihood(
-            observations,
-            control,
-            self._by_control,
-            self._inverse_deviation,
-            self._log_scale,
-            self._log_weight,
-            self._inside,
-            result,
-        )
+        result = np.empty((len(observations), self.state_count, draws))
+        log_densities(
+            observations, control, self._by_control, self._inverse_deviation, self._log_scale,
+            self._scaled_interval, self._log_weight, self._inside and draws == 1, result,
+        )  # fmt: skip
         return result
+
+    def nearest(self, observation: Float, control_index: int, value: Float) -> Nearest:
+        """Return what the sensors show where in the interval of each state they fit an observation best.
+
+        Parameters
+        ----------
+        observation : (G,)
+            SI; NaN where the sensor is lost.
+        control_index : int
+        value : (E, S, G)
+            Predictions at the levels, of any draws, SI.
+        """
+        seen = ~np.isnan(observation)
+        scaled = np.where(seen[:, None], self._scaled_interval[control_index], 0.0)  # (S, G, F)
+        distance = np.where(seen, observation - value, 0.0).clip(-LARGEST, LARGEST)
+        residual = distance * self._inverse_deviation[control_index]
+        inverse = np.linalg.inv(np.eye(scaled.shape[-1]) + scaled.swapaxes(1, 2) @ scaled)
+        place = np.einsum("sfh,sgh,esg->esf", inverse, scaled, residual, optimize=True)
+        moved = np.einsum("sgf,esf->esg", self.interval[:, control_index], place, optimize=True)
+        left = 1.0 - np.einsum("sgf,sfh,sgh->sg", scaled, inverse, scaled, optimize=True)
+        left = left.clip(LEAST_LEFT)
+        return Nearest(
+            value=value + moved,
+            alone=value + (distance - (distance - moved) / left),
+            left=left,
+            log_density=0.5 * (np.linalg.slogdet(inverse)[1] - np.sum(place**2, axis=-1)),
+        )
 
     def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
         """Return the sensors that fit worst in the state that fits best, in standard deviations."""
@@ -293,8 +306,13 @@ class GaussianSensorModel(QuantityModel):
         return {f"sensor {index + 1}": float(residual[best, index]) for index in order}
 
     def noise(self, joint: ArrayLike) -> Float:
-        """Return the standard deviation (..., G) of noise and model error under beliefs (..., S, U), SI."""
-        return np.asarray(np.sqrt(np.tensordot(self._weights(joint), self._total_deviation**2, axes=2)))
+        """Return the standard deviation (..., G) of what beliefs (..., S, U) leave unsaid of a sensor, SI.
+
+        It is noise, model error, and what a sensor changes by within the interval of a state.
+        """
+        return np.asarray(
+            np.sqrt(np.tensordot(self._weights(joint), self.total_standard_deviation**2, axes=2))
+        )
 
     def observed_count(self, observations: ArrayLike) -> Index:
         """Return how many sensors report: (..., G) -> (...). Zero flags a step that follows the dynamics."""
@@ -325,7 +343,8 @@ class GaussianSensorModel(QuantityModel):
         for row, (weight, seen) in enumerate(zip(weights, rows, strict=True)):
             state, control = np.nonzero(weight)
             below = ndtr(
-                (seen - self.value_per_draw[:, state, control]) / self._total_deviation[state, control]
+                (seen - self.value_per_draw[:, state, control])
+                / self.total_standard_deviation[state, control]
             )
             transform[row] = np.einsum("e,p,epg->g", self.draw_weight, weight[state, control], below)
         return PredictiveCheck(

@@ -32,6 +32,8 @@ class ObservationSection(Section):
     model_error: NotNegative | tuple[NotNegative, ...] = 0.0
     """Standard deviation of the predicted value as a share of it, one for all sensors or one for each; added
     to the noise in quadrature."""
+    between_levels: bool = True
+    """Whether the truth may lie between the levels of the states, which then stand for intervals."""
     average_over_draws: Literal["outside", "inside"] = "outside"
     """Where the average over the draws of the parameter stands: outside the product over the sensors as in
     the integral (30), or inside it as eq. (32) is printed."""

@@ -19,6 +19,7 @@ def pump_table() -> dict[str, Any]:
     table["state"][1] |= {"levels_percent": [0, 60], "prior": [1, 0]}
     table["calibration"] |= {"draws": 4}
     table["asset"] |= {"isolated": False}
+    table["observation"] |= {"between_levels": False}  # what is enumerated in `test_pump_oracle`
     table["truth"]["gains"] = [
         {"state": "wear", "first_step": 1, "gain_percent": 20},
         {"state": "clogging", "first_step": 3, "gain_percent": 50},

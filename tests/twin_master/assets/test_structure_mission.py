@@ -74,6 +74,30 @@ def test_the_twin_finds_the_damage_of_the_full_model(flown: Path) -> None:
     np.testing.assert_allclose(tree["filtered"]["mean"].values[-1], [0.4, 0.0], atol=0.1)
 
 
+@pytest.mark.parametrize("between", [True, False])
+def test_damage_between_two_levels_does_not_condemn_a_sound_region(tmp_path: Path, between: bool) -> None:
+    """The heel stands at 70 %, half way between two levels, and the gauge of the arm is lost.
+
+    A twin that takes it to be at a level believes with certainty that the arm has lost 80 %.
+    """
+    coarse = {"levels_percent": [0, 20, 40, 60, 80], "prior": [1, 0, 0, 0, 0]}
+    loaded = short(
+        state={"": [factor | coarse for factor in TABLE["state"]]},
+        observation={"standard_deviation_microstrain": 3, "between_levels": between},
+        transition={"probability": {"smooth": 0.02, "rough": 0.08}},
+        truth={
+            "gains": [{"state": "z_heel", "first_step": 1, "last_step": 5, "gain_percent": 14}],
+            "noise": {"standard_deviation_microstrain": 3},
+            "sensor_faults": [{"kind": "dropout", "sensors": [2], "first_step": 0}],
+        },
+    )
+    folder = new_run(loaded, tmp_path / "run", report=False).folder
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        probability = tree["filtered"]["probability"].values.reshape(-1, 5, 5)
+    sound = probability[-3:, :, 0].sum(axis=1)
+    assert np.all(sound > 0.4) if between else np.all(sound < 0.01)
+
+
 @pytest.mark.long
 def test_damage_is_found_from_frequencies_alone(tmp_path: Path) -> None:
     """Three natural frequencies in the place of gauges; those flown are the full model's."""

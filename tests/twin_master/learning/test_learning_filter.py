@@ -156,6 +156,27 @@ def test_noise_gain_and_offset_are_found_from_many_observations() -> None:
         assert abs(found.mean - truth) < 3.0 * found.standard_deviation < 0.7, name
 
 
+def test_the_interval_of_a_state_is_not_learnt_as_noise() -> None:
+    """Four gauges that two regions move together: half of what is seen could be explained by either."""
+    random = np.random.default_rng(6)
+    interval = 2.0 * random.normal(size=(1, 2, 4, 2))
+    sensor = GaussianSensorModel(np.full((1, 1, 2, 4), 5.0), 0.7, interval=interval)
+    controls = (np.arange(400) % 2).tolist()
+    place = random.normal(size=(400, 2, 1))
+    seen = 5.0 + (interval[0, controls] @ place)[..., 0] + 0.7 * random.normal(size=(400, 4))
+    learner = LearningFilter(model(levels=1), sensor, LearntPriors(noise_degrees=5.0))
+    estimates = run(learner, seen, controls)
+    learnt = estimates[-1].learnt
+    for gauge in range(1, 5):
+        assert learnt[f"noise_scale[{gauge}]"].mean == pytest.approx(1.0, abs=0.12)
+    known = LearningFilter(model(levels=1), sensor, LearntPriors())
+    evidence = [estimate.log_evidence for estimate in run(known, seen, controls)]
+    exact = [
+        float(sensor.log_likelihood(row, control)[0]) for row, control in zip(seen, controls, strict=True)
+    ]
+    np.testing.assert_allclose(evidence, exact, atol=1e-10)
+
+
 def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie() -> None:
     """Draws wider apart than the posterior: the evidence between them is interpolated."""
     fine, coarse = np.linspace(-3, 3, 2001), np.linspace(-3, 3, 25)

@@ -37,6 +37,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     offsets = [50.0] * 23 + [0.0]
     learnt = f"gauge_gain_percent = 2\ngauge_offset_microstrain = {offsets}\n"
     learnt += "transition_factors = [0.5, 1, 2]\n"
+    text = text.replace("count = 24\n", "count = 24\nbetween_levels = false\n")
     file.write_text(text.replace("draws = 60", "draws = 8").replace("[learning]\n", "[learning]\n" + learnt))
     return file
 

@@ -1,5 +1,6 @@
 """What is noticed, against sums over every course of events, an exact mean, and faults that are put in."""
 
+from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
@@ -19,6 +20,7 @@ from twin_master.network.estimator import Carried, Estimate, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import Twin
+from twin_master.scenario.reading import load_scenario
 
 Float = NDArray[np.float64]
 
@@ -27,14 +29,15 @@ GAINS = SETTINGS.gauge_gain * np.array([-2.5, -1.0, 1.0, 2.5])
 DRAWS = np.array([1.0, 2.0])
 
 
-def small(gauges: int = 3) -> tuple[GraphicalModel, GaussianSensorModel]:
+def small(gauges: int = 3, width: float = 0.0) -> tuple[GraphicalModel, GaussianSensorModel]:
     model = GraphicalModel.from_tables({"z": [0, 1, 2]}, {"u": {"z": worsening_table(3, 0.2)}})
     value = np.random.default_rng(1).normal(10.0, 3.0, size=(2, 3, 1, gauges))
-    return model, GaussianSensorModel(value, 1.0)
+    interval = width * np.random.default_rng(2).normal(size=(3, 1, gauges, 1)) if width else None
+    return model, GaussianSensorModel(value, 1.0, interval=interval)
 
 
-def watchful(gauges: int = 3, given: MonitorSettings = SETTINGS) -> WatchfulEstimator:
-    model, sensors = small(gauges)
+def watchful(gauges: int = 3, given: MonitorSettings = SETTINGS, width: float = 0.0) -> WatchfulEstimator:
+    model, sensors = small(gauges, width)
     return WatchfulEstimator(ExactFilter(model, sensors), sensors, DRAWS, given)
 
 
@@ -47,14 +50,16 @@ def run(estimator: WatchfulEstimator, seen: Float) -> list[Estimate]:
     return estimates
 
 
-def drawn(random: np.random.Generator, turns: int, gauges: int = 3) -> Float:
+def drawn(random: np.random.Generator, turns: int, gauges: int = 3, width: float = 0.0) -> Float:
     """Return observations of the model itself, with noise scales drawn from their prior."""
-    model, sensors = small(gauges)
+    model, sensors = small(gauges, width)
     half = 0.5 * SETTINGS.noise_degrees
     scale = np.sqrt(half / random.gamma(half, size=gauges))
     draw, state, rows = random.integers(2), 0, []
     for _ in range(turns):
         rows.append(sensors.value_per_draw[draw, state, 0] + scale * random.normal(size=gauges))
+        if width:
+            rows[-1] += sensors.interval[state, 0] @ random.normal(size=1)
         state = random.choice(3, p=model.transition.matrix[0, state])
     return np.array(rows)
 
@@ -145,12 +150,13 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
         assert mean == pytest.approx(np.exp(getattr(today.suspicion, name)), rel=1e-4)
 
 
-def test_false_alarms_are_rarer_than_the_threshold_says() -> None:
+@pytest.mark.parametrize("width", [0.0, 1.0, 10.0])
+def test_false_alarms_are_rarer_than_the_threshold_says(width: float) -> None:
     """The noise is what the model says, and its sums of squares are expected ones: what that costs."""
-    estimator, random = watchful(), np.random.default_rng(5)
+    estimator, random = watchful(width=width), np.random.default_rng(5)
     largest = []
     for _ in range(120):
-        turns = [estimate.suspicion for estimate in run(estimator, drawn(random, 15))]
+        turns = [estimate.suspicion for estimate in run(estimator, drawn(random, 15, width=width))]
         largest.append([(s.log_evidence_any_gauge, s.log_evidence_none) for s in turns if s is not None])
     values = np.exp(np.array(largest))  # (missions, turns, 2)
     assert np.all(values.mean(axis=0) < 1.5)
@@ -269,9 +275,17 @@ def test_too_many_states_are_refused_in_a_sentence(monkeypatch: pytest.MonkeyPat
         watchful()
 
 
+def at_levels(name: str, between: bool) -> Knowledge:
+    loaded = load_scenario(name)
+    observation = loaded.scenario.observation.model_copy(update={"between_levels": between})
+    return prepare_twin(
+        replace(loaded, scenario=loaded.scenario.model_copy(update={"observation": observation}))
+    )
+
+
 @pytest.fixture(scope="module")
 def wing() -> Knowledge:
-    return prepare_twin("level_turns")
+    return at_levels("level_turns", False)
 
 
 def fly(
@@ -353,3 +367,23 @@ def test_an_absurd_gauge_is_left_out_with_a_word(wing: Knowledge) -> None:
     left_out = [bool(e.suspicion.left_out[11]) for e in estimates if e.suspicion is not None]
     assert left_out == [3 <= turn < 10 for turn in range(12)]
     assert estimates[-1].filtered[0] > 0.3  # today's twin: 80 % damage, with certainty
+
+
+@pytest.mark.parametrize(("between", "alarmed"), [(True, 0), (False, 10)])
+def test_damage_between_two_levels_raises_no_alarm(between: bool, alarmed: int) -> None:
+    """Ten flights of the panel with a stiffener that grows soft between two levels, and nothing else."""
+    panel = at_levels("stiffened_panel", between)
+    sensors, shape = panel.sensor_model, panel.model.states.shape
+    table = sensors.mean[:, 1].reshape(*shape, -1)[:, 0, 0]  # (levels, sensors), at full pressure
+    estimator = WatchfulEstimator(panel.twin().estimator, sensors, panel.draws.values)
+    alarms = 0
+    for flight in range(10):
+        random, before, raised = np.random.default_rng(flight), None, False
+        for turn in range(30):
+            loss = min(0.25 + 0.01 * turn, 0.4) / 0.25
+            shown = [np.interp(loss, np.arange(shape[0]), column) for column in table.T]
+            seen = shown + sensors.standard_deviation * random.normal(size=len(shown))
+            estimate = estimator.turn(before, seen, 1, turn)
+            before, raised = estimate.carried, raised or any(n.kind == "alarm" for n in estimate.notices)
+        alarms += raised
+    assert alarms == alarmed

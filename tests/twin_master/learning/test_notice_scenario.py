@@ -73,6 +73,7 @@ def test_sensors_with_parameters_of_their_own_are_refused(tmp_path: Path) -> Non
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("notice") / "mine.toml"
     text = TEXT.replace("# What the figures", FAULTS).replace("steps = 50", "steps = 9")
+    text = text.replace("count = 24\n", "count = 24\nbetween_levels = false\n")
     file.write_text(text.replace("draws = 60", "draws = 8"))
     return file
 

@@ -56,6 +56,39 @@ def test_a_certain_belief_has_no_spread():
     assert np.all(SPACE.standard_deviation(SPACE.certain((0.6, 1.0))) == 0.0)
 
 
+@given(
+    steps=st.lists(st.floats(0.01, 1.0), min_size=0, max_size=4),
+    values=st.lists(st.floats(-10.0, 10.0), min_size=5, max_size=5),
+)
+def test_what_a_table_changes_by_within_an_interval_is_that_of_a_quadrature(steps, values):
+    """Along each factor: the straight line through the level that fits a piecewise linear table best."""
+    levels = np.concatenate([[0.0], np.cumsum(steps)])
+    states = StateSpace((Factor("a", tuple(levels)), Factor("b", (1.0, 2.0))))
+    along = np.array(values[: len(levels)])
+    table = along[:, None, None] * [[1.0, 0.0], [1.0, 3.0]]  # (a, b, sensor)
+    found = states.within_interval(table.reshape(-1, 2)).reshape(len(levels), 2, 2, 2)
+    half = np.concatenate([levels[:1], 0.5 * (levels[1:] + levels[:-1]), levels[-1:]])
+    for k, level in enumerate(levels):
+        at = half[k] + (half[k + 1] - half[k]) * (np.arange(20000) + 0.5) / 20000
+        place, change = at - level, np.interp(at, levels, along) - along[k]
+        expected = np.mean(place * change) / np.sqrt(np.mean(place**2)) if len(levels) > 1 else 0.0
+        np.testing.assert_allclose(found[k, :, 0, 0], expected, atol=1e-4)
+        # Of two levels each stands for the half of the step next to it: E[(x / 2)²] = 1 / 12.
+        np.testing.assert_allclose(found[k, :, 1, 1], 3.0 * along[k] / np.sqrt(12.0), atol=1e-12)
+    assert not found[:, :, 0, 1].any()
+
+
+def test_a_linear_table_changes_by_its_slope_and_mirrored_levels_by_the_opposite():
+    levels = np.array([0.0, 0.1, 0.4, 0.6])
+    left, right = np.array([0.0, 0.05, 0.15, 0.1]), np.array([0.05, 0.15, 0.1, 0.0])
+    spread = np.sqrt((left**3 + right**3) / (3.0 * (left + right)))  # of a value anywhere in the interval
+    found = StateSpace((Factor("a", tuple(levels)),)).within_interval(7.0 * levels[:, None])[:, 0, 0]
+    np.testing.assert_allclose(found, 7.0 * spread)
+    mirrored = StateSpace((Factor("a", tuple(-levels[::-1])),))
+    np.testing.assert_allclose(mirrored.within_interval(7.0 * levels[::-1, None])[::-1, 0, 0], -found)
+    np.testing.assert_array_equal(StateSpace((Factor("a", (0.3,)),)).within_interval([[5.0]]), [[[0.0]]])
+
+
 def test_unknown_factor():
     with pytest.raises(InvalidModelError, match="no factor is named 'z3'"):
         SPACE.marginal(np.full(15, 1 / 15), "z3")

@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import logsumexp
-from scipy.stats import kstest, norm
+from scipy.stats import kstest, multivariate_normal, norm
 
 from twin_master.errors import InvalidModelError, InvalidObservationError
+from twin_master.network.identified import IdentifiedSensorModel
 from twin_master.network.inference import known_control
 from twin_master.network.sensor_model import GaussianSensorModel
 
@@ -153,6 +154,67 @@ def test_no_model_error_changes_not_a_bit():
     each = GaussianSensorModel(values, deviation, weight, model_error=np.full(SENSORS, 0.1))
     np.testing.assert_array_equal(one.log_likelihood(observation, 0), each.log_likelihood(observation, 0))
     np.testing.assert_array_equal(one.model_error, np.full(SENSORS, 0.1))
+
+
+@settings(deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    factors=st.integers(0, 3),
+    size=st.sampled_from([0.0, 0.3, 3.0, 1e3]),
+    lost=st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS).filter(lambda lost: not all(lost)),
+)
+def test_an_interval_moves_all_sensors_together(seed, factors, size, lost):
+    """Against densities with the whole covariance; a place in the interval and the rest make the same."""
+    rng, values, weight, deviation, observation = random_case(seed)
+    observation[lost] = np.nan
+    seen = ~np.isnan(observation)
+    interval = size * rng.normal(size=(STATES, CONTROLS, SENSORS, factors))
+    covariance = interval @ interval.swapaxes(-1, -2) + np.diag(deviation**2)
+    part = covariance[:, 1][:, seen][:, :, seen]
+    each = np.array(
+        [
+            [
+                multivariate_normal.logpdf(observation[seen], values[e, s, 1, seen], part[s])
+                for e in range(DRAWS)
+            ]
+            for s in range(STATES)
+        ]
+    )
+    expected = logsumexp(each, b=weight, axis=1)
+    close = {"rtol": 1e-7, "atol": 1e-7}  # the covariance has a condition of up to 1e7
+    model = GaussianSensorModel(values, deviation, weight, interval=interval)
+    np.testing.assert_allclose(model.log_likelihood(observation, 1), expected, **close)
+    np.testing.assert_allclose(model.log_density_of_draws(observation[None], [1])[0], each, **close)
+    identified = IdentifiedSensorModel(values, deviation, weight, interval=interval)
+    np.testing.assert_allclose(identified.log_likelihood(observation, 1), expected, **close)
+    total = np.sqrt(np.einsum("sugg->sug", covariance))
+    np.testing.assert_allclose(model.total_standard_deviation, total)
+    printed = GaussianSensorModel(values, deviation, weight, "inside", interval=interval)
+    density = norm.logpdf(observation, values[:, :, 1], total[:, 1])[..., seen]
+    apart = logsumexp(density, b=weight[:, None, None], axis=0).sum(axis=1)
+    np.testing.assert_allclose(printed.log_likelihood(observation, 1), apart, **close)
+
+    near = model.nearest(observation, 1, values[:, :, 1])
+    rest = norm.logpdf(observation, near.value, deviation)[..., seen].sum(axis=-1)
+    np.testing.assert_allclose((rest + near.log_density).T, each, **close)
+    sensor = int(np.flatnonzero(seen)[0])
+    others = np.flatnonzero(seen)[1:]
+    for s in range(STATES if size < 100.0 else 0):  # of one sensor given the others; needs the condition
+        gain = np.linalg.solve(covariance[s, 1][np.ix_(others, others)], covariance[s, 1][others, sensor])
+        mean = values[:, s, 1, sensor] + (observation[others] - values[:, s, 1, others]) @ gain
+        variance = covariance[s, 1, sensor, sensor] - gain @ covariance[s, 1][others, sensor]
+        np.testing.assert_allclose(near.alone[:, s, sensor], mean, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(deviation[sensor] ** 2 / near.left[s, sensor], variance, rtol=1e-5)
+
+
+def test_an_absurd_observation_is_impossible_within_an_interval_too():
+    interval = np.ones((2, 1, 1, 1))
+    model = GaussianSensorModel(np.arange(2.0).reshape(1, 2, 1, 1), 1e-3, interval=interval)
+    assert np.all(np.isneginf(model.log_likelihood([1e200], 0)))
+    with pytest.raises(
+        InvalidModelError, match=r"intervals of shape \(2, 1, 1, 'factors'\), got \(2, 1, 1\)"
+    ):
+        GaussianSensorModel(np.zeros((1, 2, 1, 1)), 1.0, interval=interval[..., 0])
 
 
 def test_predictive_check_of_a_model_with_the_error_that_it_assumes():

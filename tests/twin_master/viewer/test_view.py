@@ -110,9 +110,13 @@ def test_every_number_is_that_of_the_run(run: Path) -> None:
         np.testing.assert_array_equal(belief.reward_mean, values["reward_mean"])
         np.testing.assert_array_equal(belief.reward_deviation, values["reward_standard_deviation"])
         np.testing.assert_array_equal(belief.sensor_mean, values["quantity_mean"])
-        noise = np.sqrt(belief.sensor_deviation**2 - values["quantity_standard_deviation"] ** 2)
-        np.testing.assert_allclose(noise, 125e-6, rtol=1e-9)
-    decided = stored["filtered"]["decision_probability"].values
+    filtered = stored["filtered"].to_dataset()
+    total = flight.knowledge.sensor_model.total_standard_deviation[:, stored["observed"]["control_index"]]
+    noise2 = np.einsum("ts,stg->tg", filtered["probability"].values, total**2)
+    assert np.all(noise2 > 125e-6**2)
+    spread = np.hypot(filtered["quantity_standard_deviation"].values, np.sqrt(noise2))
+    np.testing.assert_allclose(believed.sensor_deviation, spread, rtol=1e-9)
+    decided = filtered["decision_probability"].values
     np.testing.assert_array_equal(believed.control_probability, decided)
     np.testing.assert_array_equal(
         expected.control_probability, stored["predicted"]["control_probability"].values[28]
@@ -232,7 +236,7 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run: Path) -> None:
     number = everything["flight"]
     missed = json.loads(str(teller.answer(asked(0, 30, flight=number, shown=29, count=30))))
     assert missed["first"] == 30
-    assert missed["past"]["state"] == everything["past"]["state"][30:]
+    np.testing.assert_allclose(missed["past"]["state"], everything["past"]["state"][30:], rtol=1e-12)
     assert teller.answer(asked(0, TURNS, flight=number, shown=TURNS - 1, count=TURNS)) is None
     back = json.loads(str(teller.answer(asked(0, TURNS, 7, flight=number, shown=8, count=TURNS))))
     assert (back["turn"], back["past"]) == (7, None)
