@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import Flight
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
-from twin_master.watch.teaching import Question, Search, Teaching, both_patches
-from twin_master.watch.trial import Judge
+from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
+from twin_master.watch.trial import Judge, Outcome, policy_change
 from uav_twin.cli import app
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
@@ -100,6 +101,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
 def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:
     for kind, gain, sentence in (
         ("named", 0.3, "and is not adopted."),
+        ("named", -0.002, "patch gained 1.21 nats of evidence, 3 are needed, and is not adopted."),
         ("family", -0.3, "--model-patch DIR/teaching/turns_"),
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
@@ -180,6 +182,26 @@ def test_live_turns_do_not_wait_for_the_patched_model(
     assert lines(watch)[-1]["filtered"] == found.filtered.tolist()
     again = watchful(watch, tmp_path / "again")
     assert again._replayed(None).twin.save_state() == watch._replayed(None).twin.save_state()
+
+
+def test_a_policy_that_changes_is_told(base: Watch) -> None:
+    known = base.models[0].knowledge
+    states, sharp = known.model.states, known.scenario.control_names.index("3g")
+    z1, z2 = states.coordinates.T
+    assert policy_change(known, known) == ""
+    for gentle, sentence in (
+        (z1 > 0.7, "With it 3g is left at z1 80 % in the place of 60 %."),
+        (z1 >= 0.0, "With it 3g is left at z1 0 % in the place of 60 %."),
+        (z1 > 1.0, "With it another control is chosen in 10 of 25 states, first 3g in the place of 2g at "
+                   "z1 60 %, z2 0 %."),
+        ((z1 > 0.5) & (z2 > 0.1), "With it another control is chosen in 2 of 25 states, first 3g in the "
+                                  "place of 2g at z1 60 %, z2 0 %."),
+    ):  # fmt: skip
+        plan = replace(known.plan, control_index=np.where(gentle, 1 - sharp, sharp))
+        assert policy_change(known, replace(known, plan=plan)) == sentence
+    outcome = Outcome(None, None, 3.5, {}, {}, (), sentence, b"")  # type: ignore[arg-type]
+    for kind in TRIED:
+        assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
 
 
 def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
