@@ -20,11 +20,13 @@ from scenarios import scenario_files
 from tests.twin_master.watch.watches import lines, watchful
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
 from twin_master.mission.loop import Flight
+from twin_master.network.inference import known_control
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
-from twin_master.watch.trial import Judge, Outcome, policy_change
+from twin_master.watch.trial import Judge, Outcome, patched_model, policy_change
 from uav_twin.cli import app
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
@@ -202,6 +204,29 @@ def test_a_policy_that_changes_is_told(base: Watch) -> None:
     outcome = Outcome(None, None, 3.5, {}, {}, (), sentence, b"")  # type: ignore[arg-type]
     for kind in TRIED:
         assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
+
+
+def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(
+    base: Watch, mission: Flight, tmp_path: Path
+) -> None:
+    """Gauge 17 is strained most: were its readings the strain, 3g would be left at z1 80 % only."""
+    file = tmp_path / "patch.json"
+    file.write_text(json.dumps(patch_of(-0.12, "g17")))
+    known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
+    keep_knowledge(tmp_path, taught)
+    for read in (taught, kept_knowledge(tmp_path, taught.scenario)):
+        np.testing.assert_allclose(read.rewards.health_per_draw, known.rewards.health_per_draw, rtol=1e-9)
+        np.testing.assert_array_equal(read.plan.policy, known.plan.policy)
+        shown = read.sensor_model.value_per_draw / known.sensor_model.value_per_draw
+        np.testing.assert_allclose(shown[..., [15, 16]], [[[[1.0, 0.88]]]] * np.ones_like(shown[..., :2]))
+    twin, observed = taught.twin(), mission.observed.copy()
+    observed[:, 16] *= 0.88
+    turns = [twin.turn(row, int(c)) for row, c in zip(observed, mission.control_index, strict=True)]
+    calls = mission.happened.state[:, 0] > 0.59
+    gentle = known.scenario.control_names.index("2g")
+    assert {turn.next_control for turn in np.array(turns)[calls]} == {gentle}
+    error_reward = taught.rewards.expectation(known_control(turns[-1].filtered, gentle, 2), observed[-1])
+    assert error_reward.mean[2] > -1.5  # readings are compared with readings
 
 
 def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
