@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from twin_master.scenario.section import Positive, Section
 
-__all__ = ["Noticing"]
+__all__ = ["Noticing", "NoticingOrNot"]
 
 _LARGEST_GAIN = 0.4
 """The largest gain errors that are compared are two and a half times as large."""
@@ -33,3 +33,7 @@ class Noticing(Section):
     """Prior probability of each of the two kinds of fault, for their posterior."""
     noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0
     """How sure the assumed noise is: as if it came from so many observations, more than two."""
+
+
+NoticingOrNot = Annotated[Noticing | None, BeforeValidator(lambda given: None if given is False else given)]
+"""The table, or `notice = false`."""

@@ -13,7 +13,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.learning import Learning
-from twin_master.scenario.notice import Noticing
+from twin_master.scenario.notice import NoticingOrNot
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
     Count,
@@ -201,7 +201,8 @@ class Scenario(Section):
     calibration: Calibration
     truth: TruthSection
     learning: Learning | None = None
-    notice: Noticing | None = None
+    notice: NoticingOrNot = None
+    """Of a scenario file on unless it says `notice = false`, see `reading.load_scenario`."""
     watch: WatchSection = WatchSection()
     reference: tuple[Reference, ...] = ()
 
