@@ -29,6 +29,7 @@ from twin_master.learning.monitor_kernels import (
 from twin_master.network.estimator import Carried, Estimate, Estimator, Notice, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.scenario.notice import MOST_DRAWS
 
 __all__ = ["MonitorSettings", "WatchfulEstimator", "Words"]
 
@@ -42,8 +43,6 @@ _FREE = 0.5
 """Prior probability that a gauge has a gain of its own, where no state explains all of them."""
 _GAINS = (-2.5, -1.0, 1.0, 2.5)
 """Gain errors of a gauge that is off, in those that are to be found; larger ones are found by the largest."""
-_DRAWS = 15
-"""Draws of the parameter that are kept apart here: evidence is compared, and no fine posterior is needed."""
 _LARGEST = 20_000_000
 """Numbers that the beliefs of the rivals may take: each turn that is kept holds them."""
 _CLEARLY = float(np.log(10.0))
@@ -420,7 +419,7 @@ def _spread(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:
     Evenly, because a true value between two of them must not look like a fault, in the tails least of all.
     """
     order = np.argsort(draws, kind="stable")
-    grid = np.linspace(draws[order[0]], draws[order[-1]], _DRAWS)
+    grid = np.linspace(draws[order[0]], draws[order[-1]], MOST_DRAWS)
     chosen = np.unique([order[np.argmin(np.abs(draws[order] - value))] for value in grid])
     nearest = np.argmin(np.abs(draws[:, None] - draws[chosen]), axis=1)
     total = np.bincount(nearest, weight, minlength=len(chosen))

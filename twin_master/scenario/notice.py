@@ -7,8 +7,14 @@ from pydantic import BeforeValidator, Field
 
 from twin_master.scenario.section import Positive, Section
 
-__all__ = ["Noticing", "NoticingOrNot"]
+__all__ = ["GAINS", "MOST_DRAWS", "NUMBERS_BY_DEFAULT", "Noticing", "NoticingOrNot"]
 
+GAINS = 4
+"""Gain errors that are compared for each sensor."""
+MOST_DRAWS = 15
+"""Draws of the parameter that are kept apart: evidence is compared, and no fine posterior is needed."""
+NUMBERS_BY_DEFAULT = 1_000_000
+"""Numbers of the beliefs about sensors up to which a scenario gives notices by itself: 0.1 s a turn."""
 _LARGEST_GAIN = 0.4
 """The largest gain errors that are compared are two and a half times as large."""
 

@@ -15,7 +15,7 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.report.page import render_page
 from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.notice import Noticing
-from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.workflow import resume_run
 from uav_twin.cli import app
 
@@ -36,11 +36,28 @@ rate_microstrain_per_step = 1e14
 # What the figures"""
 
 
-def test_defaults_are_those_of_the_estimator_and_absence_is_off() -> None:
+def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path: Path) -> None:
     assert dict(Noticing()) == vars(MonitorSettings())
-    loaded = load_scenario("level_turns").scenario
-    assert loaded.notice is None
-    assert "notice" not in loaded.to_dict()
+    for name in scenario_files():
+        loaded = load_scenario(name)
+        off = name in ("paper_level_turns", "model_mismatch")  # what they measure is the filter alone
+        assert loaded.scenario.notice == (None if off else Noticing()), name
+        assert not loaded.remark
+        written = loaded.scenario.to_dict()
+        assert ("notice" in written) is not off
+        assert parse_scenario(written, name).notice == loaded.scenario.notice  # as a run folder says it
+    text = scenario_files()["level_turns"].read_text()
+    file = tmp_path / "mine.toml"
+    for old, new, remark in (
+        ("[transition]", 'average_over_draws = "inside"\n[transition]', "each sensor has a parameter of"),
+        ("[0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]", f"{[*range(90)]}\nprior = {[1] + [0] * 89}",
+         "they take 11,664,000 numbers a turn, more than 1,000,000"),
+    ):  # fmt: skip
+        file.write_text(text.replace(old, new))
+        assert load_scenario(file).scenario.notice is None
+        assert remark in load_scenario(file).remark
+        file.write_text(text.replace(old, new).replace("format = 2", "format = 2\nnotice = false"))
+        assert not load_scenario(file).remark
 
 
 @pytest.mark.parametrize(
