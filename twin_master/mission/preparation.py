@@ -96,7 +96,20 @@ class Knowledge:
             lag=lag,
             first_control=self.scenario.mission.first_control,
             estimator=estimator,
+            safest=self.safest,
         )
+
+    @property
+    def safest(self) -> int:
+        """Index of the control where no state is believed.
+
+        That of the scenario, or the one with the least load: whose health reward is the best in the mean over
+        all states, the first of equals.
+        """
+        named = self.scenario.planner.safest
+        if named is not None:
+            return self.scenario.control_names.index(named)
+        return int(np.argmax(self.rewards.planning_reward(1.0, 0.0).mean(axis=0)))
 
     @cached_property
     def true_model(self) -> GraphicalModel:

@@ -15,7 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import ObservationContext, filter_step, smooth
 
-__all__ = ["Carried", "Estimate", "Estimator", "ExactFilter", "Learnt", "Notice", "SensorModel", "Suspicion"]
+__all__ = [
+    "Carried",
+    "Estimate",
+    "Estimator",
+    "ExactFilter",
+    "Hypothesis",
+    "Learnt",
+    "Notice",
+    "SensorModel",
+    "Suspicion",
+]
 
 Float = NDArray[np.float64]
 
@@ -125,6 +135,24 @@ class Suspicion:
 
 
 @dataclass(frozen=True)
+class Hypothesis:
+    """What may hold in a turn.
+
+    Attributes
+    ----------
+    name : str
+        `model`, `gauge 5 off`, ..., `none of these`.
+    probability : float
+    belief : (S,) or None
+        p(D_t | hypothesis, o_0..o_t); None where no state is believed.
+    """
+
+    name: str
+    probability: float
+    belief: Float | None
+
+
+@dataclass(frozen=True)
 class Estimate:
     """What an estimator concludes in one turn t.
 
@@ -133,9 +161,9 @@ class Estimate:
     forecast : (S,)
         p(D_t | o_0..o_{t-1}).
     filtered : (S,)
-        p(D_t | o_0..o_t).
+        p(D_t | o_0..o_t), under all hypotheses that believe in a state.
     log_evidence : float
-        log p(o_t | o_0..o_{t-1}).
+        log p(o_t | o_0..o_{t-1}), under the model, as the forecast.
     carried : Carried
         For the turn after.
     learnt : dict of str to Learnt
@@ -147,6 +175,8 @@ class Estimate:
     expected : callable or None
         Returns for each sensor the mean of what it shows and the standard deviation of its noise, (G,) each,
         where the estimator knows more of the sensors than their model.
+    hypotheses : tuple of Hypothesis
+        What may hold, where more than the model is compared; those that are very improbable are left out.
     """
 
     forecast: Float
@@ -157,6 +187,7 @@ class Estimate:
     notices: tuple[Notice, ...] = ()
     suspicion: Suspicion | None = None
     expected: Callable[[], tuple[Float, Float]] | None = None
+    hypotheses: tuple[Hypothesis, ...] = ()
 
 
 class Estimator(Protocol):

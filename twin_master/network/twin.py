@@ -118,6 +118,11 @@ class TwinTurn:
     expected : callable or None
         Returns for each sensor the mean of what it shows and the standard deviation of its noise, (G,) each,
         where the estimator knows more of the sensors than their model.
+    hypotheses : dict of str to float
+        Probability of what may hold: the model, a gauge being off, none of these; empty where that is not
+        watched.
+    decided_by : str
+        That of them which adds most to the probability of the next control.
     """
 
     turn: int
@@ -131,6 +136,8 @@ class TwinTurn:
     notices: tuple[Notice, ...] = ()
     suspicion: Suspicion | None = None
     expected: Callable[[], tuple[Float, Float]] | None = None
+    hypotheses: Mapping[str, float] = field(default_factory=dict)
+    decided_by: str = ""
 
 
 @dataclass(frozen=True)
@@ -169,6 +176,8 @@ class Twin:
         Control of the first turn, where none is given with it.
     estimator : Estimator, optional
         What holds the belief in the place of the exact filter of model and sensor model.
+    safest : int or str, optional
+        Control where no state is believed; without it the policy of what is believed decides alone.
 
     Raises
     ------
@@ -188,6 +197,7 @@ class Twin:
         lag: int | None = DEFAULT_LAG,
         first_control: int | str = 0,
         estimator: Estimator | None = None,
+        safest: int | str | None = None,
     ) -> None:
         if lag is not None and lag < 0:
             raise InvalidModelError(f"expected a lag of 0 or more turns, or None for all, got {lag}")
@@ -202,6 +212,9 @@ class Twin:
         self._seen: deque[_Seen] = deque(maxlen=None if lag is None else lag + 2)
         self._turns = 0
         self._proposed = self._index_of(first_control)
+        self._safest: Float | None = None
+        if safest is not None:
+            self._safest = np.eye(len(model.controls))[self._index_of(safest)]
 
     @property
     def model(self) -> GraphicalModel:
@@ -375,12 +388,18 @@ class Twin:
 
     def _decided(self, estimate: Estimate) -> TwinTurn:
         control_index = estimate.carried.control_index
-        prediction = predict(self.model, estimate.filtered, control_index, self.policy, self.prediction_steps)
-        decided_on = estimate.filtered
-        if self.decide_on == "predicted":
-            decided_on = self.model.transition.forward(control_index, estimate.filtered)
-        decision_probability: Float = decided_on @ self.policy
+        policy, by_hypothesis = self.policy, {}
+        if self._safest is not None and estimate.hypotheses:
+            none = sum(one.probability for one in estimate.hypotheses if one.belief is None)
+            policy = (1.0 - none) * policy + none * self._safest
+        prediction = predict(self.model, estimate.filtered, control_index, policy, self.prediction_steps)
+        decision_probability = self._decided_on(estimate.filtered, control_index) @ policy
         self._proposed = int(np.argmax(decision_probability))
+        for one in estimate.hypotheses:
+            chosen = self._safest
+            if one.belief is not None:
+                chosen = self._decided_on(one.belief, control_index) @ self.policy
+            by_hypothesis[one.name] = 0.0 if chosen is None else one.probability * chosen[self._proposed]
         return TwinTurn(
             turn=self._turns - 1,
             control_index=control_index,
@@ -393,4 +412,12 @@ class Twin:
             notices=estimate.notices,
             suspicion=estimate.suspicion,
             expected=estimate.expected,
+            hypotheses={one.name: one.probability for one in estimate.hypotheses},
+            decided_by=max(by_hypothesis, key=by_hypothesis.__getitem__, default=""),
+        )
+
+    def _decided_on(self, belief: Float, control_index: int) -> Float:
+        """Return the belief that the policy acts on: that of this turn, or of the next one."""
+        return (
+            belief if self.decide_on == "filtered" else self.model.transition.forward(control_index, belief)
         )

@@ -133,6 +133,8 @@ class Planner(Section):
     gamma: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)]
     decide_on: Literal["filtered", "predicted"] = "filtered"
     """Which belief the next control is the most probable one of: D_t, or D_{t+1} as predicted."""
+    safest: Name | None = None
+    """Control where no state explains the sensors; by default the one with the least load."""
 
 
 class Reference(Section):
@@ -294,6 +296,7 @@ class Scenario(Section):
                 )
         _known(self.mission.first_control, controls, "mission.first_control", "control")
         _same(self.rewards.control, controls, "rewards.control", "control")
+        _known(self.planner.safest or controls[0], controls, "planner.safest", "control")
         norm = self.rewards.normalise_error_by
         if norm is not None:
             _known(norm, tuple(sorted(roles)), "rewards.normalise_error_by", "control input")

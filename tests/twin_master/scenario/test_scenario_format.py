@@ -17,7 +17,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.errors import ScenarioError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.asset import AssetSection, BeliefSection
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 
 WING = {"young_modulus_factor": 1.0073}
