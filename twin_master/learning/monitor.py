@@ -179,7 +179,7 @@ class WatchfulEstimator:
             filtered=own["belief"],
             carried=Carried(control_index, {**estimate.carried.arrays, **self._packed(own)}),
             notices=(*estimate.notices, *notices),
-            suspicion=suspicion,
+            suspicion=replace(suspicion, hypotheses={one.name: one.probability for one in found}),
             hypotheses=found,
         )
 

@@ -124,6 +124,10 @@ class Suspicion:
         Log e-value of each sensor.
     left_out : (G,)
         Whether the readings of a sensor are absurd and left out.
+    hypotheses : dict of str to float
+        Probability of what may hold by name, see `Hypothesis`.
+    decided_by : str
+        That of them which adds most to the probability of the control that is decided for.
     """
 
     none_of_these: float
@@ -132,6 +136,8 @@ class Suspicion:
     log_evidence_any_gauge: float
     log_evidence_gauge: Float
     left_out: NDArray[np.bool_]
+    hypotheses: Mapping[str, float] = field(default_factory=dict)
+    decided_by: str = "model"
 
 
 @dataclass(frozen=True)

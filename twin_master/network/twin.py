@@ -118,11 +118,6 @@ class TwinTurn:
     expected : callable or None
         Returns for each sensor the mean of what it shows and the standard deviation of its noise, (G,) each,
         where the estimator knows more of the sensors than their model.
-    hypotheses : dict of str to float
-        Probability of what may hold: the model, a gauge being off, none of these; empty where that is not
-        watched.
-    decided_by : str
-        That of them which adds most to the probability of the next control.
     """
 
     turn: int
@@ -136,8 +131,6 @@ class TwinTurn:
     notices: tuple[Notice, ...] = ()
     suspicion: Suspicion | None = None
     expected: Callable[[], tuple[Float, Float]] | None = None
-    hypotheses: Mapping[str, float] = field(default_factory=dict)
-    decided_by: str = ""
 
 
 @dataclass(frozen=True)
@@ -388,18 +381,12 @@ class Twin:
 
     def _decided(self, estimate: Estimate) -> TwinTurn:
         control_index = estimate.carried.control_index
-        policy, by_hypothesis = self.policy, {}
-        if self._safest is not None and estimate.hypotheses:
+        prediction = predict(self.model, estimate.filtered, control_index, self.policy, self.prediction_steps)
+        decision_probability: Float = self._decided_on(estimate.filtered, control_index) @ self.policy
+        if self._safest is not None:
             none = sum(one.probability for one in estimate.hypotheses if one.belief is None)
-            policy = (1.0 - none) * policy + none * self._safest
-        prediction = predict(self.model, estimate.filtered, control_index, policy, self.prediction_steps)
-        decision_probability = self._decided_on(estimate.filtered, control_index) @ policy
+            decision_probability = (1.0 - none) * decision_probability + none * self._safest
         self._proposed = int(np.argmax(decision_probability))
-        for one in estimate.hypotheses:
-            chosen = self._safest
-            if one.belief is not None:
-                chosen = self._decided_on(one.belief, control_index) @ self.policy
-            by_hypothesis[one.name] = 0.0 if chosen is None else one.probability * chosen[self._proposed]
         return TwinTurn(
             turn=self._turns - 1,
             control_index=control_index,
@@ -410,11 +397,21 @@ class Twin:
             next_control=self._proposed,
             learnt=estimate.learnt,
             notices=estimate.notices,
-            suspicion=estimate.suspicion,
+            suspicion=self._with_decision(estimate),
             expected=estimate.expected,
-            hypotheses={one.name: one.probability for one in estimate.hypotheses},
-            decided_by=max(by_hypothesis, key=by_hypothesis.__getitem__, default=""),
         )
+
+    def _with_decision(self, estimate: Estimate) -> Suspicion | None:
+        """Return what is suspected, with the hypothesis that adds most to the probability of the decision."""
+        share = {}
+        for one in estimate.hypotheses:
+            chosen = self._safest
+            if one.belief is not None:
+                chosen = self._decided_on(one.belief, estimate.carried.control_index) @ self.policy
+            share[one.name] = 0.0 if chosen is None else one.probability * float(chosen[self._proposed])
+        if estimate.suspicion is None or not share:
+            return estimate.suspicion
+        return replace(estimate.suspicion, decided_by=max(share, key=share.__getitem__))
 
     def _decided_on(self, belief: Float, control_index: int) -> Float:
         """Return the belief that the policy acts on: that of this turn, or of the next one."""

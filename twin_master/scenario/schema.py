@@ -48,7 +48,7 @@ MISFIT_FIGURES = ("model_misfit_rms", "model_misfit_largest")
 """Figures of the summary that say by how much asset and twin's model differ."""
 
 
-NOTICE_FIGURES = ("alarm_step", "none_of_these", "gauge_off")
+NOTICE_FIGURES = ("alarm_step", "none_of_these", "gauge_off", "decided_by")
 """Figures of the summary that say what was noticed."""
 
 

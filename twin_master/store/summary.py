@@ -269,13 +269,14 @@ def noticed(result: MissionResult) -> dict[str, Any]:
 
 def _notice_figures(flight: Flight, step_name: str) -> list[Figure]:
     """Return when the first alarm came, and what is left of the model at the end."""
-    alarm, none, gauge = NOTICE_FIGURES
+    alarm, none, gauge, decided = NOTICE_FIGURES
     last = flight.suspicion[-1]
     first = next((turn for turn, notice in flight.notices if notice.kind == "alarm"), None)
     return [
         Figure(alarm, f"{step_name} of the first alarm", first),
         Figure(none, "probability that no state explains the sensors", last.none_of_these),
         Figure(gauge, "probability that a single sensor is off", last.gauge_off),
+        Figure(decided, "the last control is decided by", last.decided_by),
     ]
 
 

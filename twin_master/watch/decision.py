@@ -16,6 +16,9 @@ from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
 
+_SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
+"""What is told of a suspicion."""
+
 
 def decision_of(
     scenario: Scenario, model: GraphicalModel, twin: Twin, reading: Reading, turn: TwinTurn
@@ -30,7 +33,7 @@ def decision_of(
         "notices": [vars(notice) for notice in turn.notices],
     }
     if turn.suspicion is not None:
-        record["none_of_these"] = turn.suspicion.none_of_these
+        record |= {name: getattr(turn.suspicion, name) for name in _SUSPECTED}
     if reading.revises is not None:
         record["revised_by_turn"] = reading.revises
     if turn.learnt:
@@ -60,7 +63,7 @@ def last_decision(path: Path, scenario: Scenario, model: GraphicalModel) -> dict
             "notices": last.get("notices", []),
         }
         if "suspicion" in last:
-            record["none_of_these"] = last["suspicion"]["none_of_these"]
+            record |= {name: last["suspicion"][name] for name in _SUSPECTED}
         if last is not line:
             record["revised_by_turn"] = last["observation_turn"]
         if "learnt" in last:

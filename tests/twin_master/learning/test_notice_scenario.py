@@ -117,7 +117,9 @@ def test_the_console_names_turn_gauge_and_the_command(folder: Path) -> None:
 
 def test_journal_store_and_summary_agree(folder: Path) -> None:
     notices = json.loads((folder / "summary.json").read_text())["notices"]
-    assert {(n["kind"], *n["sensors"]) for n in notices} == {("gauge_left_out", 12), ("alarm", 5)}
+    assert {(n["kind"], *n["sensors"]) for n in notices} == {
+        ("gauge_left_out", 12), ("alarm", 5), ("hypothesis", 5)
+    }  # fmt: skip
     lines = [json.loads(line[65:]) for line in (folder / JOURNAL_NAME).read_text().splitlines()[1:]]
     assert [{"turn": line["turn"]} | n for line in lines for n in line.get("notices", ())] == notices
     kept = open_run(folder)["notice"].to_dataset()
@@ -128,11 +130,18 @@ def test_journal_store_and_summary_agree(folder: Path) -> None:
     figures = {f["key"]: f["value"] for f in json.loads((folder / "summary.json").read_text())["figures"]}
     assert figures["alarm_step"] == alarm
     assert figures["gauge_off"] == kept["gauge_off"].values[-1] > 0.5
+    decided = [line["suspicion"]["decided_by"] for line in lines]
+    assert figures["decided_by"] == decided[-1] == "gauge 5 off"
+    assert decided[0] == "model"
+    told = lines[-1]["suspicion"]["hypotheses"]
+    assert told["none of these"] == kept["none_of_these"].values[-1]
+    assert sum(told.values()) == pytest.approx(1.0, abs=0.03)
 
 
 def test_the_report_has_the_alarm(folder: Path) -> None:
     text = render_page(read_run(folder), [])
     assert "gauge 5 shows too much" in text
+    assert "what decides its control is: gauge 5 off" in text
     assert "gauge 12 shows 1e+14 microstrain" in text
 
 
