@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.errors import InvalidModelError
+from twin_master.learning import switching
 from twin_master.learning.monitor_kernels import (
     forecast_rows,
     mix_onset,
@@ -27,16 +28,7 @@ from twin_master.learning.monitor_kernels import (
     weigh_none,
 )
 from twin_master.learning.monitor_settings import MonitorSettings, Words
-from twin_master.learning.switching import (
-    ENDS,
-    GAUGES,
-    MENDED,
-    NONE,
-    at_first,
-    beliefs_of,
-    hypotheses,
-    one_turn_later,
-)
+from twin_master.learning.switching import GAUGES, MENDED, NONE
 from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import smooth
@@ -170,9 +162,9 @@ class WatchfulEstimator:
         suspicion = self._suspicion(own)
         notices += self._alarms(own, suspicion, turn)
         believed = own["share"], estimate.filtered, own["mended"], own["gauge"]
-        found = hypotheses(*believed, self._names)
+        found = switching.hypotheses(*believed, self._names)
         notices += self._leading(own, found, turn)
-        own["belief"], own["rivals"], right = beliefs_of(*believed)
+        own["belief"], own["rivals"], right = switching.beliefs_of(*believed)
         own["right"] = np.array([right])
         return replace(
             estimate,
@@ -210,7 +202,7 @@ class WatchfulEstimator:
             "gauge": np.broadcast_to(model, self._shape).astype(np.float32),
             "none": model[None].astype(np.float32),
             "mended": model.copy(),
-            "share": at_first(2.0 * self._settings.prior * _FROM_THE_START, self._begins),
+            "share": switching.at_first(2.0 * self._settings.prior * _FROM_THE_START, self._begins),
             "leading": np.zeros(1),
             "log_gauge": np.full((sensors, gains), weight - np.log(gains)),
             "log_none": np.full(1, weight),
@@ -264,8 +256,8 @@ class WatchfulEstimator:
         twice = 2.0 * self._settings.prior
         hazard = np.log(twice) + inflow - np.log1p(twice * (self._to_begin(turn - 1.0) - 1.0))
         before = own["share"][MENDED]
-        own["share"], ended = one_turn_later(own["share"], hazard, self._begins)
-        fresh = -np.expm1(before + np.log1p(-ENDS) - own["share"][MENDED])
+        own["share"], ended = switching.one_turn_later(own["share"], hazard, self._begins)
+        fresh = max(0.0, -np.expm1(before + np.log1p(-switching.ENDS) - own["share"][MENDED]))
         weight = np.exp(ended)
         of_gauge = weight[1:].reshape(self._shape[:2])
         belief = weight[1:].astype(np.float32) @ own["gauge"].reshape(len(weight) - 1, -1)
