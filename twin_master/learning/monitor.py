@@ -238,7 +238,8 @@ class WatchfulEstimator:
             np.full(keep.size, inflow - np.log(gains)), turn, own["gauge_onset"].reshape(-1),
             keep.reshape(-1),
         )  # fmt: skip
-        own["gauge_sums"] *= keep[..., None]
+        fading = np.exp(-1.0 / self._settings.memory_turns)
+        own["gauge_sums"] *= fading * keep[..., None]
         own["gauge_squares"] = keep * own["gauge_squares"] + (1.0 - keep) * own["model_squares"][:, None]
         kept = np.empty(1)
         mix_onset(
@@ -247,7 +248,7 @@ class WatchfulEstimator:
         statistics, fresh = own["none_statistics"], 1.0 - kept[0]
         statistics[:, 0] += fresh * (_FREE - statistics[:, 0])
         statistics[:, [1, 4]] += fresh * (own["model_squares"][:, None] - statistics[:, [1, 4]])
-        statistics[:, 2:4] *= kept[0] * np.exp(-1.0 / self._settings.memory_turns)
+        statistics[:, 2:4] *= fading * kept[0]
         self._switch(own, inflow, turn)
         return own
 

@@ -33,7 +33,7 @@ TRIED = ("named", "named in part", GROUP)
 """Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
 alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
 FOLDER = "teaching"
-NO_ALARMS = "--teach begins with an alarm: the scenario needs the table `[notice]`."
+NO_ALARMS = "--teach begins with an alarm, and this scenario gives none: `notice` is off."
 NO_WING = (
     "--teach looks for what the model of a wing lacks: strains under the damage states z1 and z2, predicted "
     "by a design or a calibration, are needed, and this scenario has {}: leave --teach out, alarms are given "
