@@ -183,21 +183,48 @@ def weigh_gauges(
                             log_value[e, s] /= root[e, s]
                         mass += log_value[e, s]
             log_weight[g, k] += best + math.log(mass) - log_evidence if mass > 0.0 else -np.inf
-            added = np.zeros(3)
             for e in range(draws):
                 for s in range(states):
                     if belief[g, k, e, s] > 0.0:
-                        share = log_value[e, s] / mass
-                        belief[g, k, e, s] = share
-                        if seen and share >= NEGLIGIBLE_SHARE:
-                            c = reach[k] * value[e, s, g] * inverse_deviation[s, g]
-                            x = (observation[g] - (1.0 + gains[k]) * value[e, s, g]) * inverse_deviation[s, g]
-                            added[1] += share * c * c
-                            added[2] += share * c * x
-                            x -= c * fitted
-                            added[0] += share * x * x / (1.0 + c * c * unknown)
-            squares[g, k] += added[0]
-            sums[g, k] += added[1:]
+                        belief[g, k, e, s] = log_value[e, s] / mass
+            if seen:
+                added = _regressed(
+                    observation[g], value[:, :, g], inverse_deviation[:, g], 1.0 + gains[k], reach[k], fitted,
+                    unknown, belief[g, k],
+                )  # fmt: skip
+                squares[g, k] += added[3]
+                sums[g, k] += added[1:3]
+
+
+@compiled
+def _regressed(
+    seen: float,
+    value: Float,
+    inverse_deviation: Float,
+    shown: float,
+    gain: float,
+    fitted: float,
+    unknown: float,
+    belief: Single,
+) -> Float:
+    """Return expected sums over draws and states (4,): x², c², cx, and the innovations over their spread.
+
+    x is what one gauge shows beyond `shown` times its value, and c what a share `gain` of the value is.
+    """
+    added = np.zeros(4)
+    for e in range(belief.shape[0]):
+        for s in range(belief.shape[1]):
+            share = belief[e, s]
+            if share < NEGLIGIBLE_SHARE:
+                continue
+            x = (seen - shown * value[e, s]) * inverse_deviation[s]
+            c = gain * value[e, s] * inverse_deviation[s]
+            added[0] += share * x * x
+            added[1] += share * c * c
+            added[2] += share * c * x
+            x -= c * fitted
+            added[3] += share * x * x / (1.0 + c * c * unknown)
+    return added
 
 
 @compiled
@@ -291,20 +318,9 @@ def _learn_gain(
     seen: float, value: Float, inverse_deviation: Float, gain: float, belief: Single, free: Float, sums: Float
 ) -> None:
     """Bring the statistics (5,) of one gauge up to date, expected over draws and states."""
-    fitted, spread = sums[3] / (1.0 + sums[2]), 1.0 / (1.0 + sums[2])
-    added = np.zeros(5)
+    unknown, share = 1.0 / (1.0 + sums[2]), 0.0
     for e in range(belief.shape[0]):
         for s in range(belief.shape[1]):
-            share = belief[e, s]
-            if share < NEGLIGIBLE_SHARE:
-                continue
-            x = (seen - value[e, s]) * inverse_deviation[s]
-            c = gain * value[e, s] * inverse_deviation[s]
-            added[0] += share * free[e, s]
-            added[1] += share * x * x
-            added[2] += share * c * c
-            added[3] += share * c * x
-            x -= c * fitted
-            added[4] += share * x * x / (1.0 + c * c * spread)
-    sums[0] = added[0]
-    sums[1:] += added[1:]
+            share += belief[e, s] * free[e, s]
+    sums[0] = share
+    sums[1:] += _regressed(seen, value, inverse_deviation, 1.0, gain, unknown * sums[3], unknown, belief)
