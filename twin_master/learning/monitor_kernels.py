@@ -149,12 +149,11 @@ def weigh_gauges(
     to date.
     """
     draws, states, sensors = value.shape
-    log_value, root = np.empty((draws, states)), np.ones((draws, states))
+    log_value, root = np.empty((draws, states)), np.empty((draws, states))
     for g in range(sensors):
         for k in range(len(gains)):
             seen = not np.isnan(observation[g])
-            left = degrees + squares[g, k]
-            power = 0.5 * (degrees + count[g] + 1.0)
+            left, power = degrees + squares[g, k], 0.5 * (degrees + count[g] + 1.0)
             constant = 0.5 * math.log((degrees + squares_of_model[g]) / left)
             unknown = 1.0 / (1.0 + sums[g, k, 0])
             fitted = min(max(unknown * sums[g, k, 1], -1.0), 1.0)
@@ -164,23 +163,20 @@ def weigh_gauges(
                     if belief[g, k, e, s] < NEGLIGIBLE_RIVAL:
                         belief[g, k, e, s] = 0.0
                         continue
-                    total = log_likelihood[e, s]
+                    total, wide = log_likelihood[e, s], 1.0
                     if seen:
                         c = reach[k] * value[e, s, g] * inverse_deviation[s, g]
                         x = (observation[g] - (1.0 + gains[k]) * value[e, s, g]) * inverse_deviation[s, g]
                         x -= c * fitted
                         wide = 1.0 + c * c * unknown
                         total += constant + power * math.log(known[e, s, g] / (1.0 + x * x / (left * wide)))
-                        root[e, s] = math.sqrt(wide)
-                    log_value[e, s] = total
+                    log_value[e, s], root[e, s] = total, math.sqrt(wide)
                     best = max(best, total)
             mass = 0.0
             for e in range(draws):
                 for s in range(states):
                     if belief[g, k, e, s] > 0.0:
-                        log_value[e, s] = belief[g, k, e, s] * _exp(log_value[e, s] - best)
-                        if seen:
-                            log_value[e, s] /= root[e, s]
+                        log_value[e, s] = belief[g, k, e, s] * _exp(log_value[e, s] - best) / root[e, s]
                         mass += log_value[e, s]
             log_weight[g, k] += best + math.log(mass) - log_evidence if mass > 0.0 else -np.inf
             for e in range(draws):

@@ -405,7 +405,7 @@ def test_a_slip_of_the_pen_makes_no_folder(scenario: LoadedScenario, tmp_path: P
         ([str(tmp_path / "run.nc"), "--follow"], "only a CSV file can be followed"),
         (["-", "--follow"], "--follow belongs to a CSV file"),
         (["mqtt://host"], "is expected"),
-        (["-", "--teach"], "the scenario needs the table `[notice]`"),
+        (["-", "--teach"], "this scenario gives none: `notice` is off"),
     ):
         options = ["--out", str(tmp_path / "watch"), "--observations", *source]
         result = CliRunner().invoke(app, ["watch", str(scenario.path), *options])
