@@ -5,8 +5,9 @@ hidden effects in the FMU of the wing. The run folder alone is then read as a ca
 is named, or the most probable member of a group, goes into the twin's model, and the mission is flown again
 with the same seed. A drift cannot stand in a table of predicted strains; there the readings are corrected
 before the twin sees them, as with the temperature, which the run records. Printed: the verdict of each
-mission; rms error of the health estimate in points, and the share of turns whose 90 % set of states holds the
-truth, before and after; the table compares the missions that were flown again.
+mission; rms error of the health estimate in points, the share of turns whose 90 % set of states holds the
+truth, and the turns at 3g with z1 truly at or above the limit, before and after; the table compares the
+missions that were flown again.
 """
 
 from __future__ import annotations
@@ -61,6 +62,8 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.writing import store_mission
 
 TURNS = 50
+LIMIT = 0.6 - 1e-9
+"""z1 from which on the policy of the wing without an effect leaves 3g."""
 
 
 @dataclass(frozen=True)
@@ -115,10 +118,13 @@ class Flown:
         Of the mean of z1, z2 less the truth [1].
     coverage : float
         Share of turns whose 90 % set of states holds the truth.
+    decided : (2,) ndarray
+        Turns flown at 3g with z1 truly at or above the limit, behind the first of them, and turns beyond it.
     """
 
     rms: NDArray[np.float64]
     coverage: float
+    decided: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -216,7 +222,19 @@ def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Fl
     state = flight.truth.state
     error = flight.filtered @ knowledge.model.states.coordinates - state
     held = in_credible_set(knowledge.model, flight.filtered, state, 0.9)
-    return Flown(np.sqrt(np.mean(error**2, axis=0)), float(np.mean(held)))
+    sharp = flight.control_index == scenario.control_names.index("3g")
+    return Flown(
+        np.sqrt(np.mean(error**2, axis=0)), float(np.mean(held)), beyond_the_limit(sharp, state[:, 0])
+    )
+
+
+def beyond_the_limit(sharp: NDArray[np.bool_], z1: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the turns at 3g with z1 at or above the limit, and all such turns.
+
+    The first of them is left out: its control was decided before.
+    """
+    beyond = (z1 >= LIMIT)[:-1]
+    return np.array([np.sum(beyond & sharp[1:]), np.sum(beyond)])
 
 
 def outputs_of(patch: ModelPatch) -> tuple[Primitive, ...]:
@@ -290,7 +308,10 @@ def main() -> int:
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
     given = parser.parse_args()
     console = Console(width=150)
-    table = Table("hidden", "verdicts", "rms z1, z2 before", "90 % sets", "rms after", "90 % sets")
+    heads = ("rms z1, z2 {}", "90 % sets", "3g beyond the limit")
+    table = Table(
+        "hidden", "verdicts", *(head.format(when) for when in ("before", "after") for head in heads)
+    )
     chosen = [item for item in HIDDEN if given.only is None or item.identifier in given.only.split(",")]
     with tempfile.TemporaryDirectory() as folder:
         for hidden in chosen:
@@ -298,11 +319,15 @@ def main() -> int:
             for seed in range(given.first_seed, given.first_seed + given.seeds):
                 case = study(hidden, seed, Path(folder))
                 cases.append(case)
-                after = "" if case.after is None else f"{100 * case.after.rms} {case.after.coverage:.2f}"
+                after = (
+                    ""
+                    if case.after is None
+                    else f"{100 * case.after.rms} {case.after.coverage:.2f} {case.after.decided}"
+                )
                 console.print(
                     f"{hidden.text}, seed {seed}: {case.verdict.kind.value}: {case.verdict.sentence} "
-                    f"rms {100 * case.before.rms} {case.before.coverage:.2f}; after {after} "
-                    f"({case.seconds:.1f} s)"
+                    f"rms {100 * case.before.rms} {case.before.coverage:.2f} {case.before.decided}; "
+                    f"after {after} ({case.seconds:.1f} s)"
                 )
             table.add_row(*_row(hidden, cases))
     console.print(table)
@@ -312,22 +337,18 @@ def main() -> int:
 def _row(hidden: Hidden, cases: Sequence[Case]) -> tuple[str, ...]:
     counts = Counter(outcome(hidden, case.verdict) for case in cases)
     again = [case for case in cases if case.after is not None]
-    shown = again or cases
-    return (
-        hidden.text,
-        ", ".join(f"{name} {count}" for name, count in counts.most_common()),
-        _rms([case.before for case in shown]),
-        f"{np.mean([case.before.coverage for case in shown]):.2f}",
-        _rms([case.after for case in again if case.after is not None]),
-        f"{np.mean([case.after.coverage for case in again if case.after is not None]):.2f}" if again else "",
-    )
+    before, after = [case.before for case in again or cases], [case.after for case in again if case.after]
+    verdicts = ", ".join(f"{name} {count}" for name, count in counts.most_common())
+    return (hidden.text, verdicts, *_shown(before), *_shown(after))
 
 
-def _rms(flown: Sequence[Flown]) -> str:
+def _shown(flown: Sequence[Flown]) -> tuple[str, str, str]:
     if not flown:
-        return ""
+        return "", "", ""
     values = 100.0 * np.sqrt(np.mean([item.rms**2 for item in flown], axis=0))
-    return f"{values[0]:.1f}, {values[1]:.1f} points"
+    sharp, beyond = np.sum([item.decided for item in flown], axis=0)
+    coverage = np.mean([item.coverage for item in flown])
+    return f"{values[0]:.1f}, {values[1]:.1f} points", f"{coverage:.2f}", f"{sharp} of {beyond}"
 
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ class ScaledSource(PairedSource):
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the scaled predictions (E, S, U, G)."""
         table = super().observation_table(draws, model)
-        controls = load_scenario("level_turns").scenario.control
+        controls = load_scenario("paper_level_turns").scenario.control
         undamaged = dict(zip(model.states.names, model.states.coordinates[0].tolist(), strict=True))
         shown = self.open().step(controls[-1].values, undamaged).values
         return np.asarray(table * (shown / table[:, 0, -1].mean(axis=0)))
@@ -176,7 +176,7 @@ def combinations(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[
 
     wing_model = reduced_model(load_design(), progress=RichProgress())
     library_file = resolve_scenario(
-        load_scenario("level_turns"), Overrides(strain_library=given.strain_library)
+        load_scenario("paper_level_turns"), Overrides(strain_library=given.strain_library)
     )
 
     def sources(chosen: Scenario) -> dict[str, AssetSource]:
@@ -313,10 +313,8 @@ def main() -> int:
                 f"{SCALED}, and {name} came"
             )
     library = None if given.combinations else given.strain_library
-    scenario = resolve_scenario(load_scenario("level_turns"), Overrides(strain_library=library))
-    if given.at_levels:
-        observation = scenario.observation.model_copy(update={"between_levels": False})
-        scenario = scenario.model_copy(update={"observation": observation})
+    name = "paper_level_turns" if given.at_levels else "level_turns"
+    scenario = resolve_scenario(load_scenario(name), Overrides(strain_library=library))
     if given.decide_on:
         planner = scenario.planner.model_copy(update={"decide_on": given.decide_on})
         scenario = scenario.model_copy(update={"planner": planner})

@@ -3,7 +3,8 @@
 `python -m benchmarks.study_teaching` flies level_turns with each of several hidden effects in the FMU, and
 watches the recorded strains three times: by a twin that is never taught, by one that is (`uav-twin watch
 --teach`: alarm, search, trial, adoption), and by one that knew the effect. Printed: alarm, verdicts,
-adoption, and the rms error of z1 and z2 in points behind the adoption (without one, from turn 30 on).
+adoption, the rms error of z1 and z2 in points behind the adoption (without one, from turn 30 on), and there
+the decisions for 3g with z1 truly at or above the limit; the wing with nothing hidden is the healthy twin's.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import uav_twin
-from benchmarks.study_hidden_effects import fly_mission, patch_text
+from benchmarks.study_hidden_effects import beyond_the_limit, fly_mission, patch_text
 from fe.runtime.patch import LocalStiffnessLoss, PointMass, Primitive, RootCompliance, SensorGain
 from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
@@ -46,9 +47,10 @@ WITHOUT = 30
 
 @dataclass(frozen=True)
 class Watched:
-    """A watch of a mission; `mean` (T, 2) is what it believed of z1 and z2."""
+    """A watch of a mission; `mean` (T, 2) is what it believed of z1, z2, `sharp` (T,) whether it chose 3g."""
 
     mean: NDArray[np.float64]
+    sharp: NDArray[np.bool_]
     records: list[dict[str, Any]]
 
 
@@ -80,8 +82,10 @@ def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
     finally:
         os.close(lock)
     records = [record for record, _ in read_records(folder / JOURNAL_NAME)]
-    filtered = np.array([record["filtered"] for record in records if "filtered" in record])
-    return Watched(filtered @ watch.models[0].knowledge.model.states.coordinates, records)
+    turns = [record for record in records if "filtered" in record]
+    filtered, chosen = (np.array([turn[key] for turn in turns]) for key in ("filtered", "next_control"))
+    mean = filtered @ watch.models[0].knowledge.model.states.coordinates
+    return Watched(mean, chosen == watch.scenario.control_names.index("3g"), records)
 
 
 def said(records: list[dict[str, Any]]) -> tuple[str, int]:
@@ -120,8 +124,13 @@ def study(name: str, seed: int, work: Path) -> None:
         way: 100.0 * np.sqrt(np.mean((watch.mean[first:] - truth[first:]) ** 2, axis=0))
         for way, watch in ways.items()
     }
-    figures = ", ".join(f"{way} {z1:.2f} {z2:.2f}" for way, (z1, z2) in errors.items())
-    print(f"{name}, seed {seed}: {what}. rms of z1, z2 from turn {first} on: {figures}", flush=True)
+    # What is decided behind a turn is in force in the next one.
+    decided = {
+        way: "{} of {}".format(*beyond_the_limit(np.append(False, watch.sharp[first:-1]), truth[first:, 0]))
+        for way, watch in ways.items()
+    }
+    figures = ", ".join(f"{way} {z1:.2f} {z2:.2f}, {decided[way]}" for way, (z1, z2) in errors.items())
+    print(f"{name}, seed {seed}: {what}. From turn {first} on rms of z1, z2, 3g: {figures}", flush=True)
 
 
 def main() -> int:

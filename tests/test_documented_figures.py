@@ -23,9 +23,7 @@ pytestmark = pytest.mark.xdist_group("wing")
 
 @pytest.mark.long
 def test_the_error_reward_with_and_without_the_load_factor() -> None:
-    scenario = load_scenario("level_turns").scenario
-    observation = scenario.observation.model_copy(update={"between_levels": False})  # as in the paper
-    scenario = scenario.model_copy(update={"observation": observation})
+    scenario = load_scenario("paper_level_turns").scenario
     source = ReducedModelSource(scenario, reduced_model())
     known = prepare_knowledge(scenario, source, scenario.mission.seed)
     flight = fly(scenario, known.twin(), known.plant(known.truth(scenario.mission.seed), source.open()))

@@ -41,8 +41,6 @@ Unknown = Annotated[
     bool, typer.Option("--allow-unknown", help="Pass over keys and columns that are no sensor.")
 ]
 Authority = Annotated[Path | None, typer.Option(help="Certificate of the authority of an mqtts:// broker.")]
-_WORTH_SAYING = 0.05
-"""Probability that no state explains the sensors, from which on a line for people says so."""
 
 
 def watch(
@@ -156,5 +154,5 @@ def _line(scenario: "Scenario", decision: Mapping[str, Any]) -> str:
         f"{scenario.mission.step_name} {decision['turn']}: {decision['control']}, {', '.join(health)}; "
         f"next {decision['next_control']} with probability {decision['probability']:.3f}"
     )
-    none = decision.get("none_of_these", 0.0)
-    return line + (f"; none of the states with {none:.2f}" if none >= _WORTH_SAYING else "")
+    chosen = decision.get("decided_by", "model")
+    return line if chosen == "model" else f"{line}; by {chosen} ({decision['hypotheses'][chosen]:.2f})"

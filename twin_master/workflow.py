@@ -133,6 +133,8 @@ def new_run(
         np.save(kept, build_graphical_model(resolved).policy(policy))
         files[POLICY_NAME] = kept.getvalue()
     progress = progress or SilentProgress()
+    if loaded.remark:
+        progress.note(loaded.remark)
     _restore(folder, progress)
     lock = create_run_folder(folder, config, files, replace=replace)
     try:

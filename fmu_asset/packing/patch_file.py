@@ -24,6 +24,7 @@ from typing import Any
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
     EVERY_CHANNEL,
+    SENSORS,
     Clock,
     HighPass,
     LoggerClock,
@@ -80,6 +81,14 @@ class PatchFile:
     def patch(self) -> ModelPatch:
         """All effects together."""
         return sum((effect.patch for effect in self.effects), ModelPatch())
+
+    @property
+    def of_structure(self) -> PatchFile:
+        """The same without what changes what is read and not what happens."""
+        kept = [
+            (e.id, ModelPatch(tuple(p for p in e.patch if not isinstance(p, SENSORS)))) for e in self.effects
+        ]
+        return PatchFile(tuple(Effect(name, patch) for name, patch in kept if len(patch)), self.channels)
 
     @property
     def needs_arrays(self) -> bool:

@@ -15,7 +15,7 @@ from twin_master.scenario.reading import load_scenario
 
 def test_what_is_shipped() -> None:
     wings = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
-    wings |= {"level_turns_learning", "three_regions"}
+    wings |= {"level_turns_learning", "paper_level_turns", "three_regions"}
     assert set(scenario_files()) == {*wings, "pump_wear", "watched_wing", "bracket", "stiffened_panel"}
     assert set(binding_files()) == {
         *("gear_pump", "three_fmus", "uav_wing", "uav_wing_fmi3"),

@@ -34,7 +34,7 @@ def wing() -> ReducedModel:
 
 
 def test_the_papers_policy(wing: ReducedModel) -> None:
-    scenario = load_scenario("level_turns").scenario
+    scenario = load_scenario("paper_level_turns").scenario
     knowledge = prepare_knowledge(scenario, ReducedModelSource(scenario, wing), 0)
     z1 = knowledge.model.states.coordinates[:, 0]
     np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
@@ -44,7 +44,7 @@ def test_the_papers_policy(wing: ReducedModel) -> None:
 
 def test_reliability(wing: ReducedModel) -> None:
     """Bars of 300 missions, widened for 80; `benchmarks/study_level_turns.py` flies as many as wanted."""
-    scenario = load_scenario("level_turns").scenario
+    scenario = load_scenario("paper_level_turns").scenario
     study = fly_seeds(scenario, ReducedModelSource(scenario, wing), range(80))
     assert study.within(2).value >= 0.95
     assert study.early_fallback.value <= 0.2
@@ -55,7 +55,7 @@ def test_the_whole_chain_and_its_resumption(
     wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
 ) -> None:
     monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
-    loaded = load_scenario("level_turns")
+    loaded = load_scenario("paper_level_turns")
     outcome = new_run(loaded, tmp_path / "whole")
     figures = {figure.key: figure for figure in outcome.figures}
     assert figures["policy_switch_damage"].value == pytest.approx(60.0)
@@ -80,7 +80,7 @@ def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(
     wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
-    loaded = load_scenario("level_turns")
+    loaded = load_scenario("paper_level_turns")
 
     def arrays(name: str, overrides: Overrides, packed: str = "python") -> dict[str, np.ndarray]:
         table = loaded.scenario.to_dict()

@@ -83,7 +83,11 @@ def calibrated_with(
 
 
 class AssetSource(Protocol):
-    """Everything that a mission needs to know of its asset."""
+    """Everything that a mission needs to know of its asset.
+
+    It may have `structural_table(draws, model)`, which returns like `observation_table` what is there at the
+    sensors where its model knows that they do not show it, else None: limits are of the structure.
+    """
 
     @property
     def origin(self) -> FlownAndBelieved:
@@ -109,6 +113,13 @@ class AssetSource(Protocol):
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write the asset's field under an estimated state and a control; return whether it has one."""
+
+
+def structural_table(source: AssetSource, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
+    """Return what is there at the sensors (E, S, U, G); None where they show it, see `AssetSource`."""
+    own = getattr(source, "structural_table", None)
+    found: Float | None = None if own is None else own(draws, model)
+    return found
 
 
 class AssetBelief(BeliefSection):
@@ -168,6 +179,10 @@ class PairedSource:
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the predictions (E, S, U, G) of the twin's model."""
         return self._model.observation_table(draws, model)
+
+    def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
+        """Return what is there at the sensors by the twin's model; None where they show it."""
+        return structural_table(self._model, draws, model)
 
     def open(self) -> Asset:
         """Return the asset at its start."""

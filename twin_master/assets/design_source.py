@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
     from fe.wing.design import WingDesign
     from fmu_asset.door.binding import Binding
+    from fmu_asset.packing.patch_file import PatchFile
 
 Float = NDArray[np.float64]
 
@@ -369,10 +370,24 @@ class DesignSource:
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the strains (E, S, U, G)."""
+        return self._strains(draws, model, self._patch())
+
+    def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
+        """Return the strains of the structure itself (E, S, U, G); None where no effect is of its gauges."""
+        patch = self._patch()
+        kept = None if patch is None else patch.of_structure
+        return None if kept == patch else self._strains(draws, model, kept)
+
+    def _patch(self) -> "PatchFile | None":
+        from fmu_asset.packing.patch_file import load_patch
+
+        return None if self._of.patch_path is None else load_patch(self._of.patch_path)
+
+    def _strains(self, draws: ParameterDraws, model: GraphicalModel, patch: "PatchFile | None") -> Float:
         from twin_master.assets.patches import model_observation_table
 
-        patch = self._of.patch_path
-        return model_observation_table(self.wing, self._scenario, draws, model, patch, self._of.design())
+        where, design = str(self._of.patch_path), self._of.design()
+        return model_observation_table(self.wing, self._scenario, draws, model, patch, design, where)
 
     def open(self) -> Asset:
         """Return the model as an asset."""

@@ -57,8 +57,9 @@ def model_observation_table(
     scenario: Scenario,
     draws: ParameterDraws,
     model: GraphicalModel,
-    patch_file: Path | None,
+    patch: PatchFile | None,
     design: WingDesign,
+    where: str = "The patch",
 ) -> Float:
     """Return the strains (E, S, U, G) that the twin predicts, with the effects of its patch if it has one.
 
@@ -67,13 +68,12 @@ def model_observation_table(
     MissingObservationModelError, OutsideModelError
         As `wing_observation_table`.
     PatchFileError, MissionInputError
-        The patch cannot be read, or the model cannot carry it.
+        The model cannot carry the patch.
     """
-    if patch_file is None:
+    if patch is None or not patch.effects:
         return wing_observation_table(wing, scenario, draws, model)
     check_wing_scenario(scenario, wing.regions, wing.gauge_count)
-    patch = load_patch(patch_file)
-    check_model_patch(patch, wing.gauge_count, str(patch_file))
+    check_model_patch(patch, wing.gauge_count, where)
     effects = plain_effects(patch.for_outputs(output_channels(wing.gauge_count)))
     arrays = arrays_for(design, patch)
     steps = None if arrays is None else partial(PatchedSteps, wing, PatchedWing(arrays))
@@ -95,7 +95,7 @@ def model_observation_table(
                     )
                     table[row, state, index] = behaviour.start(parameters, inputs, moment).strain
     except UnacceptableEffectError as error:
-        raise MissionInputError(f"the twin's model cannot carry {patch_file}: {error}") from error
+        raise MissionInputError(f"the twin's model cannot carry {where}: {error}") from error
     return table
 
 

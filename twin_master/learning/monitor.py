@@ -11,7 +11,7 @@ and Shafer 2023).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from hashlib import sha256
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.errors import InvalidModelError
+from twin_master.learning import switching
 from twin_master.learning.monitor_kernels import (
     forecast_rows,
     mix_onset,
@@ -26,9 +27,13 @@ from twin_master.learning.monitor_kernels import (
     weigh_model,
     weigh_none,
 )
-from twin_master.network.estimator import Carried, Estimate, Estimator, Notice, Suspicion
+from twin_master.learning.monitor_settings import MonitorSettings, Words
+from twin_master.learning.switching import GAUGES, MENDED, NONE
+from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.scenario.notice import MOST_DRAWS
 
 __all__ = ["MonitorSettings", "WatchfulEstimator", "Words"]
 
@@ -42,8 +47,8 @@ _FREE = 0.5
 """Prior probability that a gauge has a gain of its own, where no state explains all of them."""
 _GAINS = (-2.5, -1.0, 1.0, 2.5)
 """Gain errors of a gauge that is off, in those that are to be found; larger ones are found by the largest."""
-_DRAWS = 15
-"""Draws of the parameter that are kept apart here: evidence is compared, and no fine posterior is needed."""
+_REACH = (1.0, 0.5, 0.5, 1.0)
+"""How far about each of these the gain is learnt: half of a gain that is to be found is none."""
 _LARGEST = 20_000_000
 """Numbers that the beliefs of the rivals may take: each turn that is kept holds them."""
 _CLEARLY = float(np.log(10.0))
@@ -53,86 +58,12 @@ _NAMED_DEVIATIONS = 2.0
 _MOST_NAMED = 6
 
 
-@dataclass(frozen=True)
-class MonitorSettings:
-    """What is noticed, and when.
-
-    Attributes
-    ----------
-    threshold : float
-        Of each of the two e-processes: the probability of a false alarm is at most 1 / threshold, whatever
-        the number of turns.
-    gauge_gain : float
-        Gain error of a single gauge that is to be found; less than half of it raises no alarm.
-    all_gain : float
-        Prior standard deviation of the gains of gauges that have one of their own, where no state explains
-        all of them.
-    memory_turns : float
-        Turns after which what was learnt of these gains has faded to 1 / e.
-    onset_turns : float
-        Turns within which half of the faults begin that were not there from the start; n turns later a
-        share of onset_turns / (onset_turns + n) is still to begin.
-    absurd_deviations : float
-        A reading so many assumed standard deviations beyond what any state can show is left out.
-    prior : float
-        Prior probability of each of the two kinds of fault, for their posterior.
-    noise_degrees : float
-        How sure the assumed noise is: as if it came from so many observations of each gauge.
-    """
-
-    threshold: float = 100.0
-    gauge_gain: float = 0.2
-    all_gain: float = 0.1
-    memory_turns: float = 20.0
-    onset_turns: float = 50.0
-    absurd_deviations: float = 8.0
-    prior: float = 0.01
-    noise_degrees: float = 10.0
-
-
-@dataclass(frozen=True)
-class Words:
-    """How sentences speak of turns and sensors.
-
-    Attributes
-    ----------
-    step, sensor : str
-        What one is called.
-    factor : float
-        From the values of the sensors, SI, to what is printed.
-    units : tuple of str
-        Printed unit of each sensor; none where they are empty or "1".
-    names : tuple of str
-        What each sensor is called beside its number, if anything.
-    command : str
-        What looks for the cause of an alarm; empty where nothing can.
-    """
-
-    step: str = "turn"
-    sensor: str = "gauge"
-    factor: float = 1.0
-    units: tuple[str, ...] = ()
-    names: tuple[str, ...] = ()
-    command: str = "uav-twin discrepancy run --from-run DIR"
-
-    def value(self, sensor: int, *values: float) -> list[str]:
-        """Return values of a sensor as they are printed."""
-        unit = self.units[sensor] if self.units else "1"
-        return [f"{self.factor * value:.4g}{'' if unit == '1' else f' {unit}'}" for value in values]
-
-    def sensors(self, numbers: Sequence[int]) -> str:
-        """Return sensors, counted from 0, in words."""
-        names = [f"{g + 1} ({self.names[g]})" if self.names else str(g + 1) for g in numbers]
-        if len(names) == 1:
-            return f"{self.sensor} {names[0]}"
-        return f"{self.sensor}s {', '.join(names[:-1])} and {names[-1]}"
-
-
 class WatchfulEstimator:
-    """An estimator with notices beside it; its beliefs are its own, with absurd readings left out.
+    """An estimator with notices beside it; absurd readings are left out.
 
-    It carries beside the arrays of the estimator, under the prefix `notice/`, the beliefs of the model and
-    the rivals over draws and states, their log e-values and sums of squares.
+    Its belief is that of the mixture: of the estimator, of each gauge being off, and of what was off and is
+    mended (`switching`). It carries beside the arrays of the estimator, under the prefix `notice/`, beliefs
+    of the model and the rivals over draws and states, their log e-values, shares and sums of squares.
 
     Parameters
     ----------
@@ -178,7 +109,8 @@ class WatchfulEstimator:
                 "fewer levels or state factors, or leave out `notice`"
             )
         # A model that takes the place of another, as one that was taught, begins without suspicion.
-        self._key = np.frombuffer(sha256(np.ascontiguousarray(table).tobytes()).digest()[:8], dtype=np.uint64)
+        digest = sha256(b"2" + np.ascontiguousarray(table).tobytes()).digest()
+        self._key = np.frombuffer(digest[:8], dtype=np.uint64)
         controls = range(sensor_model.control_count)
         self._value = [np.ascontiguousarray(table[:, :, u]) for u in controls]
         independent = sensor_model.independent_standard_deviation
@@ -186,11 +118,14 @@ class WatchfulEstimator:
         reach = settings.absurd_deviations * deviation
         self._low = (sensor_model.value_per_draw.min(axis=0) - reach).min(axis=0)  # (U, G)
         self._high = (sensor_model.value_per_draw.max(axis=0) + reach).max(axis=0)
-        self._gains = settings.gauge_gain * np.array(_GAINS)
+        self._gains, self._reach = settings.gauge_gain * np.array([_GAINS, _REACH])
         # The prior of a gauge grows with the turns that it takes to be found, or weak ones would be lost.
         per_turn = np.mean((settings.gauge_gain * sensor_model.mean / deviation) ** 2, axis=(0, 1))
         turns = 1.0 + 1.0 / np.maximum(per_turn, 1e-3)
         self._log_prior: Float = np.log(turns / turns.sum())
+        of_gauges = np.repeat(self._log_prior - np.log(len(_GAINS)), len(_GAINS))
+        self._begins: Float = np.log(0.5) + np.concatenate([[-np.inf, -np.inf, 0.0], of_gauges])
+        self._names = tuple(f"{self._words.sensors([g])} off" for g in range(sensors))
 
     @property
     def model(self) -> GraphicalModel:
@@ -198,8 +133,20 @@ class WatchfulEstimator:
         return self._inner.model
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
-        return self._inner.smoothed(carried)
+        """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S).
+
+        Under the model it is the estimator's; otherwise the beliefs of the mixture are smoothed, from that of
+        the last turn under all but the model.
+        """
+        own = self._inner.smoothed(carried)
+        if not carried:
+            return own
+        with np.errstate(divide="ignore"):
+            rows = np.log([turn.arrays[_PREFIX + "belief"] for turn in carried])
+            rows[-1] = np.log(carried[-1].arrays[_PREFIX + "rivals"])
+        others = smooth(self.model, [turn.control_index for turn in carried], rows).smoothed
+        right = float(carried[-1].arrays[_PREFIX + "right"][0])
+        return np.asarray(right * own + (1.0 - right) * others)
 
     def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
         """Advance the belief to turn t and correct it by an observation, see `Estimator.turn`."""
@@ -215,13 +162,36 @@ class WatchfulEstimator:
         own["left_out"] = (absurd | ((own["left_out"] > 0.0) & np.isnan(seen))).astype(np.float64)
         suspicion = self._suspicion(own)
         notices += self._alarms(own, suspicion, turn)
-        arrays = {**estimate.carried.arrays, **self._packed(own)}
+        believed = own["share"], estimate.filtered, own["mended"], own["gauge"]
+        found = switching.hypotheses(*believed, self._names)
+        notices += self._leading(own, found, turn)
+        own["belief"], own["rivals"], right = switching.beliefs_of(*believed)
+        own["right"] = np.array([right])
         return replace(
             estimate,
-            carried=Carried(control_index, arrays),
+            filtered=own["belief"],
+            carried=Carried(control_index, {**estimate.carried.arrays, **self._packed(own)}),
             notices=(*estimate.notices, *notices),
-            suspicion=suspicion,
+            suspicion=replace(suspicion, hypotheses={one.name: one.probability for one in found}),
+            hypotheses=found,
         )
+
+    def _leading(self, own: Arrays, found: Sequence[Hypothesis], turn: int) -> list[Notice]:
+        """Return the notice that belief and decision follow another hypothesis than before, if it is so."""
+        first = max(found, key=lambda one: one.probability)
+        number = 0 if first is found[0] else -1 if first.belief is None else self._names.index(first.name) + 1
+        if first.probability <= 0.5 or number == own["leading"][0]:
+            return []
+        own["leading"][0] = number
+        when = f"{self._words.step.capitalize()} {turn}"
+        sensors = f"{self._words.sensor}s"
+        what = f"{first.name}: belief and decision follow the other {sensors}"
+        if number <= 0:
+            what = f"the model explains the {sensors} again"
+        if number < 0:
+            what = f"no state explains the {sensors}, none is believed, and the control is the safest"
+        sentence = f"{when}: {what} (probability {first.probability:.3g})."
+        return [Notice("hypothesis", sentence, (number,) if number > 0 else (), first.probability)]
 
     def _start(self, forecast: Float) -> Arrays:
         """Return what is carried, before the first observation of this model."""
@@ -232,12 +202,17 @@ class WatchfulEstimator:
             "model": model,
             "gauge": np.broadcast_to(model, self._shape).astype(np.float32),
             "none": model[None].astype(np.float32),
+            "mended": model.copy(),
+            "share": switching.at_first(2.0 * self._settings.prior * _FROM_THE_START, self._begins),
+            "leading": np.zeros(1),
             "log_gauge": np.full((sensors, gains), weight - np.log(gains)),
             "log_none": np.full(1, weight),
             "gauge_onset": np.zeros((sensors, gains)),
             "none_onset": np.zeros(1),
             "model_squares": np.zeros(sensors),
+            "mended_squares": np.zeros(sensors),
             "gauge_squares": np.zeros((sensors, gains)),
+            "gauge_sums": np.zeros((sensors, gains, 2)),
             "none_statistics": np.tile([_FREE, 0.0, 0.0, 0.0, 0.0], (sensors, 1)),
             "count": np.zeros(sensors),
             "turns": np.zeros(1),
@@ -249,7 +224,7 @@ class WatchfulEstimator:
         """Return what was carried, one transition later, with the rivals that begin in this turn."""
         own = self._unpacked(before.arrays)
         sparse, states = self.model.transition.sparse, self._shape[-1]
-        for name in ("model", "gauge", "none"):
+        for name in ("model", "gauge", "none", "mended"):
             rows, own[name] = own[name].reshape(-1, states), np.empty_like(own[name])
             forecast_rows(
                 sparse.start, sparse.source, sparse.probability, before.control_index * states,
@@ -264,6 +239,8 @@ class WatchfulEstimator:
             np.full(keep.size, inflow - np.log(gains)), turn, own["gauge_onset"].reshape(-1),
             keep.reshape(-1),
         )  # fmt: skip
+        fading = np.exp(-1.0 / self._settings.memory_turns)
+        own["gauge_sums"] *= fading * keep[..., None]
         own["gauge_squares"] = keep * own["gauge_squares"] + (1.0 - keep) * own["model_squares"][:, None]
         kept = np.empty(1)
         mix_onset(
@@ -272,12 +249,33 @@ class WatchfulEstimator:
         statistics, fresh = own["none_statistics"], 1.0 - kept[0]
         statistics[:, 0] += fresh * (_FREE - statistics[:, 0])
         statistics[:, [1, 4]] += fresh * (own["model_squares"][:, None] - statistics[:, [1, 4]])
-        statistics[:, 2:4] *= kept[0] * np.exp(-1.0 / self._settings.memory_turns)
+        statistics[:, 2:4] *= fading * kept[0]
+        self._switch(own, inflow, turn)
         return own
+
+    def _switch(self, own: Arrays, inflow: float, turn: float) -> None:
+        """Let faults begin and end; "mended" takes over beliefs and sums of squares of those that ended."""
+        twice = 2.0 * self._settings.prior
+        hazard = np.log(twice) + inflow - np.log1p(twice * (self._to_begin(turn - 1.0) - 1.0))
+        before = own["share"][MENDED]
+        own["share"], ended = switching.one_turn_later(own["share"], hazard, self._begins)
+        fresh = max(0.0, -np.expm1(before + np.log1p(-switching.ENDS) - own["share"][MENDED]))
+        weight = np.exp(ended)
+        of_gauge = weight[1:].reshape(self._shape[:2])
+        belief = weight[1:].astype(np.float32) @ own["gauge"].reshape(len(weight) - 1, -1)
+        came = belief.reshape(self._shape[2:]) + weight[0] * own["none"][0]
+        own["mended"] += fresh * (came / came.sum() - own["mended"])
+        statistics, squares = own["none_statistics"], own["model_squares"].copy()
+        squares += np.sum(of_gauge * (own["gauge_squares"] - squares[:, None]), axis=1)
+        free = statistics[:, 0]
+        squares += weight[0] * (
+            free * statistics[:, 4] + (1.0 - free) * statistics[:, 1] - own["model_squares"]
+        )
+        own["mended_squares"] += fresh * (squares - own["mended_squares"])
 
     def _packed(self, own: Arrays) -> Arrays:
         """Return what is carried: of the beliefs about gauges, most of which are zero, those that are not."""
-        place = np.flatnonzero(own["gauge"])
+        place = np.flatnonzero(own["gauge"] != 0.0)  # of truth values: ten times as fast as of numbers
         packed = own | {"gauge": own["gauge"].ravel()[place], "gauge_place": place.astype(np.int32)}
         return {_PREFIX + name: value for name, value in packed.items()} | {_PREFIX + "model_key": self._key}
 
@@ -300,20 +298,29 @@ class WatchfulEstimator:
         near = self._sensor_model.nearest(seen, control_index, self._value[control_index])
         value, inverse = near.value, self._inverse[control_index]
         degrees, count = self._settings.noise_degrees, own["count"]
-        known, log_likelihood = np.ones(value.shape), near.log_density
-        before = own["model_squares"].copy()
+        known, log_likelihood = np.ones(value.shape), near.log_density.copy()
+        before, mended = own["model_squares"].copy(), own["mended_squares"].copy()
+        ratio = np.zeros_like(own["share"])
+        ratio[MENDED] = weigh_model(
+            seen, value, inverse, degrees, count, own["mended_squares"], own["mended"], known, log_likelihood
+        ) + 0.5 * np.sum(np.log((degrees + before) / (degrees + mended)), where=~np.isnan(seen))
+        of_gauges, log_likelihood = own["log_gauge"].copy(), near.log_density
         log_model = weigh_model(
             seen, value, inverse, degrees, count, own["model_squares"], own["model"], known, log_likelihood
         )
         weigh_gauges(
-            seen, value, inverse, self._gains, degrees, count, before, known, log_likelihood, log_model,
-            own["gauge"], own["log_gauge"], own["gauge_squares"],
+            seen, value, inverse, self._gains, self._reach, degrees, count, before, known, log_likelihood,
+            log_model, own["gauge"], own["log_gauge"], own["gauge_squares"], own["gauge_sums"],
         )  # fmt: skip
         log_none = weigh_none(
             seen, value, inverse, self._settings.all_gain, degrees, count, before, known, log_likelihood,
             own["none"][0], own["none_statistics"],
         )  # fmt: skip
         own["log_none"] += log_none - log_model
+        ratio[MENDED] -= log_model
+        ratio[NONE], ratio[GAUGES:] = log_none - log_model, (own["log_gauge"] - of_gauges).ravel()
+        own["share"] += ratio
+        own["share"] -= np.logaddexp.reduce(own["share"])
         count += ~np.isnan(seen)
         own["turns"] += 1.0
 
@@ -321,14 +328,11 @@ class WatchfulEstimator:
         to_begin = np.log(self._to_begin(float(own["turns"][0]) - 1.0))
         begun = np.logaddexp.reduce(own["log_gauge"], axis=1)
         log_gauge = np.logaddexp(begun, to_begin)
-        off, none = float(np.logaddexp.reduce(begun + self._log_prior)), float(own["log_none"][0])
-        prior = self._settings.prior
-        right = np.log(1.0 - 2.0 * prior + 2.0 * prior * np.exp(to_begin))
-        log_share = np.array([right, np.log(prior) + off, np.log(prior) + none])
-        share = np.exp(log_share - np.logaddexp.reduce(log_share))
+        none = float(own["log_none"][0])
+        share = np.exp(own["share"])
         return Suspicion(
-            none_of_these=float(share[2]),
-            gauge_off=float(share[1]),
+            none_of_these=float(share[NONE]),
+            gauge_off=float(share[GAUGES:].sum()),
             log_evidence_none=float(np.logaddexp(none, to_begin)),
             log_evidence_any_gauge=float(np.logaddexp.reduce(log_gauge + self._log_prior)),
             log_evidence_gauge=log_gauge,
@@ -422,7 +426,7 @@ def _spread(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:
     Evenly, because a true value between two of them must not look like a fault, in the tails least of all.
     """
     order = np.argsort(draws, kind="stable")
-    grid = np.linspace(draws[order[0]], draws[order[-1]], _DRAWS)
+    grid = np.linspace(draws[order[0]], draws[order[-1]], MOST_DRAWS)
     chosen = np.unique([order[np.argmin(np.abs(draws[order] - value))] for value in grid])
     nearest = np.argmin(np.abs(draws[:, None] - draws[chosen]), axis=1)
     total = np.bincount(nearest, weight, minlength=len(chosen))

@@ -16,10 +16,12 @@ Unsigned = NDArray[np.uint64]
 
 NEGLIGIBLE = 1e-30
 """States of the model below this probability are left out of its evidence."""
-NEGLIGIBLE_RIVAL = 1e-9
+NEGLIGIBLE_RIVAL = 1e-7
 """The same of a rival: what is left out makes its evidence smaller, and an alarm later."""
-NEGLIGIBLE_SHARE = 1e-12
+NEGLIGIBLE_SHARE = 1e-9
 """States below this probability add nothing to a sum of squares."""
+LARGE = 1e100
+"""Products of densities are taken between this and its inverse: one logarithm for many."""
 
 
 @compiled
@@ -79,16 +81,25 @@ def weigh_model(
     """
     draws, states, sensors = value.shape
     best = -np.inf
+    log_scale = np.zeros(states)
+    for s in range(states):
+        for g in range(sensors):
+            if not np.isnan(observation[g]):
+                log_scale[s] += math.log(inverse_deviation[s, g])
     for e in range(draws):
         for s in range(states):
-            total = log_likelihood[e, s]
+            total, product, power = log_likelihood[e, s] + log_scale[s], 1.0, 0.0
             for g in range(sensors):
                 if np.isnan(observation[g]):
                     continue
-                scale = inverse_deviation[s, g]
-                x = (observation[g] - value[e, s, g]) * scale
+                x = (observation[g] - value[e, s, g]) * inverse_deviation[s, g]
                 known[e, s, g] = 1.0 + x * x / (degrees + squares[g])
-                total += math.log(scale) - 0.5 * (degrees + count[g] + 1.0) * math.log(known[e, s, g])
+                # One logarithm for all sensors with as many observations, until their product is large.
+                if power != 0.5 * (degrees + count[g] + 1.0) or product > LARGE:
+                    total -= power * math.log(product)
+                    product, power = 1.0, 0.5 * (degrees + count[g] + 1.0)
+                product *= known[e, s, g]
+            total -= power * math.log(product)
             log_likelihood[e, s] = total
             if belief[e, s] >= NEGLIGIBLE:
                 best = max(best, total)
@@ -118,6 +129,7 @@ def weigh_gauges(
     value: Float,
     inverse_deviation: Float,
     gains: Float,
+    reach: Float,
     degrees: float,
     count: Float,
     squares_of_model: Float,
@@ -127,49 +139,88 @@ def weigh_gauges(
     belief: Single,
     log_weight: Float,
     squares: Float,
+    sums: Float,
 ) -> None:
     """Assimilate one observation under the rivals "gauge g shows 1 + gains[k] times what is there".
 
-    squares_of_model (G,) are those before the observation; known, log_likelihood and log_evidence are of the
-    model. belief (G, K, E, S), log_weight and squares (G, K) are brought up to date.
+    The gain is learnt within gains[k] ± reach[k], its prior standard deviation, by the sums c² and cx of a
+    regression, sums (G, K, 2). squares_of_model (G,) are those before the observation; known, log_likelihood
+    and log_evidence are of the model. belief (G, K, E, S), log_weight, squares (G, K) and sums are brought up
+    to date.
     """
     draws, states, sensors = value.shape
-    log_value = np.empty((draws, states))
+    log_value, root = np.empty((draws, states)), np.empty((draws, states))
     for g in range(sensors):
         for k in range(len(gains)):
             seen = not np.isnan(observation[g])
-            left = degrees + squares[g, k]
-            power = 0.5 * (degrees + count[g] + 1.0)
+            left, power = degrees + squares[g, k], 0.5 * (degrees + count[g] + 1.0)
             constant = 0.5 * math.log((degrees + squares_of_model[g]) / left)
+            unknown = 1.0 / (1.0 + sums[g, k, 0])
+            fitted = min(max(unknown * sums[g, k, 1], -1.0), 1.0)
             best = -np.inf
             for e in range(draws):
                 for s in range(states):
                     if belief[g, k, e, s] < NEGLIGIBLE_RIVAL:
                         belief[g, k, e, s] = 0.0
                         continue
-                    total = log_likelihood[e, s]
+                    total, wide = log_likelihood[e, s], 1.0
                     if seen:
+                        c = reach[k] * value[e, s, g] * inverse_deviation[s, g]
                         x = (observation[g] - (1.0 + gains[k]) * value[e, s, g]) * inverse_deviation[s, g]
-                        total += constant + power * math.log(known[e, s, g] / (1.0 + x * x / left))
-                    log_value[e, s] = total
+                        x -= c * fitted
+                        wide = 1.0 + c * c * unknown
+                        total += constant + power * math.log(known[e, s, g] / (1.0 + x * x / (left * wide)))
+                    log_value[e, s], root[e, s] = total, math.sqrt(wide)
                     best = max(best, total)
             mass = 0.0
             for e in range(draws):
                 for s in range(states):
                     if belief[g, k, e, s] > 0.0:
-                        log_value[e, s] = belief[g, k, e, s] * _exp(log_value[e, s] - best)
+                        log_value[e, s] = belief[g, k, e, s] * _exp(log_value[e, s] - best) / root[e, s]
                         mass += log_value[e, s]
             log_weight[g, k] += best + math.log(mass) - log_evidence if mass > 0.0 else -np.inf
-            added = 0.0
             for e in range(draws):
                 for s in range(states):
                     if belief[g, k, e, s] > 0.0:
-                        share = log_value[e, s] / mass
-                        belief[g, k, e, s] = share
-                        if seen and share >= NEGLIGIBLE_SHARE:
-                            x = (observation[g] - (1.0 + gains[k]) * value[e, s, g]) * inverse_deviation[s, g]
-                            added += share * x * x
-            squares[g, k] += added
+                        belief[g, k, e, s] = log_value[e, s] / mass
+            if seen:
+                added = _regressed(
+                    observation[g], value[:, :, g], inverse_deviation[:, g], 1.0 + gains[k], reach[k], fitted,
+                    unknown, belief[g, k],
+                )  # fmt: skip
+                squares[g, k] += added[3]
+                sums[g, k] += added[1:3]
+
+
+@compiled
+def _regressed(
+    seen: float,
+    value: Float,
+    inverse_deviation: Float,
+    shown: float,
+    gain: float,
+    fitted: float,
+    unknown: float,
+    belief: Single,
+) -> Float:
+    """Return expected sums over draws and states (4,): x², c², cx, and the innovations over their spread.
+
+    x is what one gauge shows beyond `shown` times its value, and c what a share `gain` of the value is.
+    """
+    added = np.zeros(4)
+    for e in range(belief.shape[0]):
+        for s in range(belief.shape[1]):
+            share = belief[e, s]
+            if share < NEGLIGIBLE_SHARE:
+                continue
+            x = (seen - shown * value[e, s]) * inverse_deviation[s]
+            c = gain * value[e, s] * inverse_deviation[s]
+            added[0] += share * x * x
+            added[1] += share * c * c
+            added[2] += share * c * x
+            x -= c * fitted
+            added[3] += share * x * x / (1.0 + c * c * unknown)
+    return added
 
 
 @compiled
@@ -197,12 +248,13 @@ def weigh_none(
     log_value = np.empty((draws, states))
     free = np.zeros((draws, states, sensors))
     best = -np.inf
+    without = np.sqrt((degrees + squares_of_model) / (degrees + statistics[:, 1]))
     for e in range(draws):
         for s in range(states):
             if belief[e, s] < NEGLIGIBLE_RIVAL:
                 belief[e, s] = 0.0
                 continue
-            total = log_likelihood[e, s]
+            total, product = log_likelihood[e, s], 1.0
             for g in range(sensors):
                 if np.isnan(observation[g]):
                     continue
@@ -210,23 +262,29 @@ def weigh_none(
                 x = (observation[g] - value[e, s, g]) * inverse_deviation[s, g]
                 left = degrees + statistics[g, 1]
                 log_without = power * math.log(known[e, s, g] / (1.0 + x * x / left))
-                log_without += 0.5 * math.log((degrees + squares_of_model[g]) / left)
                 c = gain * value[e, s, g] * inverse_deviation[s, g]
                 x -= c * statistics[g, 3] / (1.0 + statistics[g, 2])
                 left = (degrees + statistics[g, 4]) * (1.0 + c * c / (1.0 + statistics[g, 2]))
                 log_with = power * math.log(known[e, s, g] / (1.0 + x * x / left))
-                log_with += 0.5 * math.log((degrees + squares_of_model[g]) / left)
                 share = min(statistics[g, 0], 1.0)  # rounding takes it above one
                 if share == 0.0:  # what is ruled out for good is not the larger, whatever it would explain
                     log_with = -np.inf
                 elif share == 1.0:
                     log_without = -np.inf
-                largest = max(log_with, log_without)
-                own = share * _exp(log_with - largest)
-                both = own + (1.0 - share) * _exp(log_without - largest)
+                own = share * math.sqrt((degrees + squares_of_model[g]) / left)
+                both = (1.0 - share) * without[g]
+                if log_with > log_without:
+                    both *= _exp(log_without - log_with)
+                else:
+                    own *= _exp(log_with - log_without)
+                total += max(log_with, log_without)
+                both += own
                 free[e, s, g] = own / both
-                total += largest + math.log(both)
-            log_value[e, s] = total
+                if not 1.0 / LARGE < product < LARGE:
+                    total += math.log(product)
+                    product = 1.0
+                product *= both
+            log_value[e, s] = total + math.log(product)
             best = max(best, total)
     mass = _weigh(belief, log_value, best)
     if mass == 0.0:
@@ -261,20 +319,9 @@ def _learn_gain(
     seen: float, value: Float, inverse_deviation: Float, gain: float, belief: Single, free: Float, sums: Float
 ) -> None:
     """Bring the statistics (5,) of one gauge up to date, expected over draws and states."""
-    fitted, spread = sums[3] / (1.0 + sums[2]), 1.0 / (1.0 + sums[2])
-    added = np.zeros(5)
+    unknown, share = 1.0 / (1.0 + sums[2]), 0.0
     for e in range(belief.shape[0]):
         for s in range(belief.shape[1]):
-            share = belief[e, s]
-            if share < NEGLIGIBLE_SHARE:
-                continue
-            x = (seen - value[e, s]) * inverse_deviation[s]
-            c = gain * value[e, s] * inverse_deviation[s]
-            added[0] += share * free[e, s]
-            added[1] += share * x * x
-            added[2] += share * c * c
-            added[3] += share * c * x
-            x -= c * fitted
-            added[4] += share * x * x / (1.0 + c * c * spread)
-    sums[0] = added[0]
-    sums[1:] += added[1:]
+            share += belief[e, s] * free[e, s]
+    sums[0] = share
+    sums[1:] += _regressed(seen, value, inverse_deviation, 1.0, gain, unknown * sums[3], unknown, belief)

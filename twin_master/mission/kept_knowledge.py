@@ -8,6 +8,7 @@ import io
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,20 +25,21 @@ KNOWLEDGE_NAME = "twin.npz"
 def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
     """Write what a twin knows before its flight; the bytes depend on nothing else.
 
-    The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U).
+    The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); where what is there at
+    the sensors is not what they show also `true` (E, S, U, G), SI.
 
     Raises
     ------
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    content = io.BytesIO()
-    np.savez(
-        content,
-        predicted=knowledge.sensor_model.value_per_draw,
-        draws=knowledge.draws.values,
-        policy=knowledge.plan.policy,
-    )
+    content, true = io.BytesIO(), knowledge.rewards.true_per_draw
+    arrays: dict[str, Any] = {
+        "predicted": knowledge.sensor_model.value_per_draw,
+        "draws": knowledge.draws.values,
+        "policy": knowledge.plan.policy,
+    }
+    np.savez(content, **arrays | ({} if true is None else {"true": true}))
     atomic_write_bytes(folder / KNOWLEDGE_NAME, content.getvalue())
 
 
@@ -72,11 +74,13 @@ def kept_knowledge(folder: Path, scenario: Scenario) -> Knowledge:
             predicted, draws, policy = (
                 np.asarray(kept[name], dtype=np.float64) for name in ("predicted", "draws", "policy")
             )
+            true = np.asarray(kept["true"], dtype=np.float64) if "true" in kept else None
         calibration = scenario.calibration
         parameter = ParameterDraws(
             calibration.parameter, draws, float(draws.mean()), float(draws.std()), calibration.source
         )
-        return knowledge_of(scenario, build_graphical_model(scenario), parameter, predicted, policy)
+        model = build_graphical_model(scenario)
+        return knowledge_of(scenario, model, parameter, predicted, policy, true)
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise RunFolderError(
             f"{path} is missing, damaged or of another scenario ({error}): fly the run again with --replace."

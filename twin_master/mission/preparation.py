@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.progress import Progress, SilentProgress
-from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.asset_source import AssetSource, structural_table
 from twin_master.assets.interface import Asset
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
@@ -96,7 +96,20 @@ class Knowledge:
             lag=lag,
             first_control=self.scenario.mission.first_control,
             estimator=estimator,
+            safest=self.safest,
         )
+
+    @property
+    def safest(self) -> int:
+        """Index of the control where no state is believed.
+
+        That of the scenario, or the one with the least load: whose health reward is the best in the mean over
+        all states, the first of equals.
+        """
+        named = self.scenario.planner.safest
+        if named is not None:
+            return self.scenario.control_names.index(named)
+        return int(np.argmax(self.rewards.planning_reward(1.0, 0.0).mean(axis=0)))
 
     @cached_property
     def true_model(self) -> GraphicalModel:
@@ -142,12 +155,13 @@ def prepare_knowledge(
     model = build_graphical_model(scenario)
     draws = source.draws(seed)
     predicted, section = source.observation_table(draws, model), scenario.observation
+    true = structural_table(source, draws, model)
     for key, deviation in (
         ("observation.standard_deviation", section.standard_deviation),
         ("truth.noise.standard_deviation", scenario.truth.noise.standard_deviation),
     ):
         check_noise(key, deviation, predicted, section.sensor_units)
-    return knowledge_of(scenario, model, draws, predicted, policy)
+    return knowledge_of(scenario, model, draws, predicted, policy, true)
 
 
 def knowledge_of(
@@ -156,6 +170,7 @@ def knowledge_of(
     draws: ParameterDraws,
     predicted: Float,
     policy: Float | None = None,
+    true: Float | None = None,
 ) -> Knowledge:
     """Return what a twin knows that expects these observations (E, S, U, G), SI.
 
@@ -169,6 +184,8 @@ def knowledge_of(
         The E draws that the observations are predicted for.
     predicted : (E, S, U, G)
         SI.
+    true : (E, S, U, G), optional
+        What is there at the sensors, for limits and rewards, where that is not what they show, SI.
 
     Raises
     ------
@@ -184,7 +201,7 @@ def knowledge_of(
         model_error=section.model_error,
         interval=model.states.within_interval(predicted.mean(axis=0)) if section.between_levels else None,
     )
-    rewards = RewardModel(sensor_model, reward_settings(scenario))
+    rewards = RewardModel(sensor_model, reward_settings(scenario), true)
     transition, discount = model.transition, scenario.planner.gamma
     reward = rewards.planning_reward(scenario.rewards.health_weight, scenario.rewards.control_weight)
     if policy is None:

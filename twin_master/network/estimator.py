@@ -15,7 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import ObservationContext, filter_step, smooth
 
-__all__ = ["Carried", "Estimate", "Estimator", "ExactFilter", "Learnt", "Notice", "SensorModel", "Suspicion"]
+__all__ = [
+    "Carried",
+    "Estimate",
+    "Estimator",
+    "ExactFilter",
+    "Hypothesis",
+    "Learnt",
+    "Notice",
+    "SensorModel",
+    "Suspicion",
+]
 
 Float = NDArray[np.float64]
 
@@ -114,6 +124,10 @@ class Suspicion:
         Log e-value of each sensor.
     left_out : (G,)
         Whether the readings of a sensor are absurd and left out.
+    hypotheses : dict of str to float
+        Probability of what may hold by name, see `Hypothesis`.
+    decided_by : str
+        That of them which adds most to the probability of the control that is decided for.
     """
 
     none_of_these: float
@@ -122,6 +136,26 @@ class Suspicion:
     log_evidence_any_gauge: float
     log_evidence_gauge: Float
     left_out: NDArray[np.bool_]
+    hypotheses: Mapping[str, float] = field(default_factory=dict)
+    decided_by: str = "model"
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What may hold in a turn.
+
+    Attributes
+    ----------
+    name : str
+        `model`, `gauge 5 off`, ..., `none of these`.
+    probability : float
+    belief : (S,) or None
+        p(D_t | hypothesis, o_0..o_t); None where no state is believed.
+    """
+
+    name: str
+    probability: float
+    belief: Float | None
 
 
 @dataclass(frozen=True)
@@ -133,9 +167,9 @@ class Estimate:
     forecast : (S,)
         p(D_t | o_0..o_{t-1}).
     filtered : (S,)
-        p(D_t | o_0..o_t).
+        p(D_t | o_0..o_t), under all hypotheses that believe in a state.
     log_evidence : float
-        log p(o_t | o_0..o_{t-1}).
+        log p(o_t | o_0..o_{t-1}), under the model, as the forecast.
     carried : Carried
         For the turn after.
     learnt : dict of str to Learnt
@@ -147,6 +181,8 @@ class Estimate:
     expected : callable or None
         Returns for each sensor the mean of what it shows and the standard deviation of its noise, (G,) each,
         where the estimator knows more of the sensors than their model.
+    hypotheses : tuple of Hypothesis
+        What may hold, where more than the model is compared; those that are very improbable are left out.
     """
 
     forecast: Float
@@ -157,6 +193,7 @@ class Estimate:
     notices: tuple[Notice, ...] = ()
     suspicion: Suspicion | None = None
     expected: Callable[[], tuple[Float, Float]] | None = None
+    hypotheses: tuple[Hypothesis, ...] = ()
 
 
 class Estimator(Protocol):

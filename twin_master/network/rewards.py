@@ -148,29 +148,42 @@ class RewardModel:
     quantity : QuantityModel
         What the sensors would show without noise, for each draw, state and control.
     settings : RewardSettings
+    true_per_draw : (E, S, U, G), optional
+        What is there at the sensors, SI, where that is not what they show: limits and health are of the
+        structure, and a gauge that is known to show too little does not make it healthier.
 
     Raises
     ------
     InvalidModelError
-        If the settings are for another number of controls.
+        If the settings are for another number of controls, or what is there has another shape.
     """
 
-    def __init__(self, quantity: QuantityModel, settings: RewardSettings) -> None:
+    def __init__(
+        self, quantity: QuantityModel, settings: RewardSettings, true_per_draw: Float | None = None
+    ) -> None:
         normaliser = settings.control_normaliser or (1.0,) * len(settings.control_reward)
         if not len(settings.control_reward) == len(normaliser) == quantity.control_count:
             raise InvalidModelError(
                 f"expected a control reward and a normaliser for each of {quantity.control_count} controls, "
                 f"got {len(settings.control_reward)} and {len(normaliser)}"
             )
+        shape = quantity.value_per_draw.shape
+        if true_per_draw is not None and true_per_draw.shape != shape:
+            raise InvalidModelError(
+                f"expected what is there at the sensors in the shape of what they show, {shape}, got "
+                f"{true_per_draw.shape}"
+            )
         self.quantity = quantity
         self.settings = settings
+        self.true_per_draw = true_per_draw
         self._normaliser = np.array(normaliser, dtype=np.float64)
         self._control_reward = np.array(settings.control_reward, dtype=np.float64)
 
     @cached_property
     def health_per_draw(self) -> Float:
         """Health reward of each draw, state and control (E, S, U)."""
-        values, chosen = self.quantity.value_per_draw, self.settings.health_sensors
+        values, chosen = self.true_per_draw, self.settings.health_sensors
+        values = self.quantity.value_per_draw if values is None else values
         return health_reward(values if chosen is None else values[..., list(chosen)], self.settings.limit)
 
     @cached_property

@@ -172,6 +172,8 @@ class Twin:
         Control of the first turn, where none is given with it.
     estimator : Estimator, optional
         What holds the belief in the place of the exact filter of model and sensor model.
+    safest : int or str, optional
+        Control where no state is believed; without it the policy of what is believed decides alone.
 
     Raises
     ------
@@ -191,6 +193,7 @@ class Twin:
         lag: int | None = DEFAULT_LAG,
         first_control: int | str = 0,
         estimator: Estimator | None = None,
+        safest: int | str | None = None,
     ) -> None:
         if lag is not None and lag < 0:
             raise InvalidModelError(f"expected a lag of 0 or more turns, or None for all, got {lag}")
@@ -205,6 +208,9 @@ class Twin:
         self._seen: deque[_Seen] = deque(maxlen=None if lag is None else lag + 2)
         self._turns = 0
         self._proposed = self._index_of(first_control)
+        self._safest: Float | None = None
+        if safest is not None:
+            self._safest = np.eye(len(model.controls))[self._index_of(safest)]
 
     @property
     def model(self) -> GraphicalModel:
@@ -407,10 +413,10 @@ class Twin:
     def _decided(self, estimate: Estimate) -> TwinTurn:
         control_index = estimate.carried.control_index
         prediction = predict(self.model, estimate.filtered, control_index, self.policy, self.prediction_steps)
-        decided_on = estimate.filtered
-        if self.decide_on == "predicted":
-            decided_on = self.model.transition.forward(control_index, estimate.filtered)
-        decision_probability: Float = decided_on @ self.policy
+        decision_probability: Float = self._decided_on(estimate.filtered, control_index) @ self.policy
+        if self._safest is not None:
+            none = sum(one.probability for one in estimate.hypotheses if one.belief is None)
+            decision_probability = (1.0 - none) * decision_probability + none * self._safest
         self._proposed = int(np.argmax(decision_probability))
         return TwinTurn(
             turn=self._turns - 1,
@@ -422,6 +428,24 @@ class Twin:
             next_control=self._proposed,
             learnt=estimate.learnt,
             notices=estimate.notices,
-            suspicion=estimate.suspicion,
+            suspicion=self._with_decision(estimate),
             expected=estimate.expected,
+        )
+
+    def _with_decision(self, estimate: Estimate) -> Suspicion | None:
+        """Return what is suspected, with the hypothesis that adds most to the probability of the decision."""
+        share = {}
+        for one in estimate.hypotheses:
+            chosen = self._safest
+            if one.belief is not None:
+                chosen = self._decided_on(one.belief, estimate.carried.control_index) @ self.policy
+            share[one.name] = 0.0 if chosen is None else one.probability * float(chosen[self._proposed])
+        if estimate.suspicion is None or not share:
+            return estimate.suspicion
+        return replace(estimate.suspicion, decided_by=max(share, key=share.__getitem__))
+
+    def _decided_on(self, belief: Float, control_index: int) -> Float:
+        """Return the belief that the policy acts on: that of this turn, or of the next one."""
+        return (
+            belief if self.decide_on == "filtered" else self.model.transition.forward(control_index, belief)
         )

@@ -92,6 +92,9 @@ def _belief(record: RunRecord) -> str:
     if rest:
         parts.append(f"{_count(rest, 'other state')} as the figures below show")
     said = f"At the end the twin puts {listing(parts)}; in brackets two standard deviations either side"
+    figures = record.summary.get("figures", ())
+    decided = next((figure["value"] for figure in figures if figure["key"] == "decided_by"), "model")
+    said += "" if decided == "model" else f"; what decides its control is: {decided}"
     for learnt in record.learnt:
         if learnt.name == record.parameter_name:
             mean, deviation = learnt.course[-1, :2]

@@ -3,12 +3,18 @@
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from twin_master.scenario.section import Positive, Section
 
-__all__ = ["Noticing"]
+__all__ = ["GAINS", "MOST_DRAWS", "NUMBERS_BY_DEFAULT", "Noticing", "NoticingOrNot"]
 
+GAINS = 4
+"""Gain errors that are compared for each sensor."""
+MOST_DRAWS = 15
+"""Draws of the parameter that are kept apart: evidence is compared, and no fine posterior is needed."""
+NUMBERS_BY_DEFAULT = 1_000_000
+"""Numbers of the beliefs about sensors up to which a scenario gives notices by itself: 0.1 s a turn."""
 _LARGEST_GAIN = 0.4
 """The largest gain errors that are compared are two and a half times as large."""
 
@@ -33,3 +39,7 @@ class Noticing(Section):
     """Prior probability of each of the two kinds of fault, for their posterior."""
     noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0
     """How sure the assumed noise is: as if it came from so many observations, more than two."""
+
+
+NoticingOrNot = Annotated[Noticing | None, BeforeValidator(lambda given: None if given is False else given)]
+"""The table, or `notice = false`."""

@@ -4,6 +4,7 @@ import hashlib
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,19 @@ from scenarios import scenario_files
 from twin_master.errors import ScenarioError, UnknownScenarioError
 from twin_master.scenario.asset import KindSection
 from twin_master.scenario.format import from_format_1
+from twin_master.scenario.notice import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Section
 
 
 @dataclass(frozen=True)
 class LoadedScenario:
-    """A scenario, the file that it came from and the SHA-256 of that file's content."""
+    """A scenario, its file, the SHA-256 of that file's content, and a remark for its user, if any."""
 
     scenario: Scenario
     path: Path
     content_hash: str
+    remark: str = ""
 
 
 def find_scenario(name: str) -> Path:
@@ -50,6 +53,9 @@ def find_scenario(name: str) -> Path:
 def load_scenario(name_or_path: str | Path) -> LoadedScenario:
     """Read and check a scenario by its shipped name or its path.
 
+    Where the file says nothing of `notice` the twin gives notices, if it can. `config.json` of a run says
+    what was flown: nothing is added to that.
+
     Raises
     ------
     UnknownScenarioError
@@ -60,7 +66,28 @@ def load_scenario(name_or_path: str | Path) -> LoadedScenario:
     path = find_scenario(str(name_or_path))
     table = read_toml(path, ScenarioError, what="scenario")
     content_hash = hashlib.sha256(path.read_bytes()).hexdigest()
-    return LoadedScenario(parse_scenario(table, str(path)), path, content_hash)
+    scenario, remark = parse_scenario(table, str(path)), ""
+    if "notice" not in table:
+        reason = why_no_notices(scenario)
+        scenario = scenario.model_copy(update={"notice": None if reason else Noticing()})
+        remark = f"This twin gives no notices: {reason}; `notice = false` says that it is meant so."
+    return LoadedScenario(scenario, path, content_hash, remark if scenario.notice is None else "")
+
+
+def why_no_notices(scenario: Scenario) -> str:
+    """Return why notices are not given by themselves, in words; empty where they are."""
+    observation, calibration = scenario.observation, scenario.calibration
+    if observation.modes is not None:
+        return "observations of modes have a covariance of their own"
+    if observation.average_over_draws == "inside":
+        return "the average over the draws is taken `inside`, so that each sensor has a parameter of its own"
+    draws = 1 if calibration.source == "fixed" else min(calibration.draws, MOST_DRAWS)
+    numbers = prod(len(factor.levels) for factor in scenario.state) * draws * observation.count * GAINS
+    if numbers > NUMBERS_BY_DEFAULT:
+        return (
+            f"they take {numbers:,} numbers a turn, more than {NUMBERS_BY_DEFAULT:,} (`[notice]` takes them)"
+        )
+    return ""
 
 
 def parse_scenario(table: Mapping[str, Any], source: str) -> Scenario:

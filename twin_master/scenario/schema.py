@@ -13,7 +13,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.learning import Learning
-from twin_master.scenario.notice import Noticing
+from twin_master.scenario.notice import NoticingOrNot
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
     Count,
@@ -48,7 +48,7 @@ MISFIT_FIGURES = ("model_misfit_rms", "model_misfit_largest")
 """Figures of the summary that say by how much asset and twin's model differ."""
 
 
-NOTICE_FIGURES = ("alarm_step", "none_of_these", "gauge_off")
+NOTICE_FIGURES = ("alarm_step", "none_of_these", "gauge_off", "decided_by")
 """Figures of the summary that say what was noticed."""
 
 
@@ -133,6 +133,8 @@ class Planner(Section):
     gamma: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)]
     decide_on: Literal["filtered", "predicted"] = "filtered"
     """Which belief the next control is the most probable one of: D_t, or D_{t+1} as predicted."""
+    safest: Name | None = None
+    """Control where no state explains the sensors; by default the one with the least load."""
 
 
 class Reference(Section):
@@ -201,7 +203,8 @@ class Scenario(Section):
     calibration: Calibration
     truth: TruthSection
     learning: Learning | None = None
-    notice: Noticing | None = None
+    notice: NoticingOrNot = None
+    """Of a scenario file on unless it says `notice = false`, see `reading.load_scenario`."""
     watch: WatchSection = WatchSection()
     reference: tuple[Reference, ...] = ()
 
@@ -293,6 +296,7 @@ class Scenario(Section):
                 )
         _known(self.mission.first_control, controls, "mission.first_control", "control")
         _same(self.rewards.control, controls, "rewards.control", "control")
+        _known(self.planner.safest or controls[0], controls, "planner.safest", "control")
         norm = self.rewards.normalise_error_by
         if norm is not None:
             _known(norm, tuple(sorted(roles)), "rewards.normalise_error_by", "control input")

@@ -294,47 +294,20 @@ def _learnt(result: MissionResult, labels: _Labels) -> Group:
 
 def _notice(result: MissionResult, labels: _Labels) -> Group:
     turns = result.flight.suspicion
-    sensor = ("step", "sensor")
-    return labels.group(
-        {
-            "none_of_these": (
-                ("step",),
-                np.array([turn.none_of_these for turn in turns]),
-                "1",
-                "p(no state of the model explains the sensors | observations up to the step)",
-            ),
-            "gauge_off": (
-                ("step",),
-                np.array([turn.gauge_off for turn in turns]),
-                "1",
-                "p(a single sensor does not show what is there | observations up to the step)",
-            ),
-            "log_evidence_none": (
-                ("step",),
-                np.array([turn.log_evidence_none for turn in turns]),
-                "1",
-                "log e-value of the first: evidence for it over that for the model",
-            ),
-            "log_evidence_any_gauge": (
-                ("step",),
-                np.array([turn.log_evidence_any_gauge for turn in turns]),
-                "1",
-                "log e-value of the second",
-            ),
-            "log_evidence_gauge": (
-                sensor,
-                np.array([turn.log_evidence_gauge for turn in turns]),
-                "1",
-                "log e-value of each sensor",
-            ),
-            "left_out": (
-                sensor,
-                np.array([turn.left_out for turn in turns], dtype=np.int8),
-                "1",
-                "1 where the readings of a sensor are absurd and left out",
-            ),
-        }
-    )
+    described = {
+        "none_of_these": "p(no state of the model explains the sensors | observations up to the step)",
+        "gauge_off": "p(a single sensor does not show what is there | observations up to the step)",
+        "log_evidence_none": "log e-value of the first: evidence for it over that for the model",
+        "log_evidence_any_gauge": "log e-value of the second",
+        "log_evidence_gauge": "log e-value of each sensor",
+        "left_out": "1 where the readings of a sensor are absurd and left out",
+    }
+    variables: dict[str, Described] = {}
+    for name, text in described.items():
+        values = np.array([getattr(turn, name) for turn in turns])
+        values = values.astype(np.int8) if values.dtype == bool else values
+        variables[name] = (("step", "sensor")[: values.ndim], values, "1", text)
+    return labels.group(variables)
 
 
 def _truth(result: MissionResult, labels: _Labels, truth: Truth) -> Group:

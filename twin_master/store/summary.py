@@ -106,15 +106,34 @@ def find_fallback(
     true_state : (T, F)
         True state, SI.
     """
+    switch = policy_switch(states, policy_index, first_control)
+    if switch is None:
+        return Fallback(None, None, None, None, None)
+    axis, level = switch
+    return _fallback_of(states.factors[axis].name, level, first_control, control_index, true_state[:, axis])
+
+
+def policy_switch(states: StateSpace, policy_index: Index, first_control: int) -> tuple[int, float] | None:
+    """Return the factor on which alone a policy depends, and the level from which on it leaves a control.
+
+    Parameters
+    ----------
+    states, policy_index, first_control
+        As of `find_fallback`.
+
+    Returns
+    -------
+    (int, float) or None
+        None where the policy depends on several factors or none, or returns to the control. The level is SI.
+    """
     table = (policy_index != first_control).reshape(states.shape)
     for axis, factor in enumerate(states.factors):
         others = tuple(index for index in range(table.ndim) if index != axis)
         any_of, all_of = table.any(axis=others), table.all(axis=others)
         switched = np.flatnonzero(all_of)
         if np.array_equal(any_of, all_of) and len(switched) and all_of[switched[0] :].all():
-            level = factor.levels[switched[0]]
-            return _fallback_of(factor.name, level, first_control, control_index, true_state[:, axis])
-    return Fallback(None, None, None, None, None)
+            return axis, float(factor.levels[switched[0]])
+    return None
 
 
 def _fallback_of(name: str, level: float, first_control: int, control_index: Index, truth: Float) -> Fallback:
@@ -125,7 +144,7 @@ def _fallback_of(name: str, level: float, first_control: int, control_index: Ind
     after = other[other >= called] if called is not None else other[:0]
     return Fallback(
         switch_state=name,
-        switch_level=float(level),
+        switch_level=level,
         called_for_step=called,
         fallback_step=int(after[0]) if len(after) else None,
         early_step=int(before[0]) if len(before) else None,
@@ -250,13 +269,14 @@ def noticed(result: MissionResult) -> dict[str, Any]:
 
 def _notice_figures(flight: Flight, step_name: str) -> list[Figure]:
     """Return when the first alarm came, and what is left of the model at the end."""
-    alarm, none, gauge = NOTICE_FIGURES
+    alarm, none, gauge, decided = NOTICE_FIGURES
     last = flight.suspicion[-1]
     first = next((turn for turn, notice in flight.notices if notice.kind == "alarm"), None)
     return [
         Figure(alarm, f"{step_name} of the first alarm", first),
         Figure(none, "probability that no state explains the sensors", last.none_of_these),
         Figure(gauge, "probability that a single sensor is off", last.gauge_off),
+        Figure(decided, "the last control is decided by", last.decided_by),
     ]
 
 

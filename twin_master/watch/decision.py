@@ -17,6 +17,9 @@ from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
 
+_SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
+"""What is told of a suspicion."""
+
 
 def decision_of(
     scenario: Scenario, model: GraphicalModel, twin: Twin, reading: Reading, turn: TwinTurn
@@ -31,7 +34,7 @@ def decision_of(
         "notices": [vars(notice) for notice in turn.notices],
     }
     if turn.suspicion is not None:
-        record["none_of_these"] = turn.suspicion.none_of_these
+        record |= {name: getattr(turn.suspicion, name) for name in _SUSPECTED}
     if reading.revises is not None:
         record["revised_by_turn"] = reading.revises
     if turn.learnt:
@@ -66,7 +69,7 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
         "notices": line.get("notices", []),
     }
     if "suspicion" in line:
-        record["none_of_these"] = line["suspicion"]["none_of_these"]
+        record |= {name: line["suspicion"][name] for name in _SUSPECTED}
     if "control_in_force" in line:
         record["revised_by_turn"] = line["observation_turn"]
     if "learnt" in line:

@@ -256,7 +256,7 @@ class Watch:
         model: dict[str, Any] = {
             "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
             "before": outcome.before, "after": outcome.after, "alarms": [vars(alarm) for alarm in alarms],
-            **({} if notice is None else {"notice": dict(notice)}),
+            "policy_change": outcome.policy_change, **({} if notice is None else {"notice": dict(notice)}),
         }  # fmt: skip
         line = {
             "turn": twin.turns - 1,
@@ -274,7 +274,7 @@ class Watch:
                 for key, what in (("rms_residual", "rms residual"), ("log_evidence", "log evidence"))
                 if model["before"][key] is not None
             )
-            + "."
+            + f". {outcome.policy_change}".rstrip()
         )
         return twin
 

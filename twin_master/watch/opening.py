@@ -41,6 +41,8 @@ def begin_watch(
         With one clear sentence.
     """
     resolved = resolve_scenario(loaded, overrides)
+    if loaded.remark:
+        progress.note(loaded.remark)
     return begin_resolved(resolved, file_record(loaded), folder, progress, replace_run=replace_run)
 
 

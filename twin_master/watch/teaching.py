@@ -26,12 +26,14 @@ SETTLE_TURNS = 10
 """Turns that an alarm must hold before its cause is looked for; they also show what it is."""
 TRIAL_TURNS = 10
 """Turns behind a verdict, none of which it has seen, in which model and patched model are compared."""
+LEAST_GAIN = 3.0
+"""Evidence of these turns from which on a patch is adopted [nats]: as much as a name needs in the search."""
 GROUP = "group"
 TRIED = ("named", "named in part", GROUP)
 """Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
 alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
 FOLDER = "teaching"
-NO_ALARMS = "--teach begins with an alarm: the scenario needs the table `[notice]`."
+NO_ALARMS = "--teach begins with an alarm, and this scenario gives none: `notice` is off."
 NO_WING = (
     "--teach looks for what the model of a wing lacks: strains under the damage states z1 and z2, predicted "
     "by a design or a calibration, are needed, and this scenario has {}: leave --teach out, alarms are given "
@@ -258,15 +260,18 @@ def verdict_of(
     }  # fmt: skip
 
 
-def trial_sentence(trial: Mapping[str, Any], gained: float, step: str) -> str:
+def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str:
     """Return what the operator is told at the end of a trial."""
     first = trial["from_turn"]
-    compared = f"Beside the model for {TRIAL_TURNS} {step}s the patch gained {gained:.3g} nats of evidence"
-    if gained > 0.0:
-        said = f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
-        one = " It is one of a group: which of them is true these data cannot tell."
-        return said + (one if trial["kind"] == GROUP else "")
-    return f"{compared}, and is not adopted."
+    compared = (
+        f"Beside the model for {TRIAL_TURNS} {step}s the patch gained {outcome.gained:.3g} nats of evidence"
+    )
+    if outcome.gained < LEAST_GAIN:
+        return f"{compared}, {LEAST_GAIN:g} are needed, and is not adopted."
+    said = f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
+    if trial["kind"] == GROUP:
+        said += " It is one of a group: which of them is true these data cannot tell."
+    return f"{said} {outcome.policy_change}".rstrip()
 
 
 def notice_of(kind: str, sentence: str) -> dict[str, Any]:
@@ -361,8 +366,8 @@ class Tutor:
             return False
         if outcome is None:
             return False
-        notice = notice_of("trial", trial_sentence(trial, outcome.gained, self._step))
-        if outcome.gained > 0.0:
+        notice = notice_of("trial", trial_sentence(trial, outcome, self._step))
+        if outcome.gained >= LEAST_GAIN:
             self._pupil.adopt(outcome, notice)
             return True
         self._pupil.write({"verdict": {**trial, "tried": False, "notice": notice}})

@@ -16,6 +16,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any
 
+import numpy as np
+
 from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
 from reporting.files import atomic_write_bytes
@@ -24,10 +26,12 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.mission.journal import array_of, records_behind
-from twin_master.mission.preparation import prepare_knowledge
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
+from twin_master.report.view import printed_state
 from twin_master.scenario.schema import Scenario
+from twin_master.store.summary import policy_switch
 from twin_master.watch.decision import gap_of
 from twin_master.watch.replay import BelievedModel, replay
 
@@ -82,6 +86,8 @@ class Outcome:
         The gap of the turns from `trial.from_turn` on, see `decision.gap_of`.
     alarms : tuple of Notice
         What the patched model does not explain of these.
+    policy_change : str
+        How the policy changes, in a sentence; empty where it stays.
     state : bytes
         Of the twin that believes it, after the last turn.
     """
@@ -92,6 +98,7 @@ class Outcome:
     before: Mapping[str, Any]
     after: Mapping[str, Any]
     alarms: tuple[Notice, ...]
+    policy_change: str
     state: bytes
 
     def twin(self) -> tuple[Twin, tuple[Notice, ...]]:
@@ -156,15 +163,49 @@ def judged(trial: Trial, progress: Progress | None = None) -> Outcome:
     evidence = [
         sum(found.beliefs.log_evidence[begin - found.first_turn :][:count]) for found in (before, after)
     ]
-    believed = trial.models[-1].knowledge.sensor_model
+    known = trial.models[-1].knowledge
     return Outcome(
         trial=trial,
         model=model,
         gained=float(evidence[1] - evidence[0]),
-        before=gap_of(before.beliefs, first - before.first_turn, believed),
+        before=gap_of(before.beliefs, first - before.first_turn, known.sensor_model),
         after=gap_of(after.beliefs, first - after.first_turn, model.knowledge.sensor_model),
         alarms=tuple(n for turn, n in after.beliefs.notices if turn >= first and n.kind == "alarm"),
+        policy_change=policy_change(known, model.knowledge),
         state=after.twin.save_state(),
+    )
+
+
+def policy_change(before: Knowledge, after: Knowledge) -> str:
+    """Return in a sentence how the policy of a model differs from that of another; empty where it does not.
+
+    Parameters
+    ----------
+    before, after : Knowledge
+        Of the same scenario.
+    """
+    scenario, states = before.scenario, before.model.states
+    old, new = before.plan.control_index, after.plan.control_index
+    changed, first = np.flatnonzero(old != new), scenario.mission.first_control
+    if not len(changed):
+        return ""
+
+    def level(axis: int, value: float) -> str:
+        scale, unit = printed_state(scenario.state[axis].unit)
+        return f"{scale * value:.4g} {unit}".rstrip()
+
+    control = scenario.control_names.index(first)
+    left, leaves = policy_switch(states, old, control), policy_switch(states, new, control)
+    if left and leaves and left[0] == leaves[0]:
+        axis = left[0]
+        where = f"{scenario.state_names[axis]} {level(axis, leaves[1])}"
+        return f"With it {first} is left at {where} in the place of {level(axis, left[1])}."
+    state = states.coordinates[changed[0]]
+    where = ", ".join(f"{name} {level(k, state[k])}" for k, name in enumerate(scenario.state_names))
+    chosen, instead = (scenario.control_names[policy[changed[0]]] for policy in (new, old))
+    return (
+        f"With it another control is chosen in {len(changed)} of {len(old)} states, first {chosen} in the "
+        f"place of {instead} at {where}."
     )
 
 

@@ -38,7 +38,7 @@ def test_a_twin_learns_a_soft_wing_and_the_noise_of_its_gauges(knowledge: Knowle
 def test_without_the_table_the_filter_is_the_exact_one() -> None:
     loaded = load_scenario("level_turns")
     assert "learning" not in loaded.scenario.to_dict()
-    assert isinstance(prepare_twin("level_turns").twin().estimator, ExactFilter)
+    assert isinstance(prepare_twin("paper_level_turns").twin().estimator, ExactFilter)
 
 
 def test_a_factor_on_the_transitions_multiplies_the_probability_to_leave() -> None:

@@ -12,14 +12,17 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
+from twin_master.learning import switching
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
 from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator, Words
+from twin_master.learning.switching import at_first, one_turn_later
 from twin_master.mission.journal import belief_record, line_of
 from twin_master.mission.preparation import Knowledge, prepare_twin
 from twin_master.network.estimator import Carried, Estimate, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.network.twin import Twin
+from twin_master.network.twin import Twin, TwinTurn
+from twin_master.scenario.notice import Noticing
 from twin_master.scenario.reading import load_scenario
 
 Float = NDArray[np.float64]
@@ -64,22 +67,62 @@ def drawn(random: np.random.Generator, turns: int, gauges: int = 3, width: float
     return np.array(rows)
 
 
-def test_the_belief_is_that_of_the_filter_to_the_last_bit() -> None:
+def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state() -> None:
     model, sensors = small()
     inner = ExactFilter(model, sensors)
     seen = drawn(np.random.default_rng(3), 12)
+    seen[6:, 1] *= 1.4
     watched = run(WatchfulEstimator(inner, sensors, DRAWS), seen)
     before: Carried | None = None
     for turn, row in enumerate(seen):
-        plain = inner.turn(before, row, 0, turn)
+        plain, found = inner.turn(before, row, 0, turn), watched[turn]
         before = plain.carried
-        np.testing.assert_array_equal(watched[turn].filtered, plain.filtered)
+        # The filter goes on as if it were alone, and the evidence is the model's.
+        np.testing.assert_array_equal(
+            found.carried.arrays["log_filtered"], plain.carried.arrays["log_filtered"]
+        )
+        assert found.log_evidence == plain.log_evidence
+        probability = {one.name: one.probability for one in found.hypotheses}
+        told = 1.0 - sum(probability.values())  # those that are left out are improbable
+        assert -1e-12 < told < 0.03
+        mixed = sum((one.probability * one.belief for one in found.hypotheses if one.belief is not None),
+                    np.zeros(3))  # fmt: skip
+        np.testing.assert_allclose(mixed / mixed.sum(), found.filtered, atol=2.0 * told + 1e-6)
+        if turn < 6:
+            np.testing.assert_allclose(found.filtered, plain.filtered, atol=0.03)
+    assert probability["gauge 2 off"] > 0.9
+    assert np.abs(found.filtered - plain.filtered).max() > 0.1
     carried = [estimate.carried for estimate in watched]
-    np.testing.assert_array_equal(watchful().smoothed(carried), inner.smoothed(carried))
+    smoothed = watchful().smoothed(carried)
+    np.testing.assert_allclose(smoothed[-1], found.filtered, atol=1e-6)
+    np.testing.assert_allclose(smoothed.sum(axis=1), 1.0)
+    right = carried[-1].arrays["notice/right"]
+    assert np.all(smoothed >= right * inner.smoothed(carried) - 1e-12)
+    assert watchful().smoothed([]).shape == (0, 3)
 
 
-def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns() -> None:
-    """Where the noise is known, against the sum over every course of events."""
+def test_shares_of_hypotheses_switch_as_their_chain_says() -> None:
+    begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
+    share = at_first(0.01, begins)
+    np.testing.assert_allclose(np.exp(share), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
+    hazard, ends, chain = 0.03, switching.ENDS, np.zeros((7, 7))
+    chain[0] = hazard * np.array([0.0, 0.0, 0.5, *[0.125] * 4])
+    chain[0, 0] = 1.0 - hazard
+    chain[1, [0, 2]], chain[1, 1] = (ends, 0.5 * hazard), 1.0 - ends - 0.5 * hazard
+    chain[2:, 1], chain[range(2, 7), range(2, 7)] = ends, 1.0 - ends
+    expected = np.exp(share)
+    for _ in range(40):
+        went = ends * expected[2:]
+        expected = expected @ chain
+        share, ended = one_turn_later(share, np.log(hazard), begins)
+        np.testing.assert_allclose(np.exp(share), expected, rtol=1e-3)
+        np.testing.assert_allclose(np.exp(ended), went / went.sum(), rtol=1e-3)
+    assert np.exp(share).sum() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the noise is known and gains are not learnt, against the sum over every course of events."""
+    monkeypatch.setattr("twin_master.learning.monitor._REACH", (0.0,) * 4)
     turns, seen = 4, drawn(np.random.default_rng(8), 4)
     seen[2, 1] = np.nan
     known = MonitorSettings(noise_degrees=1e9, onset_turns=3.0)
@@ -110,7 +153,7 @@ def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns() -> None:
         assert found.log_evidence_gauge[gauge] == pytest.approx(expected, abs=1e-5)
 
 
-def test_the_first_evidence_of_none_of_these_is_a_ratio_of_two_sums() -> None:
+def test_the_first_evidence_is_a_ratio_of_two_sums() -> None:
     sensors = small()[1]
     row = sensors.value_per_draw[0, 0, 0] * [1.0, 1.3, 1.0]
     found = run(watchful(), row[None])[0].suspicion
@@ -121,6 +164,16 @@ def test_the_first_evidence_of_none_of_these_is_a_ratio_of_two_sums() -> None:
         wide, narrow = (student.pdf(row, SETTINGS.noise_degrees, value, scale) for scale in (spread, 1.0))
         sums += [np.prod(0.5 * wide + 0.5 * narrow), narrow.prod()]
     assert found.log_evidence_none == pytest.approx(np.log(0.5 * sums[0] / sums[1] + 0.5), abs=1e-6)
+    for gauge in range(3):
+        sums = np.zeros(2)
+        for value in sensors.value_per_draw[:, 0, 0]:
+            narrow = student.pdf(row, SETTINGS.noise_degrees, value)
+            reach = SETTINGS.gauge_gain * np.array([1.0, 0.5, 0.5, 1.0])  # within which a gain is learnt
+            spread = np.sqrt(1.0 + (reach * value[gauge]) ** 2)
+            off = student.pdf(row[gauge], SETTINGS.noise_degrees, (1.0 + GAINS) * value[gauge], spread).mean()
+            sums += [off * np.delete(narrow, gauge).prod(), narrow.prod()]
+        expected = np.log(0.5 * sums[0] / sums[1] + 0.5)
+        assert found.log_evidence_gauge[gauge] == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("turns", [1, 7])
@@ -285,7 +338,7 @@ def at_levels(name: str, between: bool) -> Knowledge:
 
 @pytest.fixture(scope="module")
 def wing() -> Knowledge:
-    return at_levels("level_turns", False)
+    return prepare_twin("paper_level_turns")
 
 
 def fly(
@@ -312,7 +365,7 @@ def test_a_gauge_that_is_off_is_named(
     wing: Knowledge, gauge: int, gain: float, begin: int, word: str
 ) -> None:
     estimates = fly(wing, begin + 25, {gauge: gain}, begin)
-    alarms = [notice for estimate in estimates for notice in estimate.notices]
+    alarms = [notice for estimate in estimates for notice in estimate.notices if notice.kind == "alarm"]
     assert [alarm.sensors for alarm in alarms] == [(gauge,)]
     assert alarms[0].kind == "alarm"
     assert f"gauge {gauge} shows too {word}, " in alarms[0].sentence
@@ -329,7 +382,7 @@ def test_a_gauge_that_is_off_is_named(
 def test_an_alarm_names_no_command_where_none_looks_for_causes(wing: Knowledge) -> None:
     words = Words(names=tuple(f"place {number}" for number in range(1, 25)), command="")
     estimates = fly(wing, 12, {5: 0.3}, words=words)
-    alarm = next(notice.sentence for estimate in estimates for notice in estimate.notices)
+    alarm = next(n.sentence for estimate in estimates for n in estimate.notices if n.kind == "alarm")
     assert "gauge 5 (place 5) shows too much" in alarm
     assert alarm.endswith("against the model, alarm from 100)")
 
@@ -387,3 +440,58 @@ def test_damage_between_two_levels_raises_no_alarm(between: bool, alarmed: int) 
             before, raised = estimate.carried, raised or any(n.kind == "alarm" for n in estimate.notices)
         alarms += raised
     assert alarms == alarmed
+
+
+def test_belief_and_decision_follow_what_holds_now(wing: Knowledge) -> None:
+    """A gauge comes loose while damage grows and is mended; later half of the gauges are off for a while."""
+    scenario = wing.scenario.model_copy(update={"notice": Noticing()})
+    known, random = replace(wing, scenario=scenario), np.random.default_rng(4)
+    states, gauges = known.model.states.coordinates, np.arange(24)
+    twins = {True: known.twin(lag=1), False: wing.twin(lag=1)}
+    course: dict[bool, list[TwinTurn]] = {True: [], False: []}
+    truth = np.repeat([0.0, 0.2, 0.4, 0.6], [10, 10, 10, 60])
+    for turn, z1 in enumerate(truth):
+        state = np.flatnonzero(np.isclose(states[:, 0], z1) & (states[:, 1] == 0.0))[0]
+        wrong = (gauges == 16) & (12 <= turn < 46) | (gauges % 2 == 0) & (60 <= turn < 80)
+        noise = 150e-6 * random.normal(size=24)
+        for watched, twin in twins.items():
+            control = course[watched][-1].next_control if turn else 1
+            row = known.sensor_model.mean[state, control] * np.where(wrong, 0.67, 1.0) + noise
+            course[watched].append(twin.turn(row, control))
+    mean = {
+        watched: np.array([found.filtered @ states[:, 0] for found in course[watched]]) for watched in course
+    }
+    assert np.abs(mean[True] - truth)[np.r_[14:20, 25:30, 35:90]].max() < 0.12
+    assert mean[False][40:46].max() < 0.25  # the filter alone believes the gauge, flies on and wears the wing
+    assert {found.next_control for found in course[False][32:46]} == {1}
+    assert {found.next_control for found in course[True][32:]} == {0}
+    decided = [found.suspicion.decided_by for found in course[True] if found.suspicion]
+    assert {*decided[:11]} == {"model"}
+    assert {*decided[14:45]} == {"gauge 17 off"}
+    assert {*decided[50:60]} == {"model"}
+    assert {*decided[73:79]} == {"none of these"}
+    assert {*decided[84:]} == {"model"}
+    for found in course[True]:
+        assert found.suspicion is not None
+        none = found.suspicion.none_of_these
+        assert found.suspicion.hypotheses["none of these"] == pytest.approx(none, abs=1e-12)
+        mixed = (1.0 - none) * found.filtered @ known.plan.policy + none * np.array([1.0, 0.0])
+        np.testing.assert_allclose(found.decision_probability, mixed, atol=1e-12)
+    sentences = [n.sentence for found in course[True] for n in found.notices if n.kind == "hypothesis"]
+    assert "gauge 17 off: belief and decision follow the other gauges (probability" in sentences[0]
+    assert "the model explains the gauges again (probability" in sentences[1]
+    assert "no state explains the gauges, none is believed, and the control is the safest" in sentences[-2]
+
+
+def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named(wing: Knowledge) -> None:
+    assert wing.scenario.control_names[wing.safest] == "2g"
+    planner = wing.scenario.planner.model_copy(update={"safest": "3g"})
+    named = replace(wing, scenario=wing.scenario.model_copy(update={"planner": planner}))
+    assert named.scenario.control_names[named.safest] == "3g"
+    model, sensors = small()
+    twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful())
+    for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]:
+        turn = twin.turn(row)
+    assert turn.suspicion is not None
+    assert turn.suspicion.none_of_these > 0.5
+    np.testing.assert_allclose(turn.decision_probability, [1.0])  # the policy decides where nothing is safest

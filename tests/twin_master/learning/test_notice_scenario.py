@@ -15,7 +15,7 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.report.page import render_page
 from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.notice import Noticing
-from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.workflow import resume_run
 from uav_twin.cli import app
 
@@ -36,11 +36,28 @@ rate_microstrain_per_step = 1e14
 # What the figures"""
 
 
-def test_defaults_are_those_of_the_estimator_and_absence_is_off() -> None:
+def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path: Path) -> None:
     assert dict(Noticing()) == vars(MonitorSettings())
-    loaded = load_scenario("level_turns").scenario
-    assert loaded.notice is None
-    assert "notice" not in loaded.to_dict()
+    for name in scenario_files():
+        loaded = load_scenario(name)
+        off = name in ("paper_level_turns", "model_mismatch")  # what they measure is the filter alone
+        assert loaded.scenario.notice == (None if off else Noticing()), name
+        assert not loaded.remark
+        written = loaded.scenario.to_dict()
+        assert ("notice" in written) is not off
+        assert parse_scenario(written, name).notice == loaded.scenario.notice  # as a run folder says it
+    text = scenario_files()["level_turns"].read_text()
+    file = tmp_path / "mine.toml"
+    for old, new, remark in (
+        ("[transition]", 'average_over_draws = "inside"\n[transition]', "each sensor has a parameter of"),
+        ("[0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]", f"{[*range(90)]}\nprior = {[1] + [0] * 89}",
+         "they take 11,664,000 numbers a turn, more than 1,000,000"),
+    ):  # fmt: skip
+        file.write_text(text.replace(old, new))
+        assert load_scenario(file).scenario.notice is None
+        assert remark in load_scenario(file).remark
+        file.write_text(text.replace(old, new).replace("format = 2", "format = 2\nnotice = false"))
+        assert not load_scenario(file).remark
 
 
 @pytest.mark.parametrize(
@@ -95,13 +112,14 @@ def test_the_search_for_causes_is_named_for_a_wing_alone() -> None:
 def test_the_console_names_turn_gauge_and_the_command(folder: Path) -> None:
     said = (folder.parent / "said.txt").read_text()
     alarm = next(line for line in said.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
-    assert alarm.endswith(f"to find the cause: uav-twin discrepancy run --from-run {folder}")
+    assert f"to find the cause: uav-twin discrepancy run --from-run {folder}" in alarm
     assert "Turn 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in said
 
 
 def test_journal_store_and_summary_agree(folder: Path) -> None:
     notices = json.loads((folder / "summary.json").read_text())["notices"]
-    assert {(n["kind"], *n["sensors"]) for n in notices} == {("gauge_left_out", 12), ("alarm", 5)}
+    assert {n["kind"] for n in notices} == {"gauge_left_out", "alarm", "hypothesis"}
+    assert {(n["kind"], *n["sensors"]) for n in notices} >= {("gauge_left_out", 12), ("alarm", 5)}
     lines = [json.loads(line[65:]) for line in (folder / JOURNAL_NAME).read_text().splitlines()[1:]]
     assert [{"turn": line["turn"]} | n for line in lines for n in line.get("notices", ())] == notices
     kept = open_run(folder)["notice"].to_dataset()
@@ -111,12 +129,22 @@ def test_journal_store_and_summary_agree(folder: Path) -> None:
     alarm = next(n["turn"] for n in notices if n["kind"] == "alarm")
     figures = {f["key"]: f["value"] for f in json.loads((folder / "summary.json").read_text())["figures"]}
     assert figures["alarm_step"] == alarm
-    assert figures["gauge_off"] == kept["gauge_off"].values[-1] > 0.5
+    assert figures["gauge_off"] == kept["gauge_off"].values[-1]
+    decided = [line["suspicion"]["decided_by"] for line in lines]
+    assert figures["decided_by"] == decided[-1]
+    assert decided[0] == "model"
+    assert "gauge 5 off" in decided
+    told = lines[-1]["suspicion"]["hypotheses"]
+    assert told["none of these"] == pytest.approx(kept["none_of_these"].values[-1], rel=1e-12)
+    assert sum(told.values()) == pytest.approx(1.0, abs=0.03)
 
 
 def test_the_report_has_the_alarm(folder: Path) -> None:
     text = render_page(read_run(folder), [])
     assert "gauge 5 shows too much" in text
+    decided = read_run(folder).summary["figures"][-1]
+    assert decided["key"] == "decided_by"
+    assert f"what decides its control is: {decided['value']}" in text
     assert "gauge 12 shows 1e+14 microstrain" in text
 
 

@@ -65,7 +65,7 @@ def test_resuming_after_any_turn_is_bit_identical(source: StrainLibrarySource) -
 
 def test_timing_of_a_turn(library_file: Path) -> None:
     """Control u_t is in force while d_t, the gain of step t included, is observed."""
-    scenario = load_scenario("level_turns").scenario
+    scenario = load_scenario("paper_level_turns").scenario
     source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
     asked: list[tuple[float, float, float]] = []
     inner = source.open()
@@ -87,7 +87,7 @@ def test_timing_of_a_turn(library_file: Path) -> None:
 
 def test_a_mission_is_steered_by_the_rule_of_its_scenario(library_file: Path) -> None:
     """Damage only grows: the rule that looks ahead falls back no later, and earlier in some missions."""
-    base = load_scenario("level_turns").scenario
+    base = load_scenario("paper_level_turns").scenario
     noisy = base.observation.model_copy(update={"standard_deviation": 1e-3})
     base = base.model_copy(update={"observation": noisy})
     first_gentle: dict[str, list[int]] = {}
@@ -115,7 +115,7 @@ def test_a_mission_is_steered_by_the_rule_of_its_scenario(library_file: Path) ->
 def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_twin(
     library_file: Path,
 ) -> None:
-    scenario = load_scenario("level_turns").scenario
+    scenario = load_scenario("paper_level_turns").scenario
     source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
     knowledge = prepare_knowledge(scenario, source, 1)
     flight = flown(source, knowledge, 1)
@@ -128,7 +128,7 @@ def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_tw
 
 
 def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(library_file: Path) -> None:
-    scenario = load_scenario("level_turns").scenario
+    scenario = load_scenario("paper_level_turns").scenario
     source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
     knowledge = prepare_knowledge(scenario, source, 1)
     inner = source.open()
@@ -155,7 +155,7 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(library
 
 
 def test_a_checkpoint_whose_decisions_do_not_follow_is_refused(library_file: Path) -> None:
-    scenario = load_scenario("level_turns").scenario
+    scenario = load_scenario("paper_level_turns").scenario
     source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
     knowledge = prepare_knowledge(scenario, source, 1)
     kept: list[FlownTurn] = []
@@ -168,7 +168,7 @@ def test_a_checkpoint_whose_decisions_do_not_follow_is_refused(library_file: Pat
 
 def test_study_on_the_published_library(published_library: Path) -> None:
     """Policy and reliability of the reference twin; the bars are those of 300 missions, widened for 60."""
-    scenario = load_scenario("level_turns").scenario
+    scenario = load_scenario("paper_level_turns").scenario
     source = StrainLibrarySource(scenario, load_strain_library(published_library), "h")
     knowledge = prepare_knowledge(scenario, source, 0)
     z1 = knowledge.model.states.coordinates[:, 0]

@@ -31,7 +31,7 @@ def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[K
     scenario = load_scenario(name).scenario
     planner = scenario.planner.model_copy(update={"decide_on": decide_on})
     mission = scenario.mission.model_copy(update={"steps": 35})
-    scenario = scenario.model_copy(update={"planner": planner, "mission": mission})
+    scenario = scenario.model_copy(update={"planner": planner, "mission": mission, "notice": None})
     source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
     asset = source.open()
     assert isinstance(asset, StatelessAsset)

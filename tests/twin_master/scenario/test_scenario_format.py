@@ -17,7 +17,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.errors import ScenarioError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.asset import AssetSection, BeliefSection
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 
 WING = {"young_modulus_factor": 1.0073}
@@ -40,13 +40,13 @@ def of_format_1(name: str, asset: dict[str, Any]) -> Scenario:
 
 @pytest.mark.parametrize("name", sorted(OLD))
 def test_a_file_of_format_1_means_what_it_meant(name: str) -> None:
-    assert of_format_1(name, OLD[name]) == load_scenario(name).scenario
+    assert of_format_1(name, OLD[name]) == parse_scenario(table_of(name), name)
 
 
 def test_all_of_several_fmus_is_read_from_format_1() -> None:
     new = table_of("three_fmus")
     old = new["asset"] | {"design": "uav_wing", "observation_model": None, "patch": None, "isolated": True}
-    assert of_format_1("three_fmus", old) == load_scenario("three_fmus").scenario
+    assert of_format_1("three_fmus", old) == parse_scenario(table_of("three_fmus"), "three_fmus")
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,9 @@ from twin_master.watch.opening import begin_watch
 
 @pytest.fixture(scope="session")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
-    """`level_turns` of a real wing: without what flies and what really happens."""
+    """`paper_level_turns` of a real wing: without what flies and what really happens."""
     kept, skipping = [], False
-    for line in load_scenario("level_turns").path.read_text(encoding="utf-8").splitlines():
+    for line in load_scenario("paper_level_turns").path.read_text(encoding="utf-8").splitlines():
         if line.startswith("["):
             skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
         if not skipping:
@@ -36,7 +36,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
 @pytest.fixture(scope="session")
 def mission(base: Watch) -> Flight:
     """The paper's mission, flown by the model that the watch believes."""
-    knowledge = replace(base.models[0].knowledge, scenario=load_scenario("level_turns").scenario)
+    knowledge = replace(base.models[0].knowledge, scenario=load_scenario("paper_level_turns").scenario)
     plant = knowledge.plant(knowledge.truth(knowledge.scenario.mission.seed), base._source.open())
     return fly(knowledge.scenario, knowledge.twin(), plant)
 

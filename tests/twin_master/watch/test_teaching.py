@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,13 @@ from scenarios import scenario_files
 from tests.twin_master.watch.watches import lines, watchful
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
 from twin_master.mission.loop import Flight
+from twin_master.network.inference import known_control
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
-from twin_master.watch.teaching import Question, Search, Teaching, both_patches
-from twin_master.watch.trial import Judge
+from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
+from twin_master.watch.trial import Judge, Outcome, patched_model, policy_change
 from uav_twin.cli import app
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
@@ -75,9 +78,13 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
     assert model["from_turn"] == verdict["from_turn"]
     assert model["before"]["rms_residual"] > 1.4 > 1.3 > model["after"]["rms_residual"]
     said = [notice["sentence"] for d in decisions for notice in d["notices"]]
-    assert "named. It is so. The patch is tried" in said[1]
-    assert "is believed from turn" in said[2]
-    assert len(said) == 3
+    searched = [sentence for sentence in said if "belief and decision follow" not in sentence]
+    assert "named. It is so. The patch is tried" in searched[1]
+    assert "is believed from turn" in searched[2]
+    assert len(searched) == 3
+    asked = decisions[verdict["to_turn"]]  # before anything is taught the gauge is known to be off
+    assert asked["decided_by"] == "gauge 5 off"
+    assert asked["hypotheses"]["gauge 5 off"] > 0.9
     assert [notice.sentence for _, notice in watch.told(0)] == said  # in the report too, though filtered anew
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
@@ -100,6 +107,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
 def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:
     for kind, gain, sentence in (
         ("named", 0.3, "and is not adopted."),
+        ("named", -0.002, "nats of evidence, 3 are needed, and is not adopted."),
         ("family", -0.3, "--model-patch DIR/teaching/turns_"),
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
@@ -168,7 +176,7 @@ def test_live_turns_do_not_wait_for_the_patched_model(
     assert model["turn"] == trial_end + 3
     assert model["model"]["from_turn"] < 20
     assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
-    twin, first = base.models[0].knowledge.twin(), model["model"]["from_turn"]
+    twin, first = watch.models[0].knowledge.twin(), model["model"]["from_turn"]
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
     knew = watch.models[1].knowledge.twin()
@@ -180,6 +188,49 @@ def test_live_turns_do_not_wait_for_the_patched_model(
     assert lines(watch)[-1]["filtered"] == found.filtered.tolist()
     again = watchful(watch, tmp_path / "again")
     assert again._replayed(None).twin.save_state() == watch._replayed(None).twin.save_state()
+
+
+def test_a_policy_that_changes_is_told(base: Watch) -> None:
+    known = base.models[0].knowledge
+    states, sharp = known.model.states, known.scenario.control_names.index("3g")
+    z1, z2 = states.coordinates.T
+    assert policy_change(known, known) == ""
+    for gentle, sentence in (
+        (z1 > 0.7, "With it 3g is left at z1 80 % in the place of 60 %."),
+        (z1 >= 0.0, "With it 3g is left at z1 0 % in the place of 60 %."),
+        (z1 > 1.0, "With it another control is chosen in 10 of 25 states, first 3g in the place of 2g at "
+                   "z1 60 %, z2 0 %."),
+        ((z1 > 0.5) & (z2 > 0.1), "With it another control is chosen in 2 of 25 states, first 3g in the "
+                                  "place of 2g at z1 60 %, z2 0 %."),
+    ):  # fmt: skip
+        plan = replace(known.plan, control_index=np.where(gentle, 1 - sharp, sharp))
+        assert policy_change(known, replace(known, plan=plan)) == sentence
+    outcome = Outcome(None, None, 3.5, {}, {}, (), sentence, b"")  # type: ignore[arg-type]
+    for kind in TRIED:
+        assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
+
+
+def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(
+    base: Watch, mission: Flight, tmp_path: Path
+) -> None:
+    """Gauge 17 is strained most: were its readings the strain, 3g would be left at z1 80 % only."""
+    file = tmp_path / "patch.json"
+    file.write_text(json.dumps(patch_of(-0.12, "g17")))
+    known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
+    keep_knowledge(tmp_path, taught)
+    for read in (taught, kept_knowledge(tmp_path, taught.scenario)):
+        np.testing.assert_allclose(read.rewards.health_per_draw, known.rewards.health_per_draw, rtol=1e-9)
+        np.testing.assert_array_equal(read.plan.policy, known.plan.policy)
+        shown = read.sensor_model.value_per_draw / known.sensor_model.value_per_draw
+        np.testing.assert_allclose(shown[..., [15, 16]], [[[[1.0, 0.88]]]] * np.ones_like(shown[..., :2]))
+    twin, observed = taught.twin(), mission.observed.copy()
+    observed[:, 16] *= 0.88
+    turns = [twin.turn(row, int(c)) for row, c in zip(observed, mission.control_index, strict=True)]
+    calls = mission.happened.state[:, 0] > 0.59
+    gentle = known.scenario.control_names.index("2g")
+    assert {turn.next_control for turn in np.array(turns)[calls]} == {gentle}
+    error_reward = taught.rewards.expectation(known_control(turns[-1].filtered, gentle, 2), observed[-1])
+    assert error_reward.mean[2] > -1.5  # readings are compared with readings
 
 
 def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:

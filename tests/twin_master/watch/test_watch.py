@@ -436,8 +436,12 @@ def test_the_shipped_recording_is_noticed(tmp_path: Path, monkeypatch: pytest.Mo
     assert result.exit_code == 0, result.output
     decisions = [json.loads(line) for line in result.stdout.splitlines()]
     assert [decision["turn"] for decision in decisions] == list(range(60))
-    alarms = [(d["turn"], notice) for d in decisions for notice in d["notices"]]
-    (first, gauge), (second, none) = alarms
+    notices = [(d["turn"], notice) for d in decisions for notice in d["notices"]]
+    (first, gauge), (second, none) = ((turn, said) for turn, said in notices if said["kind"] == "alarm")
+    followed = [(turn, said["sensors"]) for turn, said in notices if said["kind"] == "hypothesis"]
+    assert [sensors for _, sensors in followed] == [[4], []]
+    assert decisions[24]["decided_by"] == "gauge 4 off"
+    assert (decisions[-1]["decided_by"], decisions[-1]["next_control"]) == ("none of these", "2g")
     assert 10 < first < 25 < second < 40
     assert gauge["sensors"] == [4]
     assert "no state of the model explains all gauges" in none["sentence"]
@@ -566,7 +570,7 @@ def test_a_slip_of_the_pen_makes_no_folder(scenario: LoadedScenario, tmp_path: P
         ([str(tmp_path / "run.nc"), "--follow"], "only a CSV file can be followed"),
         (["-", "--follow"], "--follow belongs to a CSV file"),
         (["mqtt://host"], "is expected"),
-        (["-", "--teach"], "the scenario needs the table `[notice]`"),
+        (["-", "--teach"], "this scenario gives none: `notice` is off"),
     ):
         options = ["--out", str(tmp_path / "watch"), "--observations", *source]
         result = CliRunner().invoke(app, ["watch", str(scenario.path), *options])
