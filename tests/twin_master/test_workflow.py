@@ -57,7 +57,7 @@ def test_run_folder(tmp_path: Path, library_file: Path) -> None:
     with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
         tree.load()
     assert set(tree.children) == {
-        "observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth",
+        "observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice",
     }  # fmt: skip
     assert tree["predicted"]["quantity_mean"].shape == (50, 10, 24)
     assert tree["filtered"]["reward_mean"].dims == ("step", "reward")

@@ -51,7 +51,7 @@ TURNS = 6
 def fleet_file(library_file: Path, tmp_path: Path) -> Path:
     """A fleet of three wings with a recording each; one line of one of them is garbage, one turn is late."""
     library = f'kind = "strain_library"\nfile = "{library_file}"\n'
-    scenario = scenario_files()["growing_damage"].read_text()
+    scenario = "notice = false\n" + scenario_files()["growing_damage"].read_text()
     begin, end = scenario.index("[asset]"), scenario.index("[calibration]")
     (tmp_path / "wing.toml").write_text(
         scenario[:begin] + f'[asset]\n{library}\n[belief]\nkind = "asset"\n\n' + scenario[end:]
