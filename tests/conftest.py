@@ -9,7 +9,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import importlib.util
+import gc
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from hypothesis import settings
+
+from tests.kept import FE, ROOT, kept, remove_old
 
 if TYPE_CHECKING:
     from calibration.wing.result import CalibrationResult
@@ -86,6 +88,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         # pytest-xdist 3.8 writes to (pytest-xdist, issue 1386): without this no group is kept together.
         if hasattr(item, "_id"):
             item._id = type(item._id).parse(f"{item.nodeid}@{group[item.path]}")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Let one process remove what earlier runs kept and nobody reads."""
+    if not hasattr(session.config, "workerinput"):
+        remove_old()
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Take what all modules hold out of every later search for garbage: a tenth of the processor time."""
+    gc.collect()
+    gc.freeze()
 
 
 LONGEST_COMPARED = 10_000
@@ -207,10 +221,11 @@ def coarse_patch_arrays() -> PatchArrays:
     from fe.reduction.patch_cache import build_patch_arrays
     from fe.wing.design import load_design
 
-    return build_patch_arrays(load_design().changed(mesh={"refinement": 0.25}))
+    design = load_design().changed(mesh={"refinement": 0.25})
+    return kept("coarse-patches", lambda: build_patch_arrays(design), FE, design.hash)
 
 
-REFERENCE = Path(__file__).parents[1].parent / "shared" / "reference"
+REFERENCE = ROOT.parent / "shared" / "reference"
 
 
 @pytest.fixture(scope="session")
@@ -225,13 +240,9 @@ def published_library() -> Path:
 @pytest.fixture(scope="session")
 def foreign_fmu(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Build FMUs of other conventions and misbehaviours from C: `foreign_fmu("ball2")` is a path."""
-    path = Path(__file__).parent / "fmu_asset" / "foreign" / "workshop.py"
-    specification = importlib.util.spec_from_file_location("foreign_workshop", path)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module.Workshop(tmp_path_factory.mktemp("foreign"))
+    from tests.fmu_asset.foreign.workshop import Workshop
+
+    return Workshop(tmp_path_factory.mktemp("foreign"))
 
 
 BEAM = """

@@ -32,7 +32,9 @@ def test_without_a_folder_for_the_cache_it_still_compiles(monkeypatch):
     assert [options.get("cache", False) for options in asked] == [True, False]
 
 
-INNER = "from fe.compilation import compiled\nSTEP = {step}\n@compiled\ndef inner(x):\n    return x + {added}\n"
+INNER = (
+    "from fe.compilation import compiled\nSTEP = {step}\n@compiled\ndef inner(x):\n    return x + {added}\n"
+)
 OUTER = (
     "from fe.compilation import compiled\nfrom inner import STEP, inner\n"
     "@compiled\ndef outer(x):\n    return STEP * inner(x)\n"
@@ -46,7 +48,7 @@ def test_loops_are_kept_by_content_wherever_they_lie_and_a_changed_source_never_
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kept"))
 
     def outer(place: str, **numbers: float) -> tuple[float, int]:
-        """Write both modules into a folder; return what the outer gives for 1, and how often it was compiled."""
+        """Write both modules into a folder; return what the outer gives for 1, and how often it compiled."""
         folder = tmp_path / place
         folder.mkdir(exist_ok=True)
         (folder / "inner.py").write_text(INNER.format_map({"step": 1.0, "added": 1.0} | numbers))
