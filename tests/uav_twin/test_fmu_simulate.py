@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -21,9 +20,9 @@ from fmu_asset.door.history_file import read_histories
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
 from reporting.progress import SilentProgress
+from tests.command_line import command
 from uav_twin import cli
 
-ROOT = Path(__file__).parents[2]
 ROOM = """
 [binding]
 name = "room"
@@ -55,15 +54,8 @@ def room(tmp_path: Path) -> Path:
     return path
 
 
-def call(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "uav_twin", "fmu", "simulate", *map(str, arguments)],
-        cwd=ROOT,
-        env={**os.environ, "COLUMNS": "300"},
-        check=False,
-        capture_output=True,
-        text=True,
-    )
+def call(*words: object) -> subprocess.CompletedProcess[str]:
+    return command("fmu", "simulate", *words)
 
 
 def test_histories_in_outputs_out(foreign_fmu: Any, room: Path, tmp_path: Path) -> None:

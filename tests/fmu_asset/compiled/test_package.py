@@ -25,6 +25,7 @@ from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError, FmuCallError, FmuUnsupportedError
 from fmu_asset.packing.wing_fmu import build_fmu, recorded_content_hash
+from tests.command_line import command
 
 BIN = Path(sys.executable).parent
 
@@ -234,18 +235,15 @@ def test_fmpy_simulates_on_the_command_line(compiled_fmu: Path, fmu: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_the_command_line_builds_each_kind(compiler: list[str], tmp_path: Path) -> None:
-    def build(kind: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "uav_twin", "fmu", "build", "--kind", kind, "--out", f"{kind}.fmu"],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), **environment},
-        )
+def test_the_command_line_builds_each_kind(
+    compiler: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def build(kind: str) -> subprocess.CompletedProcess[str]:
+        return command("fmu", "build", "--kind", kind, "--out", tmp_path / f"{kind}.fmu")
 
-    refused = build("compiled", CC="no-such-compiler")
+    with monkeypatch.context() as patch:
+        patch.setenv("CC", "no-such-compiler")
+        refused = build("compiled")
     assert refused.returncode != 0
     assert "no-such-compiler" in " ".join(refused.stderr.split())
     assert not (tmp_path / "compiled.fmu").exists()

@@ -1,0 +1,25 @@
+"""The command line as a user calls it, without a process for each call."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+
+import pytest
+
+from uav_twin import cli
+
+
+def command(*words: object) -> subprocess.CompletedProcess[str]:
+    """Run `uav-twin` in this process; return its exit code and what it said, in lines of 200 columns."""
+    said, complained = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(complained):
+        patch.setattr(sys, "argv", ["uav-twin", *map(str, words)])
+        patch.setenv("COLUMNS", "200")
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    code = ended.value.code or 0
+    assert isinstance(code, int), code
+    return subprocess.CompletedProcess(sys.argv, code, said.getvalue(), complained.getvalue())
