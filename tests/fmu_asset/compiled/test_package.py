@@ -113,7 +113,12 @@ def test_nothing_is_found_to_complain_of(compiled_fmu: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "part", ["sources/structure_static.c", "resources/reduced_model.bin", "sources/structure_variables.c"]
+    "part",
+    [
+        "sources/structure_static.c",
+        "resources/reduced_model.bin",
+        pytest.param("sources/structure_variables.c", marks=pytest.mark.long),  # a source, as the first
+    ],
 )
 def test_a_changed_part_is_noticed(compiled_fmu: Path, tmp_path: Path, part: str) -> None:
     declared, actual = recorded_content_hash(compiled_fmu)
@@ -168,7 +173,9 @@ def test_fmpy_compiles_the_sources(
             np.testing.assert_allclose(seen[0].values, seen[1].values, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("fmi", "binary"), [(2, "linux64"), (3, "x86_64-linux")])
+@pytest.mark.parametrize(
+    ("fmi", "binary"), [pytest.param(2, "linux64", marks=pytest.mark.long), (3, "x86_64-linux")]
+)
 def test_cmake_builds_the_sources(
     model: ReducedModel, compiler: list[str], tmp_path: Path, fmi: Any, binary: str
 ) -> None:
