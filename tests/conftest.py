@@ -11,6 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import gc
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,6 +48,15 @@ COMPILED = ("discrepancy", "benchmarks", "test_documented_python.py")
 
 LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
+NOT_QUICK, QUICK_SECONDS = Path(__file__).with_name("not_quick.txt"), 0.3
+"""Functions whose tests took longer than this in all, the last time that they were listed."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add what `make test-quick` asks for, and what renews its list."""
+    parser.addoption("--quick", action="store_true", help="only tests of a fraction of a second")
+    parser.addoption("--list-not-quick", action="store_true", help=f"write {NOT_QUICK.name} anew")
+
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -60,6 +70,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if item.get_closest_marker("long"):
                 item.add_marker(pytest.mark.skip(LONG))
+    if config.getoption("quick"):
+        listed = set(NOT_QUICK.read_text("utf-8").split())
+        left_out = [
+            item
+            for item in items
+            if item.nodeid.partition("[")[0] in listed or item.get_closest_marker("slow") is not None
+        ]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
     if not getattr(config.option, "loadgroup", False):  # not in a worker of `--dist loadgroup`
         return
     group = {item.path: str(item.path.relative_to(config.rootpath)) for item in items}
@@ -100,6 +119,22 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """Take what all modules hold out of every later search for garbage: a tenth of the processor time."""
     gc.collect()
     gc.freeze()
+
+
+_taken: Counter[str] = Counter()
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Add up the seconds of each function's tests, without those of fixtures."""
+    if report.when == "call":
+        _taken[report.nodeid.partition("[")[0].partition("@")[0]] += report.duration
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Renew the list of what is not quick, where that is asked for; on an idle machine with warm caches."""
+    if session.config.getoption("list_not_quick") and not hasattr(session.config, "workerinput"):
+        names = sorted(name for name, seconds in _taken.items() if seconds > QUICK_SECONDS)
+        NOT_QUICK.write_text("".join(f"{name}\n" for name in names), "utf-8")
 
 
 LONGEST_COMPARED = 10_000
