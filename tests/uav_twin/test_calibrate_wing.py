@@ -512,7 +512,13 @@ SENTENCES = {
 }
 
 
-@pytest.mark.parametrize("kind", sorted(SENTENCES))
+@pytest.mark.parametrize(
+    "kind",
+    [  # masses are looked for after all else was read; test_dynamics.py has their refusal, too
+        pytest.param(kind, marks=pytest.mark.long if kind == "masses that cannot be" else ())
+        for kind in sorted(SENTENCES)
+    ],
+)
 def test_a_wrong_folder_is_one_sentence_and_leaves_nothing(
     kind: str,
     wings: dict[str, Tailored],
