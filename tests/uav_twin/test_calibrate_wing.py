@@ -9,7 +9,6 @@ import json
 import os
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,9 +34,9 @@ from fe.runtime.state import DigitalState
 from fe.wing.design import SHIPPED_DESIGN, load_design
 from fmu_asset.door.session import FmiAsset
 from scenarios import scenario_files
+from tests.command_line import call
 from twin_master.errors import NotResumableError
 from twin_master.workflow import resume_run
-from uav_twin import cli
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 
@@ -49,16 +48,6 @@ TRUTHS = {
         young_modulus_factor=1.04, servo_mass=0.180, pitot_mass=0.110, damping_alpha=1.4, damping_beta=9.0e-4
     ),
 }
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
-    """Run the command line in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, arguments)])
-    monkeypatch.setenv("COLUMNS", "120")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    code = caught.value.code
-    return 0 if code is None else int(code)
 
 
 @pytest.fixture(scope="module")

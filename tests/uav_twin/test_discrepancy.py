@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 from discrepancy.files.patch import read_patch
 from discrepancy.files.verdict import read_verdict
-from uav_twin import cli
+from tests import command_line
 
 RIG = ("--model", "single_mass_rig")
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Run the command line in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["uav-twin", "discrepancy", *arguments])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    code = caught.value.code
-    return 0 if code is None else int(code)
+def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    return command_line.call(monkeypatch, "discrepancy", *words)
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,8 @@ from fmu_asset.door.history_file import read_histories
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
 from reporting.progress import SilentProgress
+from tests import command_line
 from tests.command_line import command
-from uav_twin import cli
 
 ROOM = """
 [binding]
@@ -100,13 +99,8 @@ def test_bad_inputs_are_a_sentence_and_nothing_is_written(
         assert not out.exists()
 
 
-def flown(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Run the command in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["uav-twin", "fmu", "simulate", *map(str, arguments)])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    return int(caught.value.code or 0)
+def flown(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    return command_line.call(monkeypatch, "fmu", "simulate", *words)
 
 
 def test_an_fmu_alone(
