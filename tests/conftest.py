@@ -48,7 +48,7 @@ COMPILED = ("discrepancy", "benchmarks", "test_documented_python.py")
 
 LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
-NOT_QUICK, QUICK_SECONDS = Path(__file__).with_name("not_quick.txt"), 0.3
+NOT_QUICK, QUICK_SECONDS = Path(__file__).with_name("not_quick.txt"), 0.2
 """Functions whose tests took longer than this in all, the last time that they were listed."""
 
 
