@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help
 help: ## List the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1|/' | awk -F'|' '{printf "  make %-8s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1|/' | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
 
 .PHONY: demo
 demo: $(VENV)/.runtime ## Set up, fly the paper's mission and say where the report is
@@ -19,6 +19,10 @@ demo: $(VENV)/.runtime ## Set up, fly the paper's mission and say where the repo
 .PHONY: test
 test: $(VENV)/.dev ## Set up and run all tests (with UAV_TWIN_LONG_TESTS=1 those that take minutes, too)
 	$(BIN)/python -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
+
+.PHONY: test-quick
+test-quick: $(VENV)/.dev ## Set up and run the three quarters of the tests that take a fraction of a second each
+	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder --quick
 
 .PHONY: setup
 setup: $(VENV)/.dev ## Make .venv with everything that development needs

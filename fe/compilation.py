@@ -37,12 +37,14 @@ def compiled(
     function : callable
         In the subset of Python that numba knows.
     calls : iterable of callable
-        Functions of other files that it calls: numba by itself sees changes of its own file only.
+        Plain functions of other files that it calls: numba by itself sees changes of its own file only.
+        The files of compiled functions that its module names count without being told.
     error_model : str
         Of `function`.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": error_model}
-    with _kept_by_sources([inspect.getfile(item) for item in (function, *calls)]):
+    named = [item.py_func for item in function.__globals__.values() if hasattr(item, "py_func")]
+    with _kept_by_sources([inspect.getfile(item) for item in (function, *calls, *named)]):
         try:
             made = numba.njit(cache=True, **options)(function)
         except RuntimeError:  # numba's way to say that it found no writable folder

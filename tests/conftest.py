@@ -9,8 +9,9 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import importlib.util
+import gc
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from hypothesis import settings
+
+from tests.kept import FE, ROOT, kept, remove_old
 
 if TYPE_CHECKING:
     from calibration.wing.result import CalibrationResult
@@ -45,6 +48,15 @@ COMPILED = ("discrepancy", "benchmarks", "test_documented_python.py")
 
 LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
+NOT_QUICK, QUICK_SECONDS = Path(__file__).with_name("not_quick.txt"), 0.2
+"""Functions whose tests took longer than this in all, the last time that they were listed."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add what `make test-quick` asks for, and what renews its list."""
+    parser.addoption("--quick", action="store_true", help="only tests of a fraction of a second")
+    parser.addoption("--list-not-quick", action="store_true", help=f"write {NOT_QUICK.name} anew")
+
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -58,6 +70,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if item.get_closest_marker("long"):
                 item.add_marker(pytest.mark.skip(LONG))
+    if config.getoption("quick"):
+        listed = set(NOT_QUICK.read_text("utf-8").split())
+        left_out = [
+            item
+            for item in items
+            if item.nodeid.partition("[")[0] in listed or item.get_closest_marker("slow") is not None
+        ]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
     if not getattr(config.option, "loadgroup", False):  # not in a worker of `--dist loadgroup`
         return
     group = {item.path: str(item.path.relative_to(config.rootpath)) for item in items}
@@ -86,6 +107,34 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         # pytest-xdist 3.8 writes to (pytest-xdist, issue 1386): without this no group is kept together.
         if hasattr(item, "_id"):
             item._id = type(item._id).parse(f"{item.nodeid}@{group[item.path]}")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Let one process remove what earlier runs kept and nobody reads."""
+    if not hasattr(session.config, "workerinput"):
+        remove_old()
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Take what all modules hold out of every later search for garbage: a tenth of the processor time."""
+    gc.collect()
+    gc.freeze()
+
+
+_taken: Counter[str] = Counter()
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Add up the seconds of each function's tests, without those of fixtures."""
+    if report.when == "call":
+        _taken[report.nodeid.partition("[")[0].partition("@")[0]] += report.duration
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Renew the list of what is not quick, where that is asked for; on an idle machine with warm caches."""
+    if session.config.getoption("list_not_quick") and not hasattr(session.config, "workerinput"):
+        names = sorted(name for name, seconds in _taken.items() if seconds > QUICK_SECONDS)
+        NOT_QUICK.write_text("".join(f"{name}\n" for name in names), "utf-8")
 
 
 LONGEST_COMPARED = 10_000
@@ -207,10 +256,11 @@ def coarse_patch_arrays() -> PatchArrays:
     from fe.reduction.patch_cache import build_patch_arrays
     from fe.wing.design import load_design
 
-    return build_patch_arrays(load_design().changed(mesh={"refinement": 0.25}))
+    design = load_design().changed(mesh={"refinement": 0.25})
+    return kept("coarse-patches", lambda: build_patch_arrays(design), FE, design.hash)
 
 
-REFERENCE = Path(__file__).parents[1].parent / "shared" / "reference"
+REFERENCE = ROOT.parent / "shared" / "reference"
 
 
 @pytest.fixture(scope="session")
@@ -225,13 +275,9 @@ def published_library() -> Path:
 @pytest.fixture(scope="session")
 def foreign_fmu(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Build FMUs of other conventions and misbehaviours from C: `foreign_fmu("ball2")` is a path."""
-    path = Path(__file__).parent / "fmu_asset" / "foreign" / "workshop.py"
-    specification = importlib.util.spec_from_file_location("foreign_workshop", path)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module.Workshop(tmp_path_factory.mktemp("foreign"))
+    from tests.fmu_asset.foreign.workshop import Workshop
+
+    return Workshop(tmp_path_factory.mktemp("foreign"))
 
 
 BEAM = """

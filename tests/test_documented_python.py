@@ -6,11 +6,10 @@ says that the reader has by then.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from calibration.wing.result import CalibrationResult
 from calibration.wing.result_file import save_calibration
 from discrepancy.sources.examples import write_example
 from fmu_asset.packing.wing_fmu import build_fmu
+from tests import command_line
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT.parent / "shared" / "reference"
@@ -97,7 +97,9 @@ def verdict_folder(folder: Path) -> None:
 
 
 def command(folder: Path, *words: str) -> None:
-    subprocess.run([sys.executable, "-m", "uav_twin", *words], cwd=folder, check=True, capture_output=True)
+    with contextlib.chdir(folder):
+        done = command_line.command(*words)
+    assert done.returncode == 0, done.stderr
 
 
 def pump_library(folder: Path) -> None:

@@ -121,10 +121,9 @@ def begin(positions: FloatArray, ports: Ports, memory: FloatArray) -> None:
 
 @cache
 def _compiled(loop: Callable[..., None]) -> Callable[..., None]:
-    functions = law_functions()
     if loop is couple:
         callable_when_compiled(held_forces, error_model="numpy", makes_arrays=False)
-    return compiled(loop, functions, "numpy")
+    return compiled(loop, (*law_functions(), Ports), "numpy")  # a constant stands in the file of `Ports`
 
 
 def _ports(internal: Laws) -> Ports:

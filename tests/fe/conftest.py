@@ -7,6 +7,7 @@ from fe.reduction.reduced_basis import Reduction, reduce_model
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.wing.design import WingDesign, load_design
+from tests.kept import FE, kept
 
 
 @pytest.fixture(scope="session")
@@ -31,9 +32,9 @@ def shipped_operators(shipped_design: WingDesign) -> AffineOperators:
 
 
 @pytest.fixture(scope="session")
-def coarse_reduction(coarse_operators: AffineOperators) -> Reduction:
+def coarse_reduction(coarse_design: WingDesign, coarse_operators: AffineOperators) -> Reduction:
     with threadpool_limits(1):
-        return reduce_model(coarse_operators)
+        return kept("coarse-reduction", lambda: reduce_model(coarse_operators), FE, coarse_design.hash)
 
 
 @pytest.fixture(scope="session")

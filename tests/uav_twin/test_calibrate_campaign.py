@@ -12,6 +12,7 @@ from calibration.reading import load_calibration
 from calibration.wing.result import CalibrationResult
 from calibration.wing.result_file import save_calibration
 from scenarios import structure_files
+from tests import command_line
 from uav_twin import cli
 
 MODEL = """format = 1
@@ -63,12 +64,8 @@ def lab(tmp_path: Path) -> Path:
     return folder
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
-    monkeypatch.setattr(sys, "argv", ["uav-twin", "calibrate", "campaign", *map(str, arguments)])
-    monkeypatch.setenv("COLUMNS", "120")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    return int(caught.value.code or 0)
+def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    return command_line.call(monkeypatch, "calibrate", "campaign", *words)
 
 
 def test_a_campaign_gives_a_file_a_report_and_a_table(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,19 +14,9 @@ from calibration.geometry import read_lengths
 from calibration.static.experiments import read_measurements
 from calibration.wing.laboratory import read_weighed_mass
 from fe.wing.design import SHIPPED_DESIGN
-from uav_twin import cli
+from tests.command_line import call
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Run the command line in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, arguments)])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    code = caught.value.code
-    return 0 if code is None else int(code)
 
 
 def simulate(monkeypatch: pytest.MonkeyPatch, out: Path, *arguments: object) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +18,11 @@ from fmu_asset.door.binding import load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.script import build_script_fmu
 from scenarios import asset_scripts, binding_files, scenario_files
+from tests.command_line import call
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.workflow import new_run
-from uav_twin import cli
 
 TRUTH = 1.04
 NOISE = np.array([0.04, 0.05, 0.06, 0.015])
@@ -61,13 +60,6 @@ name = "points"
 kind = "static"
 file = "points.csv"
 """
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
-    monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, arguments)])
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    return int(caught.value.code or 0)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 import tomllib
 from pathlib import Path
 
@@ -19,13 +18,13 @@ from fe.structure.operators import load_and_assemble
 from fmu_asset.archive.design_record import packed_design_hash
 from reporting.progress import SilentProgress
 from scenarios import scenario_files, structure_files
+from tests import command_line
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.watch.opening import begin_watch
 from twin_master.workflow import new_run
-from uav_twin import cli
 
 TRUTH = {"e": 0.96}
 BRACKET = scenario_files()["bracket"]
@@ -39,11 +38,8 @@ noise = {{ standard_deviation = {noise} }}
 """
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> None:
-    monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, arguments)])
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    assert not caught.value.code
+def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
+    assert command_line.call(monkeypatch, *words) == 0
 
 
 def write_campaign(folder: Path, structure: Path) -> None:

@@ -11,18 +11,9 @@ from pathlib import Path
 import pytest
 
 from reporting import terminal
+from tests.command_line import call
 from twin_master.errors import ScenarioError
 from uav_twin import cli
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Run the command line in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["uav-twin", *arguments])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    code = caught.value.code
-    return 0 if code is None else int(code)
 
 
 @pytest.fixture

@@ -10,18 +10,13 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+from tests.command_line import command
+
 ROOT = Path(__file__).parents[2]
 
 
-def call(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "uav_twin", "fmu", *map(str, arguments)],
-        cwd=ROOT,
-        env={**os.environ, "COLUMNS": "200"},
-        check=False,
-        capture_output=True,
-        text=True,
-    )
+def call(*words: object) -> subprocess.CompletedProcess[str]:
+    return command("fmu", *words)
 
 
 def test_an_fmu_is_bound_and_checked(foreign_fmu: Any, tmp_path: Path) -> None:
@@ -57,8 +52,8 @@ def test_a_problem_is_named_and_the_exit_code_says_so(foreign_fmu: Any, tmp_path
     assert any(finding["verdict"] == "problem" for finding in told["findings"])
     assert "1 problem." in checked.stderr
     assert "Traceback" not in checked.stdout + checked.stderr
-    for command in ("bind", "check"):
-        missing = call(command, tmp_path / "none.fmu")
+    for word in ("bind", "check"):
+        missing = call(word, tmp_path / "none.fmu")
         assert missing.returncode != 0
         assert "There is no FMU" in missing.stderr
         assert "Traceback" not in missing.stderr

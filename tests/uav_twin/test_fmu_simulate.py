@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +19,9 @@ from fmu_asset.door.history_file import read_histories
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
 from reporting.progress import SilentProgress
-from uav_twin import cli
+from tests import command_line
+from tests.command_line import command
 
-ROOT = Path(__file__).parents[2]
 ROOM = """
 [binding]
 name = "room"
@@ -55,15 +53,8 @@ def room(tmp_path: Path) -> Path:
     return path
 
 
-def call(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "uav_twin", "fmu", "simulate", *map(str, arguments)],
-        cwd=ROOT,
-        env={**os.environ, "COLUMNS": "300"},
-        check=False,
-        capture_output=True,
-        text=True,
-    )
+def call(*words: object) -> subprocess.CompletedProcess[str]:
+    return command("fmu", "simulate", *words)
 
 
 def test_histories_in_outputs_out(foreign_fmu: Any, room: Path, tmp_path: Path) -> None:
@@ -108,13 +99,8 @@ def test_bad_inputs_are_a_sentence_and_nothing_is_written(
         assert not out.exists()
 
 
-def flown(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Run the command in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["uav-twin", "fmu", "simulate", *map(str, arguments)])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    return int(caught.value.code or 0)
+def flown(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    return command_line.call(monkeypatch, "fmu", "simulate", *words)
 
 
 def test_an_fmu_alone(

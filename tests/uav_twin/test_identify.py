@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import tomllib
 from pathlib import Path
 
@@ -11,20 +10,15 @@ import pytest
 
 from calibration.identification.design_file import design_toml
 from fe.wing.design import load_design, parse_design
-from uav_twin import cli
+from tests import command_line
 
 HEADER = (
     "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_servo_2,mass_pitot,freq_1,freq_2"
 )
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["uav-twin", "wing", "identify", *arguments])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    code = caught.value.code
-    return 0 if code is None else int(code)
+def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    return command_line.call(monkeypatch, "wing", "identify", *words)
 
 
 @pytest.fixture

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
 
 from scenarios import binding_files, scenario_files
-from uav_twin import cli
+from tests.command_line import call
 
 GRID = [
     "--grid",
@@ -21,15 +20,6 @@ GRID = [
     "--grid",
     "pressure=100:140:2",
 ]
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["uav-twin", *arguments])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    code = caught.value.code
-    return 0 if code is None else int(code)
 
 
 def test_from_a_script_to_a_library(

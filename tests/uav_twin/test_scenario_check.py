@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 from scenarios import scenario_files
+from tests.command_line import call
 from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario_check import check_scenario
 from uav_twin import cli
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Run the command line in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["uav-twin", *arguments])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    code = caught.value.code
-    return 0 if code is None else int(code)
 
 
 def leaves(command: object, *words: str) -> list[tuple[tuple[str, ...], object]]:

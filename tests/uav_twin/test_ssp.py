@@ -12,18 +12,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from uav_twin import cli
+from tests.command_line import call
 
 HERE = Path(__file__).parents[1] / "twin_master" / "assets" / "heat_exchanger"
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["uav-twin", *arguments])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    code = caught.value.code
-    return 0 if code is None else int(code)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import meshio
 import pytest
 
 from fe.verification.calculix_job import calculix_program
-from uav_twin import cli
+from tests import command_line
 
 DECK = """*NODE
 1, 0, 0, 0
@@ -69,12 +68,8 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "bar.toml"
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str, group: str = "structure") -> int:
-    monkeypatch.setattr(sys, "argv", ["uav-twin", group, *arguments])
-    monkeypatch.setenv("COLUMNS", "120")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    return int(caught.value.code or 0)
+def call(monkeypatch: pytest.MonkeyPatch, *words: object, group: str = "structure") -> int:
+    return command_line.call(monkeypatch, group, *words)
 
 
 def test_info_says_what_a_structure_is(

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 from fe.full.operators import assemble
 from fe.wing.design import load_design
-from uav_twin import cli, verify
+from tests import command_line
+from uav_twin import verify
 from uav_twin.verify import Check
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["uav-twin", "wing", *arguments])
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as caught:
-        cli.main()
-    return 0 if caught.value.code is None else int(caught.value.code)
+def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    return command_line.call(monkeypatch, "wing", *words)
 
 
 def checks_of(monkeypatch: pytest.MonkeyPatch, *checks: Check) -> None:

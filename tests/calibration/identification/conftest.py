@@ -13,6 +13,7 @@ from calibration.identification.local_model import LocalModel, build_local_model
 from calibration.identification.parameters import FreeParameter, wing_parameters
 from calibration.identification.targets import LEVELS, MASS_TOTAL, REFERENCE_PITOT, Targets, read_targets
 from fe.wing.design import WingDesign, load_design
+from tests.kept import FE, ROOT, kept
 
 ROWS = 12
 
@@ -37,7 +38,8 @@ def some_parameters(virtual_design: WingDesign) -> tuple[FreeParameter, ...]:
 
 @pytest.fixture(scope="session")
 def virtual_model(virtual_design: WingDesign, some_parameters: tuple[FreeParameter, ...]) -> LocalModel:
-    return build_local_model(virtual_design, some_parameters)
+    made_from = (*FE, ROOT / "calibration", Path(__file__))
+    return kept("local-model", lambda: build_local_model(virtual_design, some_parameters), made_from)
 
 
 def rows() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

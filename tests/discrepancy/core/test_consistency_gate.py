@@ -88,7 +88,7 @@ def test_statistic_is_the_fall_of_the_penalised_sum_of_squares(kit) -> None:  # 
     assert test.statistic == pytest.approx(left[0] - left[1], rel=1e-5)
 
 
-@pytest.mark.parametrize("freedom", [inf, 30.0])
+@pytest.mark.parametrize("freedom", [pytest.param(inf, marks=pytest.mark.long), 30.0])
 def test_p_values_are_uniform_where_the_name_is_right(kit, freedom: float) -> None:  # type: ignore[no-untyped-def]
     """100 campaigns with the effect that is named: Kolmogorov-Smirnov, and the rejections at 5 %."""
     generator = np.random.default_rng(11)

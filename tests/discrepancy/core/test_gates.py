@@ -38,9 +38,10 @@ def null_gates(kit, freedom, kinds, samples, draws=DRAWS, gap=0.0):  # type: ign
     [
         (inf, ("static",), 0),
         (30.0, ("static",), 0),
-        (inf, ("ringdown",), 60),
-        (30.0, ("ringdown",), 60),
-        (200.0, ("static", "ringdown"), 60),
+        *(
+            pytest.param(*row, 60, marks=pytest.mark.long)  # between the two above and the one below
+            for row in ((inf, ("ringdown",)), (30.0, ("ringdown",)), (200.0, ("static", "ringdown")))
+        ),
         (20.0, ("static", "ringdown"), 60),
     ],
 )

@@ -128,7 +128,7 @@ def test_a_law_that_has_become_another_one_is_not_named(small, catalogue) -> Non
     assert "slip_ratio of joint_micro_slip beside its prior" in verdict.sentence
 
 
-@pytest.mark.parametrize("seed", [1, 2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (3, 4))])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3, 4))])
 def test_nothing_is_missing_where_nothing_is(small, catalogue, seed: int) -> None:  # type: ignore[no-untyped-def]
     """With the whole catalogue."""
     verdict, _, _ = name(small.problem(small.measured(seed)), catalogue)

@@ -118,6 +118,7 @@ def test_a_fall_is_no_short_record(phone: Rig) -> None:
     assert not [fault for fault in check_against_model(*phone) if fault.fatal]
 
 
+@pytest.mark.long  # what reads the rig is tested above, and how drag is named in test_naming.py
 def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(phone: Rig) -> None:
     verdict = judged(
         phone, "quadratic_damping", "coulomb_friction", "cubic_stiffness", "joint_micro_slip",

@@ -24,7 +24,7 @@ from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.packing.wing_fmu import build_fmu
+from tests.kept import compiled_wing
 
 OK, DISCARD, ERROR = 0, 2, 3
 
@@ -40,7 +40,7 @@ def compiler() -> list[str]:
 
 @pytest.fixture(scope="session")
 def compiled_fmu(compiler: list[str], model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_fmu(model, tmp_path_factory.mktemp("compiled") / "wing.fmu", kind="compiled").path
+    return compiled_wing(model, tmp_path_factory.mktemp("compiled"))
 
 
 # fmpy's native proxy, which formats messages, knows one logger in a process: it finds the log by the name.

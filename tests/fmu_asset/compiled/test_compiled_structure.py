@@ -133,6 +133,7 @@ def test_no_check_finds_anything(pair: tuple[Path, Path], tmp_path: Path) -> Non
     assert any("GUID" in problem for problem in check_fmu(changed).problems)
 
 
+@pytest.mark.long  # the wing's sources are driven under sanitizers, and the beam flies beside its Python FMU
 def test_driven_in_c_without_a_lost_byte(
     compiler: list[str], pair: tuple[Path, Path], tmp_path: Path
 ) -> None:

@@ -26,6 +26,7 @@ from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.wing_fmu import build_fmu, recorded_content_hash
 from fmu_asset.structures.build import build_structure_fmu
 from scenarios import binding_files
+from tests.kept import compiled_wing
 
 OK, DISCARD, ERROR = 0, 2, 3
 HEALTH, INPUTS = 1, {"load_factor": 0, "tip_force": 3, "young_modulus_factor": 4}
@@ -35,7 +36,7 @@ GAUGES = 24
 
 @pytest.fixture(scope="module")
 def fmi3(compiler: list[str], model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_fmu(model, tmp_path_factory.mktemp("fmi3") / "wing.fmu", kind="compiled", fmi=3).path
+    return compiled_wing(model, tmp_path_factory.mktemp("fmi3"), fmi=3)
 
 
 class Slave3:

@@ -25,6 +25,7 @@ from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.wing_fmu import build_fmu
+from tests.kept import compiled_wing
 
 STATES = 16
 HALF = STATES // 2
@@ -33,14 +34,12 @@ DISCARD, ERROR = 2, 3
 
 @pytest.fixture(scope="module")
 def exchange(compiler: list[str], model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("exchange") / "wing.fmu"
-    return build_fmu(model, path, kind="compiled", interface="model-exchange").path
+    return compiled_wing(model, tmp_path_factory.mktemp("exchange"), interface="model-exchange")
 
 
 @pytest.fixture(scope="module")
 def exchange3(compiler: list[str], model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("exchange3") / "wing.fmu"
-    return build_fmu(model, path, kind="compiled", fmi=3, interface="model-exchange").path
+    return compiled_wing(model, tmp_path_factory.mktemp("exchange3"), fmi=3, interface="model-exchange")
 
 
 @pytest.fixture

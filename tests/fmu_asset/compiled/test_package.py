@@ -25,6 +25,7 @@ from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError, FmuCallError, FmuUnsupportedError
 from fmu_asset.packing.wing_fmu import build_fmu, recorded_content_hash
+from tests.command_line import command
 
 BIN = Path(sys.executable).parent
 
@@ -112,7 +113,12 @@ def test_nothing_is_found_to_complain_of(compiled_fmu: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "part", ["sources/structure_static.c", "resources/reduced_model.bin", "sources/structure_variables.c"]
+    "part",
+    [
+        "sources/structure_static.c",
+        "resources/reduced_model.bin",
+        pytest.param("sources/structure_variables.c", marks=pytest.mark.long),  # a source, as the first
+    ],
 )
 def test_a_changed_part_is_noticed(compiled_fmu: Path, tmp_path: Path, part: str) -> None:
     declared, actual = recorded_content_hash(compiled_fmu)
@@ -167,7 +173,9 @@ def test_fmpy_compiles_the_sources(
             np.testing.assert_allclose(seen[0].values, seen[1].values, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("fmi", "binary"), [(2, "linux64"), (3, "x86_64-linux")])
+@pytest.mark.parametrize(
+    ("fmi", "binary"), [pytest.param(2, "linux64", marks=pytest.mark.long), (3, "x86_64-linux")]
+)
 def test_cmake_builds_the_sources(
     model: ReducedModel, compiler: list[str], tmp_path: Path, fmi: Any, binary: str
 ) -> None:
@@ -234,18 +242,15 @@ def test_fmpy_simulates_on_the_command_line(compiled_fmu: Path, fmu: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_the_command_line_builds_each_kind(compiler: list[str], tmp_path: Path) -> None:
-    def build(kind: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "uav_twin", "fmu", "build", "--kind", kind, "--out", f"{kind}.fmu"],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), **environment},
-        )
+def test_the_command_line_builds_each_kind(
+    compiler: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def build(kind: str) -> subprocess.CompletedProcess[str]:
+        return command("fmu", "build", "--kind", kind, "--out", tmp_path / f"{kind}.fmu")
 
-    refused = build("compiled", CC="no-such-compiler")
+    with monkeypatch.context() as patch:
+        patch.setenv("CC", "no-such-compiler")
+        refused = build("compiled")
     assert refused.returncode != 0
     assert "no-such-compiler" in " ".join(refused.stderr.split())
     assert not (tmp_path / "compiled.fmu").exists()

@@ -11,6 +11,8 @@ from pathlib import Path
 import fmpy
 import pytest
 
+from tests.kept import packed
+
 HERE = Path(__file__).parent
 HEADERS = Path(fmpy.__file__).parent / "c-code"
 
@@ -32,10 +34,11 @@ class Workshop:
         """Return the FMU of a model, such as `ball2`, compiled with preprocessor definitions."""
         key = (model, defines)
         if key not in self._built:
-            self._built[key] = self._build(model, defines)
+            path = self._folder / f"{'_'.join([model, *defines]).lower()}.fmu"
+            self._built[key] = packed(path, lambda: self._build(path, model, defines), (HERE,), defines)
         return self._built[key]
 
-    def _build(self, model: str, defines: tuple[str, ...]) -> Path:
+    def _build(self, path: Path, model: str, defines: tuple[str, ...]) -> None:
         compiler = shutil.which("gcc") or shutil.which("cc")
         if compiler is None:
             pytest.skip("there is no C compiler (gcc or cc), which the foreign FMUs are built with")
@@ -43,8 +46,7 @@ class Workshop:
         assert version is not None
         description = (HERE / f"{model}.xml").read_text(encoding="utf-8")
         exchange = ["-DMODEL_EXCHANGE"] if "<Implementation>" not in description else []
-        name = "_".join([model, *defines]).lower()
-        library = self._folder / f"{name}.so"
+        library = path.with_suffix(".so")
         subprocess.run(
             [
                 compiler, "-shared", "-fPIC", "-O1", "-w", f"-I{HEADERS}", f"-I{HERE}", *exchange,
@@ -53,12 +55,10 @@ class Workshop:
             ],
             check=True,
         )  # fmt: skip
-        path = self._folder / f"{name}.fmu"
         platform = fmpy.platform_tuple if version[1] == "3" else fmpy.platform
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("modelDescription.xml", description)
             archive.write(library, f"binaries/{platform}/{model}.so")
-        return path
 
     def changed(self, model: str, name: str, *changes: tuple[str, str]) -> Path:
         """Return a copy of a model's FMU with texts of its model description replaced."""

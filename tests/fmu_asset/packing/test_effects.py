@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
-import subprocess
 import sys
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -42,6 +40,7 @@ from fmu_asset.packing.patch_file import SCHEMA, PatchFile, parse_patch
 from fmu_asset.packing.patched_runtime import output_channels, plain_effects
 from fmu_asset.packing.wing_fmu import build_fmu
 from fmu_asset.slaves.effect_variables import active_primitives, effect_rows, numbers_of
+from tests.command_line import command
 
 BIN = Path(sys.executable).parent
 ROOT = Path(__file__).parents[3]
@@ -374,17 +373,6 @@ def test_the_compiled_kind_names_the_other(model: ReducedModel, patch: PatchFile
         build_fmu(model, tmp_path / "wing.fmu", kind="source", patch=patch)
 
 
-def command(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "uav_twin", "fmu", *map(str, words)],
-        cwd=ROOT,
-        env={name: value for name, value in os.environ.items() if name != "COLUMNS"},  # readline sets it
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
 def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> None:
     (tmp_path / "patch.json").write_bytes(content())
     (tmp_path / "broken.json").write_bytes(b"{")
@@ -396,7 +384,7 @@ def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> Non
         (("--activate",), "no --patch"),
         (("--script", "gear_pump", "--patch", tmp_path / "patch.json"), "are for the wing"),
     ):
-        done = command("build", "--out", out, *words)
+        done = command("fmu", "build", "--out", out, *words)
         assert done.returncode != 0
         assert sentence in " ".join(done.stderr.replace("│", " ").split())
         assert "Traceback" not in done.stderr
@@ -406,10 +394,12 @@ def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_the_command_line_packs_a_patch_and_lists_its_effects(tmp_path: Path) -> None:
     (tmp_path / "patch.json").write_bytes(content())
-    done = command("build", "--out", tmp_path / "wing.fmu", "--patch", tmp_path / "patch.json", "--activate")
+    done = command(
+        "fmu", "build", "--out", tmp_path / "wing.fmu", "--patch", tmp_path / "patch.json", "--activate"
+    )
     assert done.returncode == 0, done.stderr
-    shown = command("info", tmp_path / "wing.fmu")
+    shown = command("fmu", "info", tmp_path / "wing.fmu")
     assert "gauge_zero_drift (on)" in " ".join(shown.stdout.split())
     assert "tunable" not in shown.stderr
-    shown = command("info", tmp_path / "wing.fmu", "--no-variables")
+    shown = command("fmu", "info", tmp_path / "wing.fmu", "--no-variables")
     assert "effect.gauge_zero_drift.amplitude" not in shown.stdout

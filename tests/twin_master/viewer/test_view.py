@@ -24,6 +24,7 @@ from benchmarks.browser import CHROMIUM, open_browser
 from fe.wing.design import SHIPPED_DESIGN, load_design
 from reporting.files import atomic_write_bytes
 from reporting.progress import SilentProgress
+from tests.command_line import command
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError
@@ -395,12 +396,7 @@ def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file: Path, run: P
 
 
 def test_a_folder_without_a_run_is_one_sentence(tmp_path: Path) -> None:
-    result = subprocess.run(
-        [sys.executable, "-m", "uav_twin", "view", str(tmp_path / "none")],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = command("view", tmp_path / "none")
     assert result.returncode == 1
     assert result.stderr.startswith(f"there is no run folder {tmp_path / 'none'}")
     assert result.stderr.count("\n") == 1
