@@ -266,19 +266,10 @@ def weigh_none(
                 x -= c * statistics[g, 3] / (1.0 + statistics[g, 2])
                 left = (degrees + statistics[g, 4]) * (1.0 + c * c / (1.0 + statistics[g, 2]))
                 log_with = power * math.log(known[e, s, g] / (1.0 + x * x / left))
-                share = min(statistics[g, 0], 1.0)  # rounding takes it above one
-                if share == 0.0:  # what is ruled out for good is not the larger, whatever it would explain
-                    log_with = -np.inf
-                elif share == 1.0:
-                    log_without = -np.inf
-                own = share * math.sqrt((degrees + squares_of_model[g]) / left)
-                both = (1.0 - share) * without[g]
-                if log_with > log_without:
-                    both *= _exp(log_without - log_with)
-                else:
-                    own *= _exp(log_with - log_without)
-                total += max(log_with, log_without)
-                both += own
+                largest, own, other = _scaled(statistics[g, 0], log_with, log_without)
+                own *= math.sqrt((degrees + squares_of_model[g]) / left)
+                both = own + other * without[g]
+                total += largest
                 free[e, s, g] = own / both
                 if not 1.0 / LARGE < product < LARGE:
                     total += math.log(product)
@@ -296,6 +287,19 @@ def weigh_none(
                 statistics[g],
             )  # fmt: skip
     return float(best + math.log(mass))
+
+
+@compiled
+def _scaled(share: float, log_one: float, log_other: float) -> tuple[float, float, float]:
+    """Return the larger logarithm that counts, and share e^one and (1 - share) e^other over its exponential.
+
+    What is ruled out for good does not count, whatever it would explain; rounding takes a share above one.
+    """
+    if share <= 0.0 or share >= 1.0:
+        return (log_one, 1.0, 0.0) if share > 0.0 else (log_other, 0.0, 1.0)
+    if log_one > log_other:
+        return log_one, share, (1.0 - share) * _exp(log_other - log_one)
+    return log_other, share * _exp(log_one - log_other), 1.0 - share
 
 
 @compiled

@@ -31,7 +31,6 @@ Float = NDArray[np.float64]
 
 _LARGEST = np.float64(1e150)
 """What is carried is below this, so that what follows from it are numbers, too."""
-
 Planner = Callable[[GraphicalModel], ArrayLike]
 """Returns the policy p(U | D), (S, U), for states, controls and transitions."""
 DEFAULT_LAG = 50

@@ -447,7 +447,7 @@ def ensemble_scenario(folder: Path) -> Scenario:
 def test_the_store_counts_the_notices_that_watches_gave(fleet_file: Path, tmp_path: Path) -> None:
     """And a watched asset says how probably it leaves its control, as the store does."""
     wing, log = tmp_path / "wing.toml", tmp_path / "logs" / "wing-1.csv"
-    wing.write_text(wing.read_text() + "\n[notice]\n")
+    wing.write_text(wing.read_text().removeprefix("notice = false\n"))
     header, *rows = log.read_text().splitlines()
     rows[2] = ",".join([*rows[2].split(",")[:-1], "OL"])
     log.write_text("\n".join([header, *rows]) + "\n")

@@ -304,7 +304,7 @@ def served(folder: Path) -> Iterator[str]:
         yield found.group()
     finally:
         process.send_signal(signal.SIGINT)
-        assert process.wait(30.0) == 130
+        assert process.wait(90.0) == 130
         process.stdout.close()
 
 
@@ -389,7 +389,7 @@ def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file: Path, run: P
         assert line, said
         said += line
     os.killpg(process.pid, signal.SIGINT)
-    assert process.wait(30.0) == 0, process.stderr.read()
+    assert process.wait(90.0) == 0, process.stderr.read()
     process.stderr.close()
     for name in ("run.nc", JOURNAL_NAME, KNOWLEDGE_NAME, "config.json"):
         assert (tmp_path / "run" / name).read_bytes() == (run / name).read_bytes(), name
