@@ -39,7 +39,3 @@ class RingDownError(CalibrationError, ValueError):
 
 class MassConstraintError(CalibrationError, ValueError):
     """No masses within the range of the model keep the weighed total."""
-
-
-class IdentificationError(CalibrationError, ValueError):
-    """A wing design cannot be identified: the start is laid out otherwise, or the fit does not converge."""

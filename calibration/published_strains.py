@@ -15,9 +15,6 @@ from .errors import ExperimentDataError, ExperimentFileError
 FILE_NAME = "UAVconfig.json"
 """Name of the file in the authors' repository UAV-Digital-Twin."""
 
-LIBRARY_FACTOR = 1.0073
-"""The factor e that the library's entry "mean" belongs to; it is not the average of the draws."""
-
 REGIONS = 2
 PERCENT = 1e-2
 MICROSTRAIN = 1e-6
@@ -40,7 +37,7 @@ class PublishedStrains:
     strain_per_draw : (E, n1, n2, U, G) dimensionless
         Strain of each draw, z1, z2, control and gauge.
     strain : (n1, n2, U, G) dimensionless
-        The entry "mean": the solution at e = `LIBRARY_FACTOR`.
+        The entry "mean": the solution at e = 1.0073, which is not the average of the draws.
     content : mapping
         The file as it is, for what else it holds.
     """
@@ -51,28 +48,6 @@ class PublishedStrains:
     strain_per_draw: FloatArray
     strain: FloatArray
     content: Mapping[str, Any]
-
-
-def find_strain_file(path: Path | str) -> Path:
-    """Return the library's file: `path` itself, or in that folder, or in one of the folders inside it.
-
-    Raises
-    ------
-    ExperimentFileError
-        If there is no such file, or more than one.
-    """
-    path = Path(path)
-    if path.is_file():
-        return path
-    if (path / FILE_NAME).is_file():
-        return path / FILE_NAME
-    found = sorted(path.glob(f"*/{FILE_NAME}")) + sorted(path.glob(f"*/src/{FILE_NAME}"))
-    if len(found) != 1:
-        raise ExperimentFileError(
-            f"{path} holds {len(found)} files {FILE_NAME} instead of one, in it or one folder below; "
-            "give the folder with the authors' repository UAV-Digital-Twin."
-        )
-    return found[0]
 
 
 def read_published_strains(file: Path | str) -> PublishedStrains:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 
 import pytest
@@ -12,12 +13,15 @@ import pytest
 from uav_twin import cli
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    """Run `uav-twin` in this process and return its exit code; it writes lines of 200 columns."""
+def call(monkeypatch: pytest.MonkeyPatch, *words: object, main: Callable[[], None] = cli.main) -> int:
+    """Run `uav-twin` in this process and return its exit code; it writes lines of 200 columns.
+
+    `main` is another command line that is run in its place.
+    """
     monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, words)])
     monkeypatch.setenv("COLUMNS", "200")
     with pytest.raises(SystemExit) as ended:
-        cli.main()
+        main()
     code = ended.value.code or 0
     assert isinstance(code, int), code
     return code

@@ -32,6 +32,8 @@ MAY_IMPORT = {
     },
 }  # fmt: skip
 
+BESIDE = {"benchmarks", "evidence", "tests"}
+"""What imports the product and is not distributed with it."""
 
 # The rooms of each package from the ground up; a file at the root of its package is a room of its own.
 ROOMS = {
@@ -42,7 +44,7 @@ ROOMS = {
     ),
     "calibration": (
         "errors", "lab_folder", "static", "geometry", "dynamics", "published_strains", "joint",
-        "identification", "virtual_wing", "samples", "wing", "parameters", "reading",
+        "virtual_wing", "samples", "wing", "parameters", "reading",
     ),
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
@@ -124,6 +126,16 @@ def test_imports_run_downwards_only(package: str) -> None:
         if name.split(".")[0] == package
         for other in imported(name, path)
         if other.split(".")[0] not in MAY_IMPORT[package] | {package}
+    ]
+    assert not wrong
+
+
+def test_nothing_imports_what_stands_beside_the_product() -> None:
+    wrong = [
+        f"{name} imports {other}"
+        for name, path in modules().items()
+        for other in _candidates(name, path)
+        if other.split(".")[0] in BESIDE
     ]
     assert not wrong
 

@@ -50,9 +50,7 @@ app.command("watch")(watch_command)
 app.command("compare")(compare)
 app.command("scenarios")(list_scenarios)
 app.add_typer(scenario_app, name="scenario", help="Check a scenario before it is flown.")
-app.add_typer(
-    wing_app, name="wing", help="Say what a wing weighs and how it vibrates; verify or identify its model."
-)
+app.add_typer(wing_app, name="wing", help="Say what a wing weighs and how it vibrates; verify its model.")
 app.add_typer(
     calibrate_app, name="calibrate", help="Tailor the model to one wing: all steps in order, or one of them."
 )

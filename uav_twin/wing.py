@@ -7,7 +7,6 @@ import typer
 
 from reporting import terminal
 from uav_twin.console_table import console_table
-from uav_twin.identify import identify
 from uav_twin.verify import verify
 
 if TYPE_CHECKING:
@@ -23,7 +22,6 @@ PUBLISHED = {
 
 wing_app = typer.Typer(no_args_is_help=False)
 wing_app.command("verify")(verify)
-wing_app.command("identify")(identify)
 
 
 @wing_app.callback(invoke_without_command=True)

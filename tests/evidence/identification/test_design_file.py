@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.identification.design_file import DIGITS, _number, design_toml, rounded
+from evidence.identification.design_file import DIGITS, HEADER, _number, design_toml, rounded
 from fe.wing.design import SHIPPED_DESIGN, load_design, parse_design
 
 
@@ -21,7 +21,8 @@ def test_a_written_design_is_read_back() -> None:
 
 def test_the_shipped_file_is_such_a_file() -> None:
     shipped = load_design()
-    assert "wing identify" in SHIPPED_DESIGN.read_text(encoding="utf-8")
+    text = SHIPPED_DESIGN.read_text(encoding="utf-8")
+    assert text.startswith("".join(f"# {line}".rstrip() + "\n" for line in HEADER))
     assert parse_design(rounded(shipped)) == shipped
 
 

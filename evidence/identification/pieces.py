@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from calibration.errors import IdentificationError
 from fe.full.assembly import Discretisation
 from fe.full.gauges import gauge_output
 from fe.full.operators import (
@@ -26,6 +25,8 @@ from fe.full.operators import (
 from fe.full.turn_load import inertia_relief, lift_load
 from fe.wing.design import WingDesign
 from fe.wing.mesh import WingMesh, build_mesh
+
+from .errors import IdentificationError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

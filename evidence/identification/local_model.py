@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from calibration.errors import IdentificationError
-from calibration.published_strains import LIBRARY_FACTOR
 from fe.full.modes import flapwise_bending_modes, lowest_eigenpairs
 from fe.full.operators import AffineOperators, assemble
 from fe.full.statics import Factorisation
@@ -21,10 +19,11 @@ from fe.runtime.errors import FiniteElementError
 from fe.wing.design import WingDesign
 from reporting.progress import Progress, SilentProgress
 
+from .errors import IdentificationError
 from .parameters import FreeParameter, deviations, values_of, with_values
 from .pieces import ReducedTerms, WingPieces, reduced, reduced_difference, wing_pieces
 from .responses import ReducedWing
-from .targets import LEVELS, MASS_TOTAL, REFERENCE_PITOT, fitted_states
+from .targets import LEVELS, LIBRARY_FACTOR, MASS_TOTAL, REFERENCE_PITOT, fitted_states
 
 FloatArray = NDArray[np.float64]
 

@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.identification.local_model import LocalModel, build_local_model
-from calibration.identification.parameters import FreeParameter, deviations, values_of, with_values
-from calibration.identification.pieces import reduced, wing_pieces
-from calibration.identification.residuals import fitted_residuals
-from calibration.identification.targets import Targets, Weights
+from evidence.identification.local_model import LocalModel, build_local_model
+from evidence.identification.parameters import FreeParameter, deviations, values_of, with_values
+from evidence.identification.pieces import reduced, wing_pieces
+from evidence.identification.residuals import fitted_residuals
+from evidence.identification.targets import Targets, Weights
 from fe.full.modes import eigenmodes
 from fe.full.operators import assemble
 from fe.full.statics import solve_static, tip_stiffness

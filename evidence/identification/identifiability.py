@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import IdentificationError
-
+from .errors import IdentificationError
 from .least_squares import DesignFit, minimise_local, objective
 from .local_model import build_local_model
 from .parameters import FreeParameter, deviations

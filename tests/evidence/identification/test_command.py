@@ -1,16 +1,20 @@
-"""`uav-twin wing identify` as a user calls it."""
+"""`python -m evidence.identification` as a developer calls it."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
-from calibration.identification.design_file import design_toml
+from evidence.identification.__main__ import main
+from evidence.identification.design_file import design_toml
 from fe.wing.design import load_design, parse_design
 from tests import command_line
+from tests.kept import ROOT
 
 HEADER = (
     "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_servo_2,mass_pitot,freq_1,freq_2"
@@ -18,7 +22,7 @@ HEADER = (
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    return command_line.call(monkeypatch, "wing", "identify", *words)
+    return command_line.call(monkeypatch, *words, main=main)
 
 
 @pytest.fixture
@@ -63,6 +67,14 @@ def test_files_that_are_missing_or_wrong_end_in_one_sentence(
     assert not out.exists()
 
 
+def test_the_command_is_that_of_the_module(tmp_path: Path) -> None:
+    words = (sys.executable, "-m", "evidence.identification", "--data", str(tmp_path / "none"), "--quiet")
+    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 1
+    assert done.stderr.endswith("is not a folder; give the one that holds the authors' two folders.\n")
+    assert done.stderr.count("\n") == 1
+
+
 @pytest.mark.long
 def test_a_run_leaves_a_design_a_record_and_a_report(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, tmp_path: Path
@@ -84,6 +96,7 @@ def test_a_run_leaves_a_design_a_record_and_a_report(
     ]
     record = json.loads((out / "identification.json").read_text())
     assert record["converged"] is False
+    assert "evidence.identification" in record["provenance"]["source_hashes"]
     assert len(record["parameters"]) == len(record["singular_values"])
     assert {row["name"] for row in record["comparison"] if not row["fitted"]} >= {"strain ratios at (80, 80)"}
     written = parse_design(tomllib.loads((out / "uav_wing.toml").read_text()))

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.identification.comparison import _row
-from calibration.identification.design_file import _NOTES
+from evidence.identification.comparison import _row
+from evidence.identification.design_file import _NOTES
 
 
 def test_the_first_gauge_is_gauge_1() -> None:

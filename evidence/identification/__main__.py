@@ -1,14 +1,25 @@
-"""`uav-twin wing identify`."""
+"""Where the numbers of the shipped wing's design come from: `python -m evidence.identification --data DIR`.
+
+Called in a checkout of the project. `DIR` holds clones of the authors' repositories UAV-Digital-Twin and
+UAV-Experimental-Calibration. `--out RESULT` leaves a design file, a record and a report, `--from-prior`
+begins at the prior means, `--design FILE` at another design, `--steps N` says how many full models there are
+at most, and `--remesh FACTOR` evaluates the result on another mesh as well. `docs/identification.md` says
+what is fitted to what, how, and what came out. Ends with 1 if the fit has not converged.
+"""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.table import Table
 
+from evidence.identification.identified import Identification
+from evidence.identification.workflow import run_identification, write_identification
+from fe.wing.design import load_design
 from reporting import terminal
-
-if TYPE_CHECKING:
-    from calibration.identification.identified import Identification
+from reporting.errors import FileNotWrittenError
+from twin_master.command import guarded
 
 
 def identify(
@@ -30,10 +41,6 @@ def identify(
     ] = None,
 ) -> None:
     """Fit the free numbers of the wing design to outputs of the published model; takes minutes."""
-    from calibration.identification.workflow import run_identification, write_identification
-    from fe.wing.design import load_design
-    from reporting.errors import FileNotWrittenError
-
     if out is not None and out.exists() and not out.is_dir():
         raise FileNotWrittenError(f"{out} exists and is no folder: choose another --out.")
     result = run_identification(
@@ -56,11 +63,7 @@ def identify(
         raise typer.Exit(1)
 
 
-def _show(result: "Identification", console: object) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    assert isinstance(console, Console)
+def _show(result: Identification, console: Console) -> None:
     table = Table("output", "unit", "wanted", "start", "identified", "kept", "fitted")
     for row, old in zip(result.comparison, result.before, strict=True):
         wanted = [f"{limit:g}" for limit in (row.wanted_rms, row.wanted_largest) if limit is not None]
@@ -82,3 +85,14 @@ def _show(result: "Identification", console: object) -> None:
         f"{' (as far as allowed)' if last.limited else ''}, and the start lies "
         f"{result.largest_change:.4f} away."
     )
+
+
+def main() -> None:
+    """Run `python -m evidence.identification`."""
+    application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    application.command()(identify)
+    guarded(lambda: terminal.with_common_options(application)(prog_name="python -m evidence.identification"))
+
+
+if __name__ == "__main__":
+    main()

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from calibration.errors import IdentificationError
 from fe.wing.design import WingDesign, load_design
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text
@@ -18,6 +17,7 @@ from reporting.record_json import plain
 
 from .comparison import compare, outputs
 from .design_file import design_toml
+from .errors import IdentificationError
 from .identifiability import analyse, profile
 from .identified import Identification
 from .least_squares import CONVERGED, identify
@@ -201,6 +201,8 @@ def record(result: Identification) -> dict[str, Any]:
             for refinement, unknowns, rows in result.remeshed
         ],
         "provenance": collect_provenance(
-            None, input_hashes=result.targets.sources, packages=("calibration", "fe", "reporting")
+            None,
+            input_hashes=result.targets.sources,
+            packages=("calibration", "evidence.identification", "fe", "reporting"),
         ).as_dict(),
     }

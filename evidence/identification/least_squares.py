@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from calibration.errors import IdentificationError
 from fe.runtime.errors import FiniteElementError
 from fe.wing.design import WingDesign
 from reporting.progress import Progress, SilentProgress
 
+from .errors import IdentificationError
 from .local_model import LocalModel, build_local_model
 from .parameters import FreeParameter, deviations, scaled, values_of, with_values
 from .residuals import fitted_residuals

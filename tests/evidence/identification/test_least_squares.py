@@ -5,13 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calibration.errors import IdentificationError
-from calibration.identification import least_squares
-from calibration.identification.identifiability import analyse, profile
-from calibration.identification.least_squares import DesignFit, identify, minimise_local
-from calibration.identification.local_model import LocalModel
-from calibration.identification.parameters import FreeParameter, scaled, values_of, with_values
-from calibration.identification.targets import Targets, Weights
+from evidence.identification import least_squares
+from evidence.identification.errors import IdentificationError
+from evidence.identification.identifiability import analyse, profile
+from evidence.identification.least_squares import DesignFit, identify, minimise_local
+from evidence.identification.local_model import LocalModel
+from evidence.identification.parameters import FreeParameter, scaled, values_of, with_values
+from evidence.identification.targets import Targets, Weights
 from fe.wing.design import WingDesign
 
 # the fit that most need takes a minute

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from calibration.dynamics.published import RESULTS_FILE, read_published_results
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.published_strains import LIBRARY_FACTOR, find_strain_file, read_published_strains
+from calibration.published_strains import FILE_NAME, read_published_strains
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+LIBRARY_FACTOR = 1.0073
+"""The factor e that the library's entry "mean" belongs to; it is not the average of the draws."""
 LOAD_FACTOR = 3.0
 """Load factor of the strains that are fitted; the library's 2g is exactly two thirds of them."""
 CONTROL = "3g"
@@ -155,7 +157,7 @@ def read_targets(data: Path | str) -> Targets:
         raise ExperimentFileError(
             f"{data} is not a folder; give the one that holds the authors' two folders."
         )
-    strain_file, results_file = find_strain_file(data), _find_results(data)
+    strain_file, results_file = _find_library(data), _find_results(data)
     library = read_published_strains(strain_file)
     if CONTROL not in library.controls:
         raise ExperimentDataError(
@@ -228,6 +230,18 @@ def frequency_slopes(
     basis = np.column_stack([np.ones_like(x), x, pitot_mass - REFERENCE_PITOT, x**2])
     coefficients, *_ = np.linalg.lstsq(basis, np.log(frequency), rcond=None)
     return np.exp(coefficients[0]), np.asarray(coefficients[1]), np.asarray(coefficients[2])
+
+
+def _find_library(data: Path) -> Path:
+    if (data / FILE_NAME).is_file():
+        return data / FILE_NAME
+    found = sorted(data.glob(f"*/{FILE_NAME}")) + sorted(data.glob(f"*/src/{FILE_NAME}"))
+    if len(found) != 1:
+        raise ExperimentFileError(
+            f"{data} holds {len(found)} files {FILE_NAME} instead of one, in it or one folder below; "
+            "give the folder with the authors' repository UAV-Digital-Twin."
+        )
+    return found[0]
 
 
 def _find_results(data: Path) -> Path:

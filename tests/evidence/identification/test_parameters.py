@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.errors import IdentificationError
-from calibration.identification.parameters import (
+from evidence.identification.errors import IdentificationError
+from evidence.identification.parameters import (
     CLUSTERS,
     FreeParameter,
     fixed_parameters,

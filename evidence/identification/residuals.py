@@ -6,11 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.published_strains import LIBRARY_FACTOR
-
 from .responses import ReducedWing, Value
 from .targets import (
     LEVELS,
+    LIBRARY_FACTOR,
     LIMITING_GAUGE,
     Targets,
     Weights,

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
 
-from calibration.errors import IdentificationError
-from calibration.published_strains import LIBRARY_FACTOR
 from fe.full.operators import AffineOperators
 from fe.runtime.state import Losses
 
+from .errors import IdentificationError
 from .pieces import ReducedTerms
-from .targets import LEVELS, LOAD_FACTOR, MASS_TOTAL, REFERENCE_PITOT
+from .targets import LEVELS, LIBRARY_FACTOR, LOAD_FACTOR, MASS_TOTAL, REFERENCE_PITOT
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

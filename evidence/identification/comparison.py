@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.published_strains import LIBRARY_FACTOR
-
 from .local_model import LocalModel
 from .responses import ReducedWing
 from .targets import (
     LEVELS,
+    LIBRARY_FACTOR,
     LIMITING_GAUGE,
     Targets,
     fitted_states,

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.identification.comparison import outputs
-from calibration.identification.local_model import LocalModel, build_local_model
-from calibration.identification.parameters import FreeParameter, wing_parameters
-from calibration.identification.targets import LEVELS, MASS_TOTAL, REFERENCE_PITOT, Targets, read_targets
+from evidence.identification.comparison import outputs
+from evidence.identification.local_model import LocalModel, build_local_model
+from evidence.identification.parameters import FreeParameter, wing_parameters
+from evidence.identification.targets import LEVELS, MASS_TOTAL, REFERENCE_PITOT, Targets, read_targets
 from fe.wing.design import WingDesign, load_design
 from tests.kept import FE, ROOT, kept
 
@@ -38,7 +38,7 @@ def some_parameters(virtual_design: WingDesign) -> tuple[FreeParameter, ...]:
 
 @pytest.fixture(scope="session")
 def virtual_model(virtual_design: WingDesign, some_parameters: tuple[FreeParameter, ...]) -> LocalModel:
-    made_from = (*FE, ROOT / "calibration", Path(__file__))
+    made_from = (*FE, ROOT / "calibration", ROOT / "evidence", Path(__file__))
     return kept("local-model", lambda: build_local_model(virtual_design, some_parameters), made_from)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.identification.targets import (
+from evidence.identification.targets import (
     FITTED_LEVELS,
     LEVELS,
     REFERENCE_PITOT,

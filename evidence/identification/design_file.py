@@ -15,10 +15,10 @@ HEADER = (
     "SI units: m, Pa, kg/m^3, kg, N, N/m, N m/rad. Places along the chord are fractions of the local",
     "chord; ribs, stations and point masses are placed by fractions of the semi-span.",
     "",
-    "Written by `uav-twin wing identify`. Lengths of the planform are those of the wing as built. Numbers",
-    "marked 'identified' were fitted together to outputs of the published model (docs/identification.md",
-    "says which, how well, and what was held out). They are effective numbers of this idealisation, not",
-    "measured properties of the wing.",
+    "Written by `python -m evidence.identification`. Lengths of the planform are those of the wing as built.",
+    "Numbers marked 'identified' were fitted together to outputs of the published model",
+    "(docs/identification.md says which, how well, and what was held out). They are effective numbers of",
+    "this idealisation, not measured properties of the wing.",
 )
 
 _NOTES = {

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import IdentificationError
 from fe.wing.design import WingDesign, parse_design
+
+from .errors import IdentificationError
 
 FloatArray = NDArray[np.float64]
 Content = dict[str, Any]

@@ -1,0 +1,1 @@
+"""Where numbers come from that are shipped: what repeats how they were found, and is not shipped itself."""
