@@ -295,9 +295,11 @@ class WatchfulEstimator:
         return (1.0 - _FROM_THE_START) / (1.0 + turn / self._settings.onset_turns)
 
     def _assimilate(self, own: Arrays, seen: Float, control_index: int) -> None:
-        near = self._sensor_model.nearest(seen, control_index, self._value[control_index])
-        value, inverse = near.value, self._inverse[control_index]
         degrees, count = self._settings.noise_degrees, own["count"]
+        # By the noise that is learnt: else a gauge that is off would pull the place, and with it all others.
+        precision = np.minimum((degrees + count) / (degrees + own["model_squares"]), 1.0)
+        near = self._sensor_model.nearest(seen, control_index, self._value[control_index], precision)
+        value, inverse = near.value, self._inverse[control_index]
         known, log_likelihood = np.ones(value.shape), near.log_density.copy()
         before, mended = own["model_squares"].copy(), own["mended_squares"].copy()
         ratio = np.zeros_like(own["share"])

@@ -139,6 +139,14 @@ class Predicted:
     control_probability: Float
     joint: Float
 
+    def mixed(self, share: float, control: Float) -> "Predicted":
+        """Return it where with probability `share` the controls are p(U) (U,), whatever the state is."""
+        return Predicted(
+            self.predicted,
+            (1.0 - share) * self.control_probability + share * control,
+            (1.0 - share) * self.joint + share * self.predicted[..., None] * control,
+        )
+
 
 def _checked_controls(model: GraphicalModel, control_index: ArrayLike) -> Index:
     """Return the controls as the compiled loops expect them."""

@@ -267,7 +267,9 @@ class GaussianSensorModel(QuantityModel):
         )  # fmt: skip
         return result
 
-    def nearest(self, observation: Float, control_index: int, value: Float) -> Nearest:
+    def nearest(
+        self, observation: Float, control_index: int, value: Float, precision: ArrayLike = 1.0
+    ) -> Nearest:
         """Return what the sensors show where in the interval of each state they fit an observation best.
 
         Parameters
@@ -277,11 +279,13 @@ class GaussianSensorModel(QuantityModel):
         control_index : int
         value : (E, S, G)
             Predictions at the levels, of any draws, SI.
+        precision : float or (G,) dimensionless
+            Of the sensors over the assumed one, where more is known: a sensor that is off tells no place.
         """
-        seen = ~np.isnan(observation)
-        scaled = np.where(seen[:, None], self._scaled_interval[control_index], 0.0)  # (S, G, F)
+        seen, root = ~np.isnan(observation), np.sqrt(precision)
+        scaled = np.where(seen, root, 0.0)[:, None] * self._scaled_interval[control_index]  # (S, G, F)
         distance = np.where(seen, observation - value, 0.0).clip(-LARGEST, LARGEST)
-        residual = distance * self._inverse_deviation[control_index]
+        residual = distance * self._inverse_deviation[control_index] * root
         inverse = np.linalg.inv(np.eye(scaled.shape[-1]) + scaled.swapaxes(1, 2) @ scaled)
         place = np.einsum("sfh,sgh,esg->esf", inverse, scaled, residual, optimize=True)
         moved = np.einsum("sgf,esf->esg", self.interval[:, control_index], place, optimize=True)

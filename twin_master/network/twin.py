@@ -416,6 +416,7 @@ class Twin:
         if self._safest is not None:
             none = sum(one.probability for one in estimate.hypotheses if one.belief is None)
             decision_probability = (1.0 - none) * decision_probability + none * self._safest
+            prediction = prediction.mixed(none, self._safest)
         self._proposed = int(np.argmax(decision_probability))
         return TwinTurn(
             turn=self._turns - 1,
@@ -445,6 +446,5 @@ class Twin:
 
     def _decided_on(self, belief: Float, control_index: int) -> Float:
         """Return the belief that the policy acts on: that of this turn, or of the next one."""
-        return (
-            belief if self.decide_on == "filtered" else self.model.transition.forward(control_index, belief)
-        )
+        forward = self.model.transition.forward
+        return belief if self.decide_on == "filtered" else forward(control_index, belief)

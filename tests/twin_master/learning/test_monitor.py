@@ -442,8 +442,10 @@ def test_damage_between_two_levels_raises_no_alarm(between: bool, alarmed: int) 
     assert alarms == alarmed
 
 
-def test_belief_and_decision_follow_what_holds_now(wing: Knowledge) -> None:
+@pytest.mark.parametrize("between", [False, True])
+def test_belief_and_decision_follow_what_holds_now(between: bool) -> None:
     """A gauge comes loose while damage grows and is mended; later half of the gauges are off for a while."""
+    wing = at_levels("paper_level_turns", between)
     scenario = wing.scenario.model_copy(update={"notice": Noticing()})
     known, random = replace(wing, scenario=scenario), np.random.default_rng(4)
     states, gauges = known.model.states.coordinates, np.arange(24)
@@ -477,6 +479,9 @@ def test_belief_and_decision_follow_what_holds_now(wing: Knowledge) -> None:
         assert found.suspicion.hypotheses["none of these"] == pytest.approx(none, abs=1e-12)
         mixed = (1.0 - none) * found.filtered @ known.plan.policy + none * np.array([1.0, 0.0])
         np.testing.assert_allclose(found.decision_probability, mixed, atol=1e-12)
+        ahead = found.prediction
+        assert np.all(ahead.control_probability[:, 0] >= none - 1e-12)
+        np.testing.assert_allclose(ahead.joint.sum(axis=1), ahead.control_probability, atol=1e-12)
     sentences = [n.sentence for found in course[True] for n in found.notices if n.kind == "hypothesis"]
     assert "gauge 17 off: belief and decision follow the other gauges (probability" in sentences[0]
     assert "the model explains the gauges again (probability" in sentences[1]
