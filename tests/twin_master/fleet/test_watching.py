@@ -290,7 +290,7 @@ def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
     fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
     fleet.run(send)
     broker.stop()
-    assert told == [0, 1, 2, 2, 3, 4, 5]
+    assert told == [*range(TURNS)]
     assert notes[1:3] == [
         "north/wing-0 is not watched: ZeroDivisionError: division by zero",
         "north/wing-0 is watched again.",
@@ -337,7 +337,7 @@ def test_an_asset_that_falls_silent_while_another_is_heard(
 ) -> None:
     """Also one that was watched before; and what was decided of it and never published is."""
     monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
-    monkeypatch.setattr("twin_master.fleet.watching.STATE_SECONDS", 0.0)
+    monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.0)
     with (tmp_path / "wing.toml").open("a") as file:
         file.write("\n[watch]\nquiet_after_seconds = 0.5\n")
@@ -447,7 +447,7 @@ def ensemble_scenario(folder: Path) -> Scenario:
 def test_the_store_counts_the_notices_that_watches_gave(fleet_file: Path, tmp_path: Path) -> None:
     """And a watched asset says how probably it leaves its control, as the store does."""
     wing, log = tmp_path / "wing.toml", tmp_path / "logs" / "wing-1.csv"
-    wing.write_text(wing.read_text() + "\n[notice]\n")
+    wing.write_text(wing.read_text().replace("notice = false\n", ""))
     header, *rows = log.read_text().splitlines()
     rows[2] = ",".join([*rows[2].split(",")[:-1], "OL"])
     log.write_text("\n".join([header, *rows]) + "\n")
