@@ -128,10 +128,9 @@ def watch(
             publish(decision)
 
         try:
-            if (untold := _untold(watched)) is not None:
-                tell(untold)
+            untold = _untold(watched)
             search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
-            counts = watched.run(feed, tell, turns=turns, patched=patch, search=search)
+            counts = watched.run(feed, tell, turns=turns, patched=patch, search=search, untold=untold)
         finally:
             close()
         watched.store(counts, last=last, report=report)

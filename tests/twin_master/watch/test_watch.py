@@ -367,7 +367,8 @@ def test_silence_is_told_and_journalled(base: Watch, mission: Flight, tmp_path: 
     while flight.update():
         pass
     seen = [[notice.kind for notice in turn.notices] for turn in flight.seen(0, 4)]
-    assert seen == [["heard", "quiet"], ["heard", "quiet"], ["heard"], []]
+    assert seen == [["heard", "quiet", "quiet"], ["heard", "quiet"], ["heard"], []]
+    assert [turn for turn, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
 
 
 def test_a_reader_that_leaves_ends_the_watch_in_order(
