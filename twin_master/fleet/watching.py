@@ -25,12 +25,13 @@ from twin_master.fleet.store import written
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
+from twin_master.watch.broker import broker_of, is_broker
 from twin_master.watch.feeds import Fed, file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed, LiveFeed
 from twin_master.watch.message import MessageReader
-from twin_master.watch.mqtt import Outbox, Session, broker_of, is_broker, placed
+from twin_master.watch.mqtt import Outbox, Session, placed
 from twin_master.watch.opening import begin_resolved, resume_watch
 
 __all__ = ["KIND", "FleetWatch"]

@@ -13,9 +13,7 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
 from twin_master.assets.asset_source import calibrated_with
-from twin_master.assets.resolution import (
-    believed_source,
-)
+from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import (
     JOURNAL_NAME,
@@ -30,10 +28,7 @@ from twin_master.mission.loop import Source, operate
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
-from twin_master.run_folder import (
-    tidy,
-    with_inputs,
-)
+from twin_master.run_folder import tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
@@ -182,6 +177,7 @@ class Watch:
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
             self.keep = Keeper(journal, intake, found.twin, self.standing)
+            self.keep.quiet = "quiet" in (found.last or {})
             yield journal, self.keep
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:

@@ -11,11 +11,12 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.watch.broker import broker_of, is_broker
 from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, check_file, file_feed
 from twin_master.watch.folder import STORED_TURNS, Patched, Watch
 from twin_master.watch.intake import Feed
-from twin_master.watch.mqtt import MqttFeed, broker_of, is_broker
+from twin_master.watch.mqtt import MqttFeed
 from twin_master.watch.opening import begin_watch, resume_watch
 from twin_master.watch.snapshot import stored
 from twin_master.watch.teaching import Search, check_teachable

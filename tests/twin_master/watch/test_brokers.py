@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,10 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import Flight
 from twin_master.scenario.reading import LoadedScenario
+from twin_master.watch.broker import PASSWORD_VARIABLE, Broker, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
-from twin_master.watch.mqtt import PASSWORD_VARIABLE, Broker, MqttFeed, broker_of
+from twin_master.watch.mqtt import MqttFeed
 from twin_master.watch.snapshot import flown
 from uav_twin.cli import app
 
@@ -199,11 +201,8 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     watched(watch, 4)  # nothing more is wanted, and what was not published is
     wait_until(lambda: {one["turn"] for one in heard if "control" in one} == {0, 1, 2, 3})
     feed = MqttFeed(where_of(broker), watch, lambda _note: publish(4))
-    with pytest.raises(ZeroDivisionError):
-        try:
-            watch.run(feed, lambda decision: decision["turn"] // 0)
-        finally:
-            feed.close()
+    with pytest.raises(ZeroDivisionError), closing(feed):
+        watch.run(feed, lambda decision: decision["turn"] // 0)
     wait_until(lambda: heard[-1].get("state") == "lost")
     names = [path.read_text() for path in watch.folder.glob("*.mqtt")]
     other = begun(base, tmp_path / "other")
