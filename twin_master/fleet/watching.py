@@ -322,7 +322,7 @@ class _Files:
                     and not self._fleet.asked
                     and self._begun(path)
                 ):
-                    feed = partial(self._feed, path)
+                    feed = partial(file_feed, path, follow=self._follow)
                     self._assets[path] = self._fleet.take_up(self._group, name, feed)
         turns = 0
         for asset in self._assets.values():
@@ -331,9 +331,6 @@ class _Files:
             if asset is not None:
                 turns += self._fleet.advance(asset, TURNS_AT_ONCE)
         return turns
-
-    def _feed(self, path: Path, scenario: Scenario) -> Feed:
-        return file_feed(path, scenario, follow=self._follow)
 
     def _begun(self, path: Path) -> bool:
         """Return whether the header of a file that grows is whole."""

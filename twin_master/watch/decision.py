@@ -1,13 +1,12 @@
 """What the operator is told of a turn, and how well the twin's model has explained turns."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.mission.journal import array_of, records_backwards
+from twin_master.mission.journal import array_of
 from twin_master.mission.loop import Beliefs
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
@@ -18,17 +17,6 @@ Float = NDArray[np.float64]
 
 _SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
 """What is told of a suspicion."""
-
-
-def last_decision(path: Path, scenario: Scenario, model: GraphicalModel) -> dict[str, Any] | None:
-    """Return the last decision in a journal; None without any.
-
-    A kill may have left it untold, and nobody knows: it has `told_again`.
-    """
-    for line, *_ in records_backwards(path):
-        if "filtered" in line:
-            return {**journalled_decision(line, scenario, model), "told_again": True}
-    return None
 
 
 def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:

@@ -34,10 +34,10 @@ from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
 from twin_master.store.writing import store_mission, write_summary
-from twin_master.watch.decision import journalled_decision, last_decision
+from twin_master.watch.decision import journalled_decision
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
 from twin_master.watch.keeping import Keeper, Standing
-from twin_master.watch.replay import BelievedModel, Replayed, replay
+from twin_master.watch.replay import BelievedModel, replay
 from twin_master.watch.stopping import Stopping
 from twin_master.watch.teaching import Search, Teaching, Tutor, both_patches, check_teachable, notice_of
 from twin_master.watch.trial import Judge, Outcome, Trial, judged, patched_model
@@ -170,7 +170,7 @@ class Watch:
             self._take_up()
             if patched is not None:
                 self._patch(journal, patched)
-            found = self._replayed()
+            found = replay(self._path, self.models, self.scenario.watch.lag)
             intake.restore(None if found.last is None else found.last["intake"])
             if found.last is not None:
                 self._progress.note(
@@ -185,6 +185,17 @@ class Watch:
         for _ in operate(keep.twin, source, keep):
             yield journalled_decision(keep.line, self.scenario, self.models[-1].knowledge.model)
 
+    def last_decision(self) -> dict[str, Any] | None:
+        """Return the last decision in the journal; None without any.
+
+        A kill may have left it untold, and nobody knows: it has `told_again`.
+        """
+        model = self.models[-1].knowledge.model
+        for line, *_ in records_backwards(self._path):
+            if "filtered" in line:
+                return {**journalled_decision(line, self.scenario, model), "told_again": True}
+        return None
+
     def quiet(self) -> dict[str, Any] | None:
         """Return the last decision with the notice that it grows old, once no turn has come for too long."""
         keep = self.keep
@@ -193,8 +204,7 @@ class Watch:
             return None
         since = f"since {step} {keep.twin.turns - 1}" if keep.twin.turns else "and none before"
         sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
-        last = last_decision(self._path, self.scenario, self.models[-1].knowledge.model)
-        decision = {**(last or {"turn": -1}), "notices": [notice_of("quiet", sentence)]}
+        decision = {**(self.last_decision() or {"turn": -1}), "notices": [notice_of("quiet", sentence)]}
         keep.write({"notices": decision["notices"], "quiet": decision})
         keep.quiet = True
         return decision
@@ -239,11 +249,6 @@ class Watch:
         patch = both_patches(self._patches[max(believed)], file)
         models = tuple(self.models)
         return Trial(self._path, journal.size, self.scenario, models, patch, from_turn, compared)
-
-    def _replayed(self, first_turn: int | None = None) -> Replayed:
-        """Return the twin, or with all that it keeps from a turn on."""
-        lag = self.scenario.watch.lag if first_turn is None else None
-        return replay(self._path, self.models, lag, first_turn=first_turn)
 
     def _patch(self, journal: JournalFile, patched: Patched) -> None:
         """Believe a patch that is given from a turn on."""
@@ -295,7 +300,7 @@ class Watch:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
         first = max(0, turns - last)
-        found = self._replayed(first)
+        found = replay(self._path, self.models, None, first_turn=first)
         flight = found.beliefs.flight(found.twin, None, first_turn=found.first_turn)
         flight = replace(flight, notices=self.told(first))
         knowledge, mission = self.models[-1].knowledge, self.scenario.mission

@@ -142,8 +142,7 @@ class Session:
                 "user that right"
             )
             return
-        if not self._kept:
-            atomic_write_text(self._path, self._name + "\n")
+        atomic_write_text(self._path, self._name + "\n")  # which also ends the wish to begin anew
         self._begun = self._kept = True
         self._told, self._pause, self._beat = "", _RETRY_SECONDS[0], 0.0
         for outbox in self.behind:
@@ -197,7 +196,6 @@ class Session:
         if self._clean and self._connected:
             # The old session has ended. One that begins so is forgotten by brokers that start again.
             self._client.disconnect()
-            atomic_write_text(self._path, self._name + "\n")
             self._client, self._clean, self._connected, self._failure = None, False, False, ""
             return
         for outbox in [*self.behind] if self.room else ():
