@@ -215,8 +215,8 @@ class FleetWatch:
                 count += 1
                 if count == most or self.done(asset) or self.asked:
                     break
-            if not count and not asset.keep.intake.ended and (told := asset.watch.quiet()) is not None:
-                self._decided(asset, told)
+            if not count and not asset.keep.intake.ended:
+                asset.watch.quiet(partial(self._decided, asset))
         except Exception as error:  # noqa: BLE001 - likewise
             self.lost(asset.name, error)
         return count
@@ -369,17 +369,15 @@ class _Topics:
         self._session = Session(broker, group.name, fleet.folder, fleet.note, self._pulse)
         fleet.goodbyes.callback(self._session.close)
         self._messages = self._session.messages(0.0)
-        self._begin = True
         self._inboxes: dict[str, _Inbox] = {}
-        self._searched = time.monotonic()
+        self._searched = 0.0
 
     def look(self) -> int:
         """Take in what the broker has sent; return the number of turns."""
         turns, begin = 0, time.monotonic()
-        if self._begin:  # those that were watched before may be quiet, or have decisions to publish
+        if not self._searched:  # those that were watched before may be quiet, or have decisions to publish
             for path in sorted((self._fleet.folder / self._group.name).glob(f"*/{CONFIG_NAME}")):
                 self._inbox(self._topic[:-1] + path.parent.name)
-            self._begin = False
         if begin - self._searched >= SEARCH_SECONDS:
             self._searched = begin
             for inbox in self._inboxes.values():

@@ -147,10 +147,8 @@ class Watch:
             The last decision, to be told again first.
         """
         with self.begun(feed, patched) as (journal, keep):
-            source = Stopping(keep.intake, turns, lambda: self._look(decide))
-            tutor = None
-            if search is not None:
-                tutor = self._tutor(journal, keep, search, source, wait=feed.replayable)
+            source = Stopping(keep.intake, turns, lambda: self.quiet(decide))
+            tutor = self._tutor(journal, keep, search, source, wait=feed.replayable) if search else None
             with source.listening():
                 try:
                     if untold is not None:
@@ -196,22 +194,18 @@ class Watch:
                 return {**journalled_decision(line, self.scenario, model), "told_again": True}
         return None
 
-    def quiet(self) -> dict[str, Any] | None:
-        """Return the last decision with the notice that it grows old, once no turn has come for too long."""
+    def quiet(self, decide: Callable[[dict[str, Any]], None]) -> None:
+        """Tell the last decision with the notice that it grows old, once no turn has come for too long."""
         keep = self.keep
         longest, step = self.scenario.watch.quiet_after_seconds, self.scenario.mission.step_name
         if longest is None or keep.quiet or keep.silence < longest:
-            return None
+            return
         since = f"since {step} {keep.twin.turns - 1}" if keep.twin.turns else "and none before"
         sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
         decision = {**(self.last_decision() or {"turn": -1}), "notices": [notice_of("quiet", sentence)]}
         keep.write({"notices": decision["notices"], "quiet": decision})
         keep.quiet = True
-        return decision
-
-    def _look(self, decide: Callable[[Mapping[str, Any]], None]) -> None:
-        if (decision := self.quiet()) is not None:
-            decide(decision)
+        decide(decision)
 
     def _operate(
         self, source: Stopping, keep: Keeper, decide: Callable[[Mapping[str, Any]], None], tutor: Tutor | None

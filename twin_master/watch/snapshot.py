@@ -102,7 +102,5 @@ def stored(folder: Path) -> bool:
 
 def _config(folder: Path) -> dict[str, Any] | None:
     """Return the configuration of a watch; None where the folder holds something else."""
-    if not (folder / CONFIG_NAME).is_file():
-        return None
-    config = read_json(folder / CONFIG_NAME, NotResumableError)
+    config = read_json(folder / CONFIG_NAME, NotResumableError) if (folder / CONFIG_NAME).is_file() else None
     return config if isinstance(config, dict) and config.get("watched") else None

@@ -342,8 +342,8 @@ class Tutor:
             except TwinMasterError as error:
                 found = error
             if found is not None:
-                verdict = verdict_of(self._search.watch, question, found, teaching.turn, self._step)
-                self._write({"verdict": verdict})
+                watch, turn = self._search.watch, teaching.turn
+                self._write({"verdict": verdict_of(watch, question, found, turn, self._step)})
         trial = teaching.trial
         if trial is None or teaching.turn < trial["turn"] + TRIAL_TURNS:
             return False
