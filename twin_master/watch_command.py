@@ -81,8 +81,8 @@ def watch(
     """
     from twin_master.store.outcome import REPORT_NAME
     from twin_master.watch import from_python
+    from twin_master.watch.broker import is_broker
     from twin_master.watch.folder import Watch
-    from twin_master.watch.mqtt import is_broker
 
     watches: list[Watch] = []
     live = follow or observations is None or observations == "-" or is_broker(observations)

@@ -8,8 +8,6 @@ from reporting.json_file import read_json
 from reporting.section import Section, checked
 from twin_master.errors import FleetError
 from twin_master.fleet.reading import attention
-from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.watch.decision import last_decision
 from twin_master.watch.folder import Watch
 
 __all__ = ["STATE_NAME", "FleetRecord", "WatchedAsset"]
@@ -90,7 +88,7 @@ class WatchedAsset:
         self.tell: Callable[[Mapping[str, Any]], None] = lambda _decision: None
         self.close: Callable[[], None] = lambda: None
         self._knowledge = watch.models[-1].knowledge
-        self.decision = last_decision(watch.folder / JOURNAL_NAME, watch.scenario, self._knowledge.model)
+        self.decision = watch.last_decision()
         first = before.last.turn + 1 if before is not None and before.last is not None else 0
         self.alarms_before = before.alarms if before is not None and first else 0
         told = [notice for _, notice in watch.told(first)] if self.decision else []

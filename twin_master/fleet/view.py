@@ -107,7 +107,7 @@ def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
         )
         standing = Standing(
             scenario, list(own), np.array([told.turn for told in last], dtype=np.int64), mean, deviation,
-            [told.next_control for told in last],
+            [told.control for told in last],
             np.array([alarms for _, alarms, _ in own.values()], dtype=np.int64),
             np.array([chance for _, _, chance in own.values()], dtype=np.float64),
         )  # fmt: skip

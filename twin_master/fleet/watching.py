@@ -25,12 +25,13 @@ from twin_master.fleet.store import written
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
+from twin_master.watch.broker import broker_of, is_broker
 from twin_master.watch.feeds import Fed, file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed, LiveFeed
 from twin_master.watch.message import MessageReader
-from twin_master.watch.mqtt import Outbox, Session, broker_of, is_broker, placed
+from twin_master.watch.mqtt import Outbox, Session, placed
 from twin_master.watch.opening import begin_resolved, resume_watch
 
 __all__ = ["KIND", "FleetWatch"]
@@ -40,8 +41,8 @@ TURNS_AT_ONCE = 64
 """Turns of one asset before the next one is looked at."""
 SEARCH_SECONDS, STATE_SECONDS = 2.0, 2.0
 """Between two searches for new files, and between two writings of the state."""
-AGAIN_SECONDS = 30.0
-"""After which an asset that was lost is taken up again."""
+AGAIN_SECONDS, LONGEST_AGAIN = 30.0, 3600.0
+"""After which an asset that was lost is taken up again; twice as long each time that it meets the same."""
 HELD = 200
 """Messages of an asset that is lost, the last ones, that wait for it here."""
 IDLE_SECONDS, BUSY_SHARE = 0.05, 0.2
@@ -101,7 +102,8 @@ class FleetWatch:
         self.folder, self.assets, self.asked = folder, dict[str, WatchedAsset](), False
         self.failures: dict[str, str] = {}
         self._again: dict[str, float] = {}
-        self.note, self.closing = note, ExitStack()
+        self._met: dict[str, tuple[str, float]] = {}  # why an asset was lost, and how long it was then left
+        self.note, self.closing, self.goodbyes = note, ExitStack(), ExitStack()
         self._tell, self._turns = tell, turns
         self._like: dict[str, Watch] = {}
         flown = [group.name for group in fleet.groups if not group.observations]
@@ -136,15 +138,12 @@ class FleetWatch:
             A broker does not answer, or refuses the twin.
         """
         state = 0.0
-        with self.closing:
+        with self.closing, self.goodbyes:  # what is said last may still write into the folders
             try:
                 while not self.asked:
                     begin = time.monotonic()
                     turns = sum(source.look() for source in self._sources)
                     if begin - state > STATE_SECONDS:
-                        for asset in self.assets.values():
-                            if not self.done(asset) and (decision := asset.watch.quiet()) is not None:
-                                self._decided(asset, decision)
                         self._write_state()
                         state = begin
                     looked()
@@ -156,7 +155,10 @@ class FleetWatch:
             finally:
                 self._write_state()
 
-    def take_up(self, group: Group, name: str, feed: Callable[[Scenario], Feed]) -> WatchedAsset | None:
+    def take_up(
+        self, group: Group, name: str, feed: Callable[[Scenario], Feed],
+        begun: Callable[[WatchedAsset], None] = lambda _asset: None,
+    ) -> WatchedAsset | None:  # fmt: skip
         """Begin the watch of an asset, or go on with it; None where that cannot be."""
         key, folder = f"{group.name}/{name}", self.folder / group.name / name
         with ExitStack() as closing:
@@ -178,13 +180,13 @@ class FleetWatch:
                 closing.enter_context(watch.begun(source))
                 told = self._told_before.get(key)
                 asset = WatchedAsset(key, watch, told)
+                begun(asset)
                 asset.close = closing.pop_all().close
             except Exception as error:  # noqa: BLE001 - whatever one asset comes to, the others go on
                 self.lost(key, error)
                 return None
         self.closing.callback(asset.close)
-        if self.failures.pop(key, None) is not None:
-            self.note(f"{key} is watched again.")
+        self.failures.pop(key, None)
         self._like.setdefault(group.name, watch)
         self.assets[key] = asset
         last = asset.decision
@@ -207,12 +209,14 @@ class FleetWatch:
             return count
         try:
             for decision in asset.watch.decisions(asset.keep.intake, asset.keep):
+                if self._met.pop(asset.name, None) is not None:
+                    self.note(f"{asset.name} is watched again.")
                 self._decided(asset, decision)
                 count += 1
                 if count == most or self.done(asset) or self.asked:
                     break
-        except DiskFullError:
-            raise
+            if not count and not asset.keep.intake.ended:
+                asset.watch.quiet(partial(self._decided, asset))
         except Exception as error:  # noqa: BLE001 - likewise
             self.lost(asset.name, error)
         return count
@@ -230,13 +234,20 @@ class FleetWatch:
         return name in self.failures and time.monotonic() >= self._again[name]
 
     def lost(self, name: str, error: Exception) -> None:
-        """Say once why an asset is not watched, and give its folder free."""
+        """Say once why an asset is not watched, and give its folder free; a full disk ends all."""
+        if isinstance(error, DiskFullError):
+            raise error
+        if name not in self.assets and len(self.failures) >= LARGEST_FLEET:
+            return
         sentence = str(error) if isinstance(error, IN_FLIGHT) else f"{type(error).__name__}: {error}"
-        if self.failures.get(name) != sentence and len(self.failures) < LARGEST_FLEET:
-            self.failures[name] = sentence
+        met, wait = self._met.get(name, ("", 0.0))
+        if met != sentence:
             self.note(f"{name} is not watched: {sentence}")
-        self._again[name] = time.monotonic() + AGAIN_SECONDS
+        wait = min(2.0 * wait, LONGEST_AGAIN) if met == sentence else AGAIN_SECONDS
+        self.failures[name], self._met[name] = sentence, (sentence, wait)
+        self._again[name] = time.monotonic() + wait
         if name in self.assets:
+            self._told_before[name] = self.assets[name].record()
             self.assets[name].close()
 
     def _write_state(self) -> None:
@@ -311,7 +322,7 @@ class _Files:
                     and not self._fleet.asked
                     and self._begun(path)
                 ):
-                    feed = partial(self._feed, path)
+                    feed = partial(file_feed, path, follow=self._follow)
                     self._assets[path] = self._fleet.take_up(self._group, name, feed)
         turns = 0
         for asset in self._assets.values():
@@ -320,9 +331,6 @@ class _Files:
             if asset is not None:
                 turns += self._fleet.advance(asset, TURNS_AT_ONCE)
         return turns
-
-    def _feed(self, path: Path, scenario: Scenario) -> Feed:
-        return file_feed(path, scenario, follow=self._follow)
 
     def _begun(self, path: Path) -> bool:
         """Return whether the header of a file that grows is whole."""
@@ -336,11 +344,14 @@ class _Files:
 
 
 class _Inbox(LiveFeed):
-    """What a broker sent of one asset."""
+    """What a broker sent of one asset, and what it is told."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, topic: str, scenario: Scenario) -> None:
+        self.topic, self.name = topic, topic.rpartition("/")[2]
         self._reader = MessageReader(scenario)
         self.came: deque[bytes] = deque(maxlen=HELD)
+        self.asset: WatchedAsset | None = None
+        self.outbox: Outbox | None = None
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         while True:
@@ -356,51 +367,55 @@ class _Topics:
         broker = broker_of(group.observations, authority, many=True)
         self._fleet, self._group, self._topic = fleet, group, broker.topic
         self._session = Session(broker, group.name, fleet.folder, fleet.note, self._pulse)
-        fleet.closing.callback(self._session.close)
+        fleet.goodbyes.callback(self._session.close)
         self._messages = self._session.messages(0.0)
-        self._begin = True
-        self._assets: dict[str, WatchedAsset] = {}
-        self._inboxes: dict[str, _Inbox | None] = {}
-        self._searched = time.monotonic()
+        self._inboxes: dict[str, _Inbox] = {}
+        self._searched = 0.0
 
     def look(self) -> int:
         """Take in what the broker has sent; return the number of turns."""
-        turns = 0
-        if self._begin:  # those that were watched before may be quiet, or have decisions to publish
+        turns, begin = 0, time.monotonic()
+        if not self._searched:  # those that were watched before may be quiet, or have decisions to publish
             for path in sorted((self._fleet.folder / self._group.name).glob(f"*/{CONFIG_NAME}")):
-                topic = self._topic[:-1] + path.parent.name
-                self._inboxes[topic] = self._begun(topic, None)
-            self._begin = False
-        again = time.monotonic() - self._searched >= SEARCH_SECONDS
-        self._searched = time.monotonic() if again else self._searched
-        for topic in [*self._inboxes] if again else ():
-            if self._fleet.due(f"{self._group.name}/{topic.rpartition('/')[2]}"):
-                self._inboxes[topic] = self._begun(topic, self._inboxes[topic])
-                turns += self._advanced(topic)
+                self._inbox(self._topic[:-1] + path.parent.name)
+        if begin - self._searched >= SEARCH_SECONDS:
+            self._searched = begin
+            for inbox in self._inboxes.values():
+                if self._fleet.due(f"{self._group.name}/{inbox.name}"):
+                    self._take_up(inbox)
+                turns += self._advanced(inbox)
         while not self._fleet.asked and (message := next(self._messages)) is not None:
-            topic = message.topic
-            if topic not in self._inboxes and len(self._inboxes) < LARGEST_FLEET:
-                self._inboxes[topic] = self._begun(topic, None)
-            inbox = self._inboxes.get(topic)
-            if inbox is not None and not self._fleet.enough(self._assets[topic]):
-                inbox.came.append(message.payload)
-                turns += self._advanced(topic)
+            box = self._inbox(message.topic)
+            if box is not None and not (box.asset and self._fleet.enough(box.asset)):
+                box.came.append(message.payload)
+                turns += self._advanced(box)
+            if time.monotonic() - begin > STATE_SECONDS:
+                break
         return turns
 
-    def _advanced(self, topic: str) -> int:
-        return self._fleet.advance(self._assets[topic]) if topic in self._assets else 0
+    def _inbox(self, topic: str) -> _Inbox | None:
+        """Return that of a topic, of which an asset is begun; None of one too many."""
+        if topic not in self._inboxes and len(self._inboxes) < LARGEST_FLEET:
+            self._inboxes[topic] = _Inbox(topic, self._group.scenarios[0])
+            self._take_up(self._inboxes[topic])
+        return self._inboxes.get(topic)
 
-    def _begun(self, topic: str, before: _Inbox | None) -> _Inbox | None:
-        inbox, name = before or _Inbox(self._group.scenarios[0]), topic.rpartition("/")[2]
-        asset = self._fleet.take_up(self._group, name, lambda _scenario: inbox)
-        if asset is None:
-            return before
-        self._assets[topic] = asset
-        asset.tell = Outbox(self._session, topic, asset.watch).tell
-        return inbox
+    def _advanced(self, inbox: _Inbox) -> int:
+        return 0 if inbox.asset is None else self._fleet.advance(inbox.asset)
+
+    def _take_up(self, inbox: _Inbox) -> None:
+        def begun(asset: WatchedAsset) -> None:
+            if inbox.outbox is None:
+                failed = partial(self._fleet.lost, asset.name)
+                inbox.outbox = Outbox(self._session, inbox.topic, asset.watch, failed)
+            else:
+                inbox.outbox.take_up(asset.watch)
+            inbox.asset, asset.tell = asset, inbox.outbox.tell
+
+        self._fleet.take_up(self._group, inbox.name, lambda _scenario: inbox, begun)
 
     def _pulse(self) -> dict[str, Any]:
-        kept = [asset.keep for asset in self._assets.values()]
+        kept = [inbox.asset.keep for inbox in self._inboxes.values() if inbox.asset is not None]
         return {
             "state": "watching", "assets": len(kept), "turns": sum(keep.twin.turns for keep in kept),
             "quiet": sum(keep.quiet for keep in kept), "lag": len(self._session.came),

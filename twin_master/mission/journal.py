@@ -262,6 +262,18 @@ def records_backwards(path: Path, end: int | None = None) -> Iterator[tuple[dict
                         record_of(path, number, text)
 
 
+def last_turn(path: Path, limit: float = math.inf) -> tuple[int, int]:
+    """Return the last turn of a journal up to a limit, -1 for none, and where its lines end in bytes.
+
+    Raises
+    ------
+    NotResumableError
+        A line at the end was changed or is damaged.
+    """
+    lines = ((int(record.get("turn", -1)), end) for record, _, end in records_backwards(path))
+    return next(((turn, end) for turn, end in lines if turn <= limit), (-1, 0))
+
+
 def records_behind(path: Path, end: int) -> Iterator[tuple[dict[str, Any], int]]:
     """Return the record of each whole line behind the first `end` bytes, with the position of its own end."""
     with path.open("rb") as file:

@@ -131,8 +131,9 @@ class Flight:
         news = self._journal.news(TURNS_AT_ONCE)
         for line in news:
             if line.seen is None:
-                if line.notices and self.turns:
-                    self._told[self.turns - 1] = self._told.get(self.turns - 1, ()) + line.notices
+                if line.notices:
+                    turn = max(self.turns - 1, 0)
+                    self._told[turn] = self._told.get(turn, ()) + line.notices
                     self.number += 1
                 continue
             if line.seen.turn == self.turns:

@@ -6,14 +6,13 @@ This is the one place that knows how a journal tells its turns: see `twin_master
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.mission.journal import JOURNAL_NAME, array_of, damaged, record_of
+from twin_master.mission.journal import JOURNAL_NAME, array_of, damaged, whole_record
 from twin_master.network.estimator import Learnt, Notice
 
 Float = NDArray[np.float64]
@@ -154,10 +153,10 @@ class GrowingJournal:
             return None
 
     def _record(self, line: bytes, number: int | None) -> dict[str, Any]:
-        digest, _, text = line.rstrip(b"\n").partition(b" ")
-        if sha256(text).hexdigest().encode("ascii") != digest:
+        record = whole_record(line)
+        if record is None:
             raise damaged(self._path, number or 0, "it does not have the hash that stands before it")
-        return record_of(self._path, number or 0, text)
+        return record
 
 
 def _seen(record: Mapping[str, Any]) -> SeenTurn:

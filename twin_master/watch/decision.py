@@ -1,18 +1,16 @@
 """What the operator is told of a turn, and how well the twin's model has explained turns."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.mission.journal import array_of, records_backwards
-from twin_master.mission.loop import Beliefs, Reading
+from twin_master.mission.journal import array_of
+from twin_master.mission.loop import Beliefs
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.network.twin import Twin, TwinTurn
 from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
@@ -21,49 +19,27 @@ _SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
 """What is told of a suspicion."""
 
 
-def decision_of(
-    scenario: Scenario, model: GraphicalModel, twin: Twin, reading: Reading, turn: TwinTurn
-) -> dict[str, Any]:
-    """Return what the operator is told of a turn: never a control without its certainty."""
-    record = {"turn": turn.turn} | _decided(
-        scenario, model, turn.filtered, turn.control_index, turn.next_control, turn.decision_probability
-    )
-    record |= {
-        "lost_sensors": int(np.isnan(reading.observed[: scenario.observation.count]).sum()),
-        "log_evidence": turn.log_evidence,
-        "notices": [vars(notice) for notice in turn.notices],
-    }
-    if turn.suspicion is not None:
-        record |= {name: getattr(turn.suspicion, name) for name in _SUSPECTED}
-    if reading.revises is not None:
-        record["revised_by_turn"] = reading.revises
-    if turn.learnt:
-        record["learnt"] = {name: vars(learnt) for name, learnt in turn.learnt.items()}
-    return record
-
-
-def last_decision(path: Path, scenario: Scenario, model: GraphicalModel) -> dict[str, Any] | None:
-    """Return the last decision in a journal; None without any.
-
-    A kill may have left it untold, and nobody knows: it has `told_again`.
-    """
-    for line, *_ in records_backwards(path):
-        if "filtered" in line:
-            return {**journalled_decision(line, scenario, model), "told_again": True}
-    return None
-
-
 def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
-    """Return what the operator was told with a line of a journal; nothing where it tells no decision."""
+    """Return what the operator is told with a line of a journal: never a control without its certainty.
+
+    Nothing where it tells no decision.
+    """
     if "quiet" in line:
         return dict(line["quiet"])
     if "filtered" not in line:
         return {}
-    record = {"turn": line["turn"]} | _decided(
-        scenario, model, array_of(line["filtered"]), line.get("control_in_force", line["control_index"]),
-        line["next_control"], array_of(line["decision_probability"]),
-    )  # fmt: skip
-    record |= {
+    filtered = array_of(line["filtered"])
+    mean, deviation = model.states.mean(filtered), model.states.standard_deviation(filtered)
+    controls, coming = scenario.control_names, line["next_control"]
+    record = {
+        "turn": line["turn"],
+        "control": controls[line.get("control_in_force", line["control_index"])],
+        "health": {
+            factor.name: {"mean": mean[index], "standard_deviation": deviation[index], "unit": factor.unit}
+            for index, factor in enumerate(scenario.state)
+        },
+        "next_control": controls[coming],
+        "probability": min(float(line["decision_probability"][coming]), 1.0),
         "lost_sensors": line["observed"][: scenario.observation.count].count(None),
         "log_evidence": line["log_evidence"],
         "notices": line.get("notices", []),
@@ -75,22 +51,6 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
     if "learnt" in line:
         record["learnt"] = line["learnt"]
     return record
-
-
-def _decided(
-    scenario: Scenario, model: GraphicalModel, filtered: Float, control: int, coming: int, probability: Float
-) -> dict[str, Any]:
-    controls = scenario.control_names
-    mean, deviation = model.states.mean(filtered), model.states.standard_deviation(filtered)
-    return {
-        "control": controls[control],
-        "health": {
-            factor.name: {"mean": mean[index], "standard_deviation": deviation[index], "unit": factor.unit}
-            for index, factor in enumerate(scenario.state)
-        },
-        "next_control": controls[coming],
-        "probability": min(float(probability[coming]), 1.0),
-    }
 
 
 def gap_of(beliefs: Beliefs, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,12 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
 from twin_master.assets.asset_source import calibrated_with
-from twin_master.assets.resolution import (
-    believed_source,
-)
+from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
+    last_turn,
     open_journal,
     read_lines,
     records_backwards,
@@ -28,19 +28,16 @@ from twin_master.mission.loop import Source, operate
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
-from twin_master.run_folder import (
-    tidy,
-    with_inputs,
-)
+from twin_master.run_folder import tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
 from twin_master.store.writing import store_mission, write_summary
-from twin_master.watch.decision import decision_of, last_decision
+from twin_master.watch.decision import journalled_decision
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
 from twin_master.watch.keeping import Keeper, Standing
-from twin_master.watch.replay import BelievedModel, Replayed, replay
+from twin_master.watch.replay import BelievedModel, replay
 from twin_master.watch.stopping import Stopping
 from twin_master.watch.teaching import Search, Teaching, Tutor, both_patches, check_teachable, notice_of
 from twin_master.watch.trial import Judge, Outcome, Trial, judged, patched_model
@@ -130,6 +127,7 @@ class Watch:
     def run(
         self, feed: Feed, decide: Callable[[Mapping[str, Any]], None], *, turns: int | None = None,
         patched: Patched | None = None, search: Search | None = None,
+        untold: Mapping[str, Any] | None = None,
     ) -> Counts:  # fmt: skip
         """Watch until the feed ends, or SIGINT or SIGTERM ask for it between two turns.
 
@@ -145,17 +143,20 @@ class Watch:
             To believe from a turn on.
         search : Search, optional
             Looks for the cause of an alarm, so that the twin is taught.
+        untold : dict, optional
+            The last decision, to be told again first.
         """
         with self.begun(feed, patched) as (journal, keep):
-            source = Stopping(keep.intake, turns, lambda: self._look(decide))
-            if search is not None:
-                keep.tutor = self._tutor(journal, keep, search, source, wait=feed.replayable)
+            source = Stopping(keep.intake, turns, lambda: self.quiet(decide))
+            tutor = self._tutor(journal, keep, search, source, wait=feed.replayable) if search else None
             with source.listening():
                 try:
-                    self._operate(source, keep, decide)
+                    if untold is not None:
+                        decide(untold)
+                    self._operate(source, keep, decide, tutor)
                 finally:
-                    if keep.tutor is not None:
-                        keep.tutor.end()
+                    if tutor is not None:
+                        tutor.end()
         return keep.intake.counts
 
     @contextmanager
@@ -167,59 +168,72 @@ class Watch:
             self._take_up()
             if patched is not None:
                 self._patch(journal, patched)
-            found = self._replayed()
+            found = replay(self._path, self.models, self.scenario.watch.lag)
             intake.restore(None if found.last is None else found.last["intake"])
             if found.last is not None:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
             self.keep = Keeper(journal, intake, found.twin, self.standing)
+            self.keep.quiet = "quiet" in (found.last or {})
             yield journal, self.keep
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
         """Yield what the operator is told of each turn, once it is written down, until the source ends."""
-        twin = keep.twin
-        for reading, turn, _ in operate(twin, source, keep):
-            decision = decision_of(self.scenario, self.models[-1].knowledge.model, twin, reading, turn)
-            yield decision | {"notices": [*decision["notices"], *keep.told]}
+        for _ in operate(keep.twin, source, keep):
+            yield journalled_decision(keep.line, self.scenario, self.models[-1].knowledge.model)
 
-    def quiet(self) -> dict[str, Any] | None:
-        """Return the last decision with the notice that it grows old, once no turn has come for too long."""
+    def last_decision(self) -> dict[str, Any] | None:
+        """Return the last decision in the journal; None without any.
+
+        A kill may have left it untold, and nobody knows: it has `told_again`.
+        """
+        model = self.models[-1].knowledge.model
+        for line, *_ in records_backwards(self._path):
+            if "filtered" in line:
+                return {**journalled_decision(line, self.scenario, model), "told_again": True}
+        return None
+
+    def quiet(self, decide: Callable[[dict[str, Any]], None]) -> None:
+        """Tell the last decision with the notice that it grows old, once no turn has come for too long."""
         keep = self.keep
         longest, step = self.scenario.watch.quiet_after_seconds, self.scenario.mission.step_name
         if longest is None or keep.quiet or keep.silence < longest:
-            return None
+            return
         since = f"since {step} {keep.twin.turns - 1}" if keep.twin.turns else "and none before"
         sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
-        last = last_decision(self._path, self.scenario, self.models[-1].knowledge.model)
-        decision = {**(last or {"turn": -1}), "notices": [notice_of("quiet", sentence)]}
+        decision = {**(self.last_decision() or {"turn": -1}), "notices": [notice_of("quiet", sentence)]}
         keep.write({"notices": decision["notices"], "quiet": decision})
         keep.quiet = True
-        return decision
+        decide(decision)
 
-    def _look(self, decide: Callable[[Mapping[str, Any]], None]) -> None:
-        if (decision := self.quiet()) is not None:
-            decide(decision)
-
-    def _operate(self, source: Stopping, keep: Keeper, decide: Callable[[Mapping[str, Any]], None]) -> None:
+    def _operate(
+        self, source: Stopping, keep: Keeper, decide: Callable[[Mapping[str, Any]], None], tutor: Tutor | None
+    ) -> None:
         """Watch with one twin after the other: where it is taught, another one goes on."""
         while True:
-            if keep.tutor is not None:
-                keep.tutor.act()
+            if tutor is not None:
+                tutor.act()
             for decision in self.decisions(source, keep):
                 decide(decision)
-                if keep.tutor is not None and keep.tutor.due:
+                if tutor is not None and tutor.due:
                     break
             else:
                 return
 
     def _tutor(
-        self, journal: JournalFile, keep: "Keeper", search: Search, source: Stopping, *, wait: bool
+        self, journal: JournalFile, keep: Keeper, search: Search, source: Stopping, *, wait: bool
     ) -> Tutor:
         check_teachable(self.scenario)
-        teaching, pupil = self.standing.teaching, _Pupil(self, journal, keep, Judge(wait=wait))
-        step = self.scenario.mission.step_name
-        return Tutor(pupil, teaching, search, step, wait=wait, asked_to_end=lambda: source.asked)
+        keep.taught = True
+
+        def adopt(outcome: Outcome, notice: Mapping[str, Any]) -> None:
+            keep.twin = self.adopt(journal, outcome, notice)
+
+        return Tutor(
+            self.standing.teaching, search, Judge(wait=wait), keep.write, partial(self.trial, journal), adopt,
+            self.scenario.mission.step_name, wait=wait, asked_to_end=lambda: source.asked,
+        )  # fmt: skip
 
     def trial(
         self, journal: JournalFile, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)
@@ -230,14 +244,9 @@ class Watch:
         models = tuple(self.models)
         return Trial(self._path, journal.size, self.scenario, models, patch, from_turn, compared)
 
-    def _replayed(self, first_turn: int | None = None) -> Replayed:
-        """Return the twin, or with all that it keeps from a turn on."""
-        lag = self.scenario.watch.lag if first_turn is None else None
-        return replay(self._path, self.models, lag, first_turn=first_turn)
-
     def _patch(self, journal: JournalFile, patched: Patched) -> None:
         """Believe a patch that is given from a turn on."""
-        turns = self._turns()
+        turns = last_turn(self._path)[0] + 1
         if not turns or not 0 <= patched.from_turn <= turns:
             raise MissionInputError(
                 f"--from-turn names one of the {turns} turns watched so far, or the next one."
@@ -278,19 +287,14 @@ class Watch:
         )
         return twin
 
-    def _turns(self) -> int:
-        """Return how many turns were watched."""
-        lines = records_backwards(self._path)
-        return next((int(line["turn"]) + 1 for line, *_ in lines if {"filtered", "model"} & {*line}), 0)
-
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
-        turns = self._turns()
+        turns = last_turn(self._path)[0] + 1
         if not turns:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
         first = max(0, turns - last)
-        found = self._replayed(first)
+        found = replay(self._path, self.models, None, first_turn=first)
         flight = found.beliefs.flight(found.twin, None, first_turn=found.first_turn)
         flight = replace(flight, notices=self.told(first))
         knowledge, mission = self.models[-1].knowledge, self.scenario.mission
@@ -342,13 +346,16 @@ class Watch:
                 write_report(self.folder)
 
     def told(self, first: int) -> tuple[tuple[int, Notice], ...]:
-        """Return what the operator was told in the turns from `first` on, each sentence once."""
+        """Return what the operator was told in the turns from `first` on, each sentence once.
+
+        What was told before the first turn counts to it.
+        """
         told: dict[str, tuple[int, Notice]] = {}
-        lines = takewhile(lambda line: line[0].get("turn", -1) >= first, records_backwards(self._path))
+        lines = takewhile(lambda line: max(line[0].get("turn", 0), 0) >= first, records_backwards(self._path))
         for record in reversed([record for record, *_ in lines if "notices" in record]):
             for notice in record["notices"]:
                 found = {**notice, "sensors": tuple(notice["sensors"])}
-                told.setdefault(notice["sentence"], (record["turn"], Notice(**found)))
+                told.setdefault(notice["sentence"], (max(record["turn"], 0), Notice(**found)))
         return tuple(told.values())
 
     def _figures(self, counts: Counts, turns: int) -> tuple[Figure, ...]:
@@ -374,23 +381,3 @@ class Watch:
 
 
 WATCHED = "watched asset"
-
-
-class _Pupil:
-    """A watch that is taught, see `teaching.Pupil`."""
-
-    def __init__(self, watch: Watch, journal: JournalFile, keep: Keeper, judge: Judge) -> None:
-        self.folder, self._watch, self._journal = watch.folder, watch, journal
-        self._keep, self._judge = keep, judge
-
-    def write(self, record: Mapping[str, Any]) -> None:
-        self._keep.write(record)
-
-    def outcome(self, file: Path, from_turn: int, compared: tuple[int, int]) -> Outcome | None:
-        return self._judge.outcome(lambda: self._watch.trial(self._journal, file, from_turn, compared))
-
-    def adopt(self, outcome: Outcome, notice: Mapping[str, Any]) -> None:
-        self._keep.twin = self._watch.adopt(self._journal, outcome, notice)
-
-    def end(self) -> None:
-        self._judge.end()

@@ -8,14 +8,13 @@ from typing import Any
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.resolution import Overrides, given_overrides
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.decision import last_decision
+from twin_master.watch.broker import broker_of, is_broker
 from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, check_file, file_feed
 from twin_master.watch.folder import STORED_TURNS, Patched, Watch
 from twin_master.watch.intake import Feed
-from twin_master.watch.mqtt import MqttFeed, broker_of, is_broker
+from twin_master.watch.mqtt import MqttFeed
 from twin_master.watch.opening import begin_watch, resume_watch
 from twin_master.watch.snapshot import stored
 from twin_master.watch.teaching import Search, check_teachable
@@ -128,10 +127,10 @@ def watch(
             publish(decision)
 
         try:
-            if (untold := _untold(watched)) is not None:
-                tell(untold)
+            # A kill may have left the last decision untold.
+            untold = None if stored(watched.folder) else watched.last_decision()
             search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
-            counts = watched.run(feed, tell, turns=turns, patched=patch, search=search)
+            counts = watched.run(feed, tell, turns=turns, patched=patch, search=search, untold=untold)
         finally:
             close()
         watched.store(counts, last=last, report=report)
@@ -214,10 +213,3 @@ def _feed(
     else:
         feed = file_feed(Path(observations), scenario, follow=follow)
     return feed, lambda _decision: None, lambda: None
-
-
-def _untold(watched: Watch) -> dict[str, Any] | None:
-    """Return the last decision, to be told again, where a kill may have left it untold."""
-    model = watched.models[-1].knowledge.model
-    last = last_decision(watched.folder / JOURNAL_NAME, watched.scenario, model)
-    return None if stored(watched.folder) else last

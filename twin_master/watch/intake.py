@@ -2,7 +2,7 @@
 
 import json
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -146,6 +146,8 @@ class Intake:
         Of sensors of which no number came with the last reading, and before it did, or the other way round.
     ended : bool
         Whether the feed has ended; if not, more may come after `read` has returned None.
+    look : callable
+        Called behind each message from which no reading comes.
     """
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: RejectedFile) -> None:
@@ -161,12 +163,13 @@ class Intake:
         self._origin: float | None = None
         self._first: int | None = None  # the only turn that was told a time so far, if there is but one
         self._text = ""
-        self._unreadable: set[int] = set()
+        self._unreadable = self._known = set[int]()  # after the last reading, and before it
         self.notices: list[Notice] = []
         self._before: Float = np.empty(0)
         self.counts = Counts()
         self.observation_turn = -1
         self.ended = False
+        self.look: Callable[[], None] = lambda: None
 
     @property
     def settled(self) -> bool:
@@ -220,8 +223,11 @@ class Intake:
                 self._sort(twin, message)
             except Refused as refusal:
                 self._refuse(str(refusal))
+            if not self._pending:
+                self.look()
         turn, reading, given = self._pending.popleft()
         self.observation_turn = turn
+        self._known = self._unreadable
         self.notices = [*self._noticed(reading)]
         if reading.revises is None:
             self._given.append(given)
@@ -235,6 +241,8 @@ class Intake:
 
     def _noticed(self, reading: Reading) -> Iterator[Notice]:
         """Say of each sensor once that it is unreadable, and once that it is back."""
+        if reading.revises is not None:
+            return  # it says nothing of how the sensors are now
         came, words = reading.unreadable, self._words
         when = f"{words.step.capitalize()} {self.observation_turn}"
         for g in sorted(came.keys() - self._unreadable):
@@ -243,8 +251,6 @@ class Intake:
                 "readings of it come back."
             )
             yield Notice("gauge_left_out", sentence, (g + 1,))
-        if reading.revises is not None:
-            return  # it says nothing of how the sensors are now
         back = {g for g in self._unreadable - came.keys() if not np.isnan(reading.observed[g])}
         for g in sorted(back):
             sentence = f"{when}: the readings of {words.sensors([g])} are back, and used again."
@@ -254,6 +260,7 @@ class Intake:
     def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Refuse an observation that no state allows; its turn is predicted through, or stays as it was."""
         self._refuse(str(error))
+        self.notices, self._unreadable = [], self._known
         if reading.revises is not None:
             return Reading(self._before, None, reading.revises)
         return Reading(np.full(self._width, np.nan), reading.control)

@@ -22,7 +22,7 @@ from twin_master.mission.journal import (
 from twin_master.mission.loop import Reading
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.watch.intake import Intake
-from twin_master.watch.teaching import Teaching, Tutor, notice_of
+from twin_master.watch.teaching import Teaching, notice_of
 
 SNAPSHOT_TURNS = 32
 """Turns between two lines that also hold the state of the twin and what follows from all lines before."""
@@ -104,10 +104,10 @@ class Keeper:
 
     Attributes
     ----------
-    tutor : Tutor or None
-        What teaches the twin.
-    told : list
-        Notices that the last line has beside those of its turn.
+    taught : bool
+        Whether the twin is taught.
+    line : dict
+        The last line of a turn that was written down.
     filtered : (S,) or None
         What was believed after the last turn; None before the first one of this process.
     quiet : bool
@@ -116,8 +116,8 @@ class Keeper:
 
     def __init__(self, journal: JournalFile, intake: Intake, twin: Twin, standing: Standing) -> None:
         self._journal, self.intake, self.twin, self._standing = journal, intake, twin, standing
-        self.tutor: Tutor | None = None
-        self.told: list[dict[str, Any]] = []
+        self.taught = False
+        self.line: dict[str, Any] = {}
         self.filtered: NDArray[np.float64] | None = None
         self.quiet, self._heard = False, time.monotonic()
 
@@ -143,15 +143,15 @@ class Keeper:
             record |= self._standing.snapshot(self.twin, self._journal.size)
         record |= belief_record(turn)
         known = {(notice.kind, notice.sensors) for notice in turn.notices}
-        self.told = [vars(n) for n in self.intake.notices if (n.kind, n.sensors) not in known]
-        if self.tutor is not None:
-            self.told += self.tutor.teaching.untold
+        told = [vars(n) for n in self.intake.notices if (n.kind, n.sensors) not in known]
+        told += self._standing.teaching.untold if self.taught else []
         if self.quiet:
             sentence = f"Turn {turn.turn}: observations come again, after {self.silence:.0f} s."
-            self.told.append(notice_of("heard", sentence))
-        if self.told:
-            record["notices"] = record.get("notices", []) + self.told
+            told.append(notice_of("heard", sentence))
+        if told:
+            record["notices"] = record.get("notices", []) + told
         self._append(record)
+        self.line = record
         self.quiet, self._heard = False, time.monotonic()
 
     def write(self, record: Mapping[str, Any]) -> None:

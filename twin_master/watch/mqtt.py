@@ -6,21 +6,20 @@ more of them than can wait; further ones wait at the broker, or are dropped ther
 
 import json
 import os
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from importlib.util import find_spec
+from contextlib import contextmanager
 from pathlib import Path
 from secrets import token_hex
-from ssl import create_default_context
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 from reporting.files import atomic_write_text, write_error
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records_behind
 from twin_master.scenario.schema import Scenario
+from twin_master.watch.broker import PASSWORD_VARIABLE, Broker
 from twin_master.watch.decision import journalled_decision
 from twin_master.watch.feeds import Fed, parsed, shown
 from twin_master.watch.folder import Watch
@@ -28,9 +27,10 @@ from twin_master.watch.growing import Place
 from twin_master.watch.intake import LiveFeed
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
-PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
 CLIENT_SUFFIX, PUBLISHED_NAME = ".mqtt", "published"
 """Of the file with the name of the client, and of that which says how far decisions were published."""
+BEGIN_ANEW = "begin anew"
+"""Behind the name of the client, until what the broker kept for it is thrown away."""
 _WAITING = 200
 """Messages that the broker may send before they are acknowledged."""
 _DECISIONS_WAITING = 1000
@@ -41,75 +41,6 @@ _RETRY_SECONDS = (1.0, 30.0)
 HEARTBEAT_SECONDS = 10.0
 _GOODBYE_SECONDS = 5.0
 """How long the end waits for the broker to take the last decisions."""
-
-
-@dataclass(frozen=True)
-class Broker:
-    """Where observations come from.
-
-    Attributes
-    ----------
-    host, port, topic : str, int, str
-        Of the broker, and of the observations; decisions go to `TOPIC/decision`, how the twin is to
-        `TOPIC/heartbeat`.
-    user : str or None
-        Who the twin is; the password is in the environment, `UAV_TWIN_MQTT_PASSWORD`.
-    tls : bool
-        `mqtts://`: encrypted, the broker known by its certificate.
-    authority : Path or None
-        Certificate of the authority, where the system does not know it.
-    """
-
-    host: str
-    port: int
-    topic: str
-    user: str | None = None
-    tls: bool = False
-    authority: Path | None = None
-
-
-def is_broker(observations: str) -> bool:
-    """Return whether observations come from a broker, and not from a file."""
-    return observations.startswith(("mqtt://", "mqtts://"))
-
-
-def broker_of(address: str, authority: Path | None = None, *, many: bool = False) -> Broker:
-    """Return the broker of `mqtt://[USER@]HOST[:PORT]/TOPIC`, or `mqtts://` with TLS.
-
-    Of many assets the topic ends with `/+`, which stands for the name of each.
-
-    Raises
-    ------
-    MissionInputError
-        paho-mqtt is not installed, or it is no such address, has a password in it, or a topic of many assets;
-        the authority's file holds no certificate.
-    """
-    if find_spec("paho") is None:
-        raise MissionInputError("observations over MQTT need paho-mqtt: pip install 'uav-twin[mqtt]'.")
-    try:
-        parts = urlsplit(address)
-        port, topic = parts.port, unquote(parts.path.lstrip("/"))
-    except ValueError:
-        parts, port, topic = urlsplit("mqtt:"), None, ""
-    if not parts.hostname or not topic:
-        raise MissionInputError(f"{address}: `mqtt://[USER@]HOST[:PORT]/TOPIC` is expected, or `mqtts://`.")
-    if parts.password is not None:
-        raise MissionInputError(
-            f"every user of this machine sees a password in an address: put it into {PASSWORD_VARIABLE}."
-        )
-    if many and (not topic.endswith("/+") or "+" in topic[:-1] or "#" in address):
-        raise MissionInputError(f"{address}: a topic of many assets is expected, such as wings/+.")
-    if not many and ("#" in address or "+" in topic):
-        raise MissionInputError(f"{address}: a topic of one asset is expected, without `#` and `+`.")
-    tls, user = parts.scheme == "mqtts", None if parts.username is None else unquote(parts.username)
-    if authority is not None:
-        if not (tls and authority.is_file()):
-            raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
-        try:
-            create_default_context(cafile=authority)
-        except OSError as error:
-            raise MissionInputError(f"{authority} holds no certificate: {error}.") from None
-    return Broker(parts.hostname, port or (8883 if tls else 1883), topic, user, tls, authority)
 
 
 class Session:
@@ -126,8 +57,6 @@ class Session:
         Told when the broker is lost and found, and what it refuses.
     pulse : callable
         What the heartbeat says.
-    clean : bool
-        Begin anew: what the broker kept for this client is not wanted.
 
     Attributes
     ----------
@@ -139,12 +68,13 @@ class Session:
 
     def __init__(
         self, broker: Broker, name: str, folder: Path, note: Callable[[str], None],
-        pulse: Callable[[], dict[str, Any]], *, clean: bool = False,
+        pulse: Callable[[], dict[str, Any]],
     ) -> None:  # fmt: skip
         self._broker, self.note, self._pulse = broker, note, pulse
-        self._own = folder / f"{name}{CLIENT_SUFFIX}", f"uav-twin-{name}-{token_hex(8)}"
-        self._clean = clean and self._own[0].is_file()
-        self._kept = not clean and self._own[0].is_file()
+        self._path = folder / f"{name}{CLIENT_SUFFIX}"
+        known = self._path.read_text(encoding="utf-8").splitlines() if self._path.is_file() else []
+        self._name = (known or [""])[0] or f"uav-twin-{name}-{token_hex(8)}"
+        self._clean, self._kept = known[1:] == [BEGIN_ANEW], len(known) == 1
         self._where = f"broker at {broker.host}:{broker.port}"
         self._heartbeat = broker.topic.replace("+", "fleet") + "/heartbeat"
         self._client: Any = None
@@ -168,13 +98,9 @@ class Session:
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
 
-        path, own = self._own
-        if not path.is_file():
-            atomic_write_text(path, own + "\n")
         client = paho.Client(
-            CallbackAPIVersion.VERSION2, client_id=path.read_text(encoding="utf-8").strip(),
-            protocol=paho.MQTTv5, manual_ack=True,
-        )  # fmt: skip
+            CallbackAPIVersion.VERSION2, client_id=self._name, protocol=paho.MQTTv5, manual_ack=True
+        )
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = _SESSION_SECONDS
         properties.ReceiveMaximum = _WAITING
@@ -216,6 +142,7 @@ class Session:
                 "user that right"
             )
             return
+        atomic_write_text(self._path, self._name + "\n")  # which also ends the wish to begin anew
         self._begun = self._kept = True
         self._told, self._pause, self._beat = "", _RETRY_SECONDS[0], 0.0
         for outbox in self.behind:
@@ -308,13 +235,16 @@ class Session:
 
     def close(self) -> None:
         """Say goodbye once the broker has the last decisions; it keeps the session."""
-        end = time.monotonic() + _GOODBYE_SECONDS
-        while self._client is not None and (self.behind or self._flying) and time.monotonic() < end:
+        crashed, end = sys.exc_info()[0] is not None, time.monotonic() + _GOODBYE_SECONDS
+        while (self.behind or self._flying) and time.monotonic() < end:
+            if self._client is None and (self._begun or crashed):
+                break
             self._exchange(0.1)
         if self.behind or self._flying:
             self.note("The broker has not taken all decisions: the rest is published when the watch goes on.")
         if self._client is not None:
-            self._client.publish(self._heartbeat, json.dumps(self._pulse() | {"state": "ended"}), retain=True)
+            said = json.dumps(self._pulse() | {"state": "lost" if crashed else "ended"})
+            self._client.publish(self._heartbeat, said, retain=True)
             self._client.disconnect()
 
 
@@ -331,18 +261,40 @@ class Outbox:
         Of the observations of the asset.
     watch : Watch
         Of the asset.
+    failed : callable
+        Told what keeps the decisions from being published; they are then left until it is taken up again.
     """
 
-    def __init__(self, session: Session, topic: str, watch: Watch) -> None:
-        self._session, self._topic, self._watch = session, topic, watch
-        self._path, self._journal = watch.folder / PUBLISHED_NAME, watch.folder / JOURNAL_NAME
-        self._before = self._journal.stat().st_size  # decisions before may have been published
-        if not self._path.is_file():
-            atomic_write_text(self._path, f"{self._before:020d}\n")
-        self._done = self._read = int(self._path.read_text())
+    def __init__(
+        self, session: Session, topic: str, watch: Watch, failed: Callable[[Exception], None]
+    ) -> None:
+        self._session, self._topic, self._failed = session, topic, failed
         self._waiting: dict[int, int] = {}
-        self.not_before = 0.0
-        session.behind[self] = None
+        self.not_before, self._before = 0.0, 0
+        self.take_up(watch)
+
+    def take_up(self, watch: Watch) -> None:
+        """Publish what the journal of a watch has, which was begun or taken up again."""
+        self._watch = watch
+        self._path, self._journal = watch.folder / PUBLISHED_NAME, watch.folder / JOURNAL_NAME
+        size = self._journal.stat().st_size  # decisions before may have been published
+        if not self._path.is_file():
+            atomic_write_text(self._path, f"{size:020d}\n")
+        text = self._path.read_text(encoding="utf-8", errors="replace").strip()
+        self._done, self._read = min(int(text) if text.isdecimal() else 0, size), size
+        self.go_back()
+        if self._done == size:
+            self._session.behind.pop(self)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Let what goes wrong end nothing but this."""
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001 - whatever it is
+            self._waiting.clear()
+            self._session.behind.pop(self, None)
+            self._failed(error)
 
     def _write(self, done: int) -> None:
         try:
@@ -364,15 +316,16 @@ class Outbox:
         if time.monotonic() < self.not_before:
             return
         scenario, model = self._watch.scenario, self._watch.models[-1].knowledge.model
-        for line, end in records_behind(self._journal, self._read):
-            if not self._session.room:
-                return
-            decision = journalled_decision(line, scenario, model)
-            if decision:
-                decision |= {"told_again": True} if end <= self._before else {}
-                self._waiting[self._session.send(self._topic, decision, self)] = self._read
-            self._read = end
-        self._session.behind.pop(self, None)
+        with self._alone():
+            for line, end in records_behind(self._journal, self._read):
+                if not self._session.room:
+                    return
+                decision = journalled_decision(line, scenario, model)
+                if decision:
+                    decision |= {"told_again": True} if end <= self._before else {}
+                    self._waiting[self._session.send(self._topic, decision, self)] = self._read
+                self._read = end
+            self._session.behind.pop(self, None)
 
     def answered(self, mid: int, refusal: str | None) -> None:
         """Take in that the broker has a decision, or refuses it."""
@@ -382,7 +335,8 @@ class Outbox:
             self.not_before = time.monotonic() + _RETRY_SECONDS[1]
             self.go_back()
         if self._waiting.pop(mid, None) is not None:
-            self._write(next(iter(self._waiting.values()), self._read))
+            with self._alone():
+                self._write(next(iter(self._waiting.values()), self._read))
 
     def go_back(self) -> None:
         """Publish again what the broker has not acknowledged."""
@@ -411,11 +365,8 @@ class MqttFeed(LiveFeed):
     ) -> None:
         self._topic, self._watch = broker.topic, watch
         self._reader = MessageReader(scenario or watch.scenario)
-        clean = not (watch.folder / JOURNAL_NAME).exists()
-        name = watch.scenario.mission.name
-        self._session = Session(broker, name, watch.folder, note, self._pulse, clean=clean)
+        self._session = Session(broker, watch.scenario.mission.name, watch.folder, note, self._pulse)
         self._outbox: Outbox | None = None
-        self.close = self._session.close
 
     def _pulse(self) -> dict[str, Any]:
         keep = self._watch.keep
@@ -428,7 +379,7 @@ class MqttFeed(LiveFeed):
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return what comes, without end; a message is acknowledged when it is written down."""
-        self._outbox = Outbox(self._session, self._topic, self._watch)
+        self._outbox = Outbox(self._session, self._topic, self._watch, _raised)
         for message in self._session.messages(0.1):
             yield (None, "") if message is None else placed(self._reader, message.payload)
 
@@ -436,6 +387,16 @@ class MqttFeed(LiveFeed):
         """Publish what was decided since the watch was taken up; what was before follows by itself."""
         if self._outbox is not None:
             self._outbox.tell(decision)
+
+    def close(self) -> None:
+        """Say goodbye, see `Session.close`; what a kill left unpublished goes out, also without a turn."""
+        if self._outbox is None and sys.exc_info()[0] is None:
+            self._outbox = Outbox(self._session, self._topic, self._watch, _raised)
+        self._session.close()
+
+
+def _raised(error: Exception) -> None:
+    raise error
 
 
 def placed(reader: MessageReader, payload: bytes) -> Fed:

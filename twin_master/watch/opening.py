@@ -25,7 +25,7 @@ from twin_master.run_folder import (
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.folder import Watch
-from twin_master.watch.mqtt import CLIENT_SUFFIX
+from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX
 
 
 def begin_watch(
@@ -67,7 +67,9 @@ def begin_resolved(
         "provenance": collect_provenance(resolved.mission.seed).as_dict(),
     }
     # A watch that takes the place of another ends its session at the broker: it comes under the same name.
-    files = dict(source.files()) | {path.name: path.read_bytes() for path in folder.glob(f"*{CLIENT_SUFFIX}")}
+    files = dict(source.files())
+    for path in folder.glob(f"*{CLIENT_SUFFIX}"):
+        files[path.name] = path.read_bytes().partition(b"\n")[0] + f"\n{BEGIN_ANEW}\n".encode()
     lock = create_run_folder(folder, config, files, replace=replace_run)
     try:
         located = located_scenario(portable_scenario(resolved), folder)

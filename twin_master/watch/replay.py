@@ -91,9 +91,11 @@ def replay(
     settled, last = (-1, b""), None
     for record, begin, _ in records_backwards(path, end):
         try:
-            if not begin or int(record["turn"]) <= settled[0]:
+            if not begin:
                 break
             last = last or record
+            if int(record["turn"]) <= settled[0]:
+                break
             if settled[0] < 0 and "settled" in record:
                 turn, state = int(record["settled"]["turn"]), record["settled"]["state"]
                 # Only one before what is wanted, and before all models that are adopted behind it.

@@ -1,18 +1,19 @@
 """A watch as it stood after a turn: a copy of its folder, ended there, while the watch itself goes on."""
 
+import math
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.resolution import located_scenario
 from twin_master.errors import MissionInputError, NotResumableError
-from twin_master.mission.journal import JOURNAL_NAME, read_lines, record_of, records_backwards
+from twin_master.mission.journal import JOURNAL_NAME, last_turn
 from twin_master.report import reading
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
@@ -44,11 +45,11 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
     MissionInputError
         There is no turn from the first one on.
     """
-    config = read_json(folder / CONFIG_NAME, NotResumableError) if (folder / CONFIG_NAME).is_file() else None
-    if not isinstance(config, dict) or not config.get("watched"):
+    config = _config(folder)
+    if config is None:
         yield folder
         return
-    end, turn = _end_of(folder / JOURNAL_NAME, last)
+    turn, end = last_turn(folder / JOURNAL_NAME, math.inf if last is None else last)
     if first is not None and turn < first:
         known = f"the turns 0 to {turn}" if turn >= 0 else "no turn"
         limit = "" if last is None else f" up to turn {last}"
@@ -84,7 +85,7 @@ def open_run(folder: Path | str) -> "xr.DataTree":
     NotResumableError
         The journal of a watch was changed or is damaged.
     """
-    if stored(Path(folder)) or not (Path(folder) / JOURNAL_NAME).is_file():
+    if _config(Path(folder)) is None or stored(Path(folder)):
         return reading.open_run(folder)
     with flown(Path(folder), None, None, SilentProgress()) as ended:
         return reading.open_run(ended)
@@ -96,18 +97,10 @@ def stored(folder: Path) -> bool:
         ended = read_json(folder / SUMMARY_NAME, DamagedFileError)["steps"]
     except (DamagedFileError, KeyError, TypeError):
         return False
-    last = next((int(line.get("turn", -1)) for line, *_ in records_backwards(folder / JOURNAL_NAME)), -1)
-    return bool(ended == last + 1)
+    return bool(ended == last_turn(folder / JOURNAL_NAME)[0] + 1)
 
 
-def _end_of(path: Path, last: int | None) -> tuple[int, int]:
-    """Return where the lines of the turns up to a last one end [bytes], and the last turn; -1 for none."""
-    end, turn = 0, -1
-    for number, (text, after) in enumerate(read_lines(path, None)):
-        if number:
-            found = int(record_of(path, number, text).get("turn", -1))
-            if last is not None and found > last:
-                break
-            turn = max(turn, found)
-        end = after
-    return end, turn
+def _config(folder: Path) -> dict[str, Any] | None:
+    """Return the configuration of a watch; None where the folder holds something else."""
+    config = read_json(folder / CONFIG_NAME, NotResumableError) if (folder / CONFIG_NAME).is_file() else None
+    return config if isinstance(config, dict) and config.get("watched") else None

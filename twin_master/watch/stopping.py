@@ -26,11 +26,12 @@ class Stopping:
     turns : int or None
         In all, after which it ends.
     look : callable
-        Called now and then while nothing comes.
+        Called now and then while nothing comes, and behind messages from which no reading comes.
     """
 
     def __init__(self, intake: Intake, turns: int | None, look: Callable[[], None]) -> None:
         self._intake, self._turns, self._look = intake, turns, look
+        intake.look = self._looked
         self.asked = self._waiting = False
 
     def read(self, twin: Twin) -> Reading | None:
@@ -43,13 +44,19 @@ class Stopping:
                 if (reading := self._intake.read(twin)) is not None or self._intake.ended:
                     return reading
                 time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
-                self._waiting = False
-                self._look()
+                self._looked()
         except _Asked:
             pass
         finally:
             self._waiting = False
         return None
+
+    def _looked(self) -> None:
+        self._waiting = False
+        self._look()
+        self._waiting = True
+        if self.asked:
+            raise _Asked
 
     def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Return what is assimilated in the place of an observation that no state allows."""

@@ -13,14 +13,15 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.trial import CANNOT, Outcome, beside, last_words
+from twin_master.watch.trial import CANNOT, Judge, Outcome, Trial, beside, last_words
 
 SETTLE_TURNS = 10
 """Turns that an alarm must hold before its cause is looked for; they also show what it is."""
@@ -289,36 +290,22 @@ def both_patches(before: Path | None, found: Path) -> bytes:
     return (text + "\n").encode()
 
 
-class Pupil(Protocol):
-    """What the tutor teaches: a watch."""
-
-    folder: Path
-
-    def write(self, record: Mapping[str, Any]) -> None:
-        """Add a line to the journal."""
-
-    def outcome(self, file: Path, from_turn: int, compared: tuple[int, int]) -> Outcome | None:
-        """Return what comes of a patch from a turn on; None while it is worked out.
-
-        `compared` are the first turn whose evidence is compared, and how many.
-        """
-
-    def adopt(self, outcome: Outcome, notice: Mapping[str, Any]) -> None:
-        """Believe a patch."""
-
-    def end(self) -> None:
-        """End what is worked out."""
-
-
 class Tutor:
     """Asks, tries and adopts between two turns of a watch.
 
     Parameters
     ----------
-    pupil : Pupil
     teaching : Teaching
         After all lines of the journal.
     search : Search
+    judge : Judge
+    write : callable
+        Adds a line to the journal.
+    trial : callable
+        Returns the trial of a patch, by its file, the turn from which on it is believed, the first turn whose
+        evidence is compared, and how many.
+    adopt : callable
+        Believes a patch.
     step : str
         What a turn is called.
     wait : bool
@@ -329,10 +316,13 @@ class Tutor:
     """
 
     def __init__(
-        self, pupil: Pupil, teaching: Teaching, search: Search, step: str, *, wait: bool,
+        self, teaching: Teaching, search: Search, judge: Judge, write: Callable[[Mapping[str, Any]], None],
+        trial: Callable[[Path, int, tuple[int, int]], Trial],
+        adopt: Callable[[Outcome, Mapping[str, Any]], None], step: str, *, wait: bool,
         asked_to_end: Callable[[], bool],
     ) -> None:  # fmt: skip
-        self._pupil, self.teaching, self._search, self._step = pupil, teaching, search, step
+        self.teaching, self._search, self._judge, self._step = teaching, search, judge, step
+        self._write, self._trial, self._adopt = write, trial, adopt
         self._wait, self._asked_to_end = wait, asked_to_end
 
     @property
@@ -352,28 +342,29 @@ class Tutor:
             except TwinMasterError as error:
                 found = error
             if found is not None:
-                verdict = verdict_of(self._pupil.folder, question, found, teaching.turn, self._step)
-                self._pupil.write({"verdict": verdict})
+                watch, turn = self._search.watch, teaching.turn
+                self._write({"verdict": verdict_of(watch, question, found, turn, self._step)})
         trial = teaching.trial
         if trial is None or teaching.turn < trial["turn"] + TRIAL_TURNS:
             return False
-        file = self._pupil.folder / trial["folder"] / "patch.json"
+        file = self._search.watch / trial["folder"] / "patch.json"
         try:
-            outcome = self._pupil.outcome(file, trial["from_turn"], (trial["turn"] + 1, TRIAL_TURNS))
+            compared = trial["turn"] + 1, TRIAL_TURNS
+            outcome = self._judge.outcome(partial(self._trial, file, trial["from_turn"], compared))
         except CANNOT as error:
             sentence = f"The patch cannot be believed by this twin: {error}"
-            self._pupil.write({"verdict": {**trial, "tried": False, "notice": notice_of("trial", sentence)}})
+            self._write({"verdict": {**trial, "tried": False, "notice": notice_of("trial", sentence)}})
             return False
         if outcome is None:
             return False
         notice = notice_of("trial", trial_sentence(trial, outcome, self._step))
         if outcome.gained >= LEAST_GAIN:
-            self._pupil.adopt(outcome, notice)
+            self._adopt(outcome, notice)
             return True
-        self._pupil.write({"verdict": {**trial, "tried": False, "notice": notice}})
+        self._write({"verdict": {**trial, "tried": False, "notice": notice}})
         return False
 
     def end(self) -> None:
         """End what is under way."""
         self._search.end()
-        self._pupil.end()
+        self._judge.end()

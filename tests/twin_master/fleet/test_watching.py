@@ -278,21 +278,29 @@ def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
             sent.append(1)
             for turn in range(TURNS):
                 record = {"turn": turn, "control": "2g", "strain": [1e-3] * 24}
-                publisher.publish("wings/wing-0", json.dumps(record), qos=1)
-        inbox = fleet._sources[0]._inboxes.get("wings/wing-0")  # type: ignore[union-attr]
-        if inbox is not None and len(inbox.came) == TURNS - 3:  # all that came while it was lost
-            fleet._again["north/wing-0"] = 0.0
+                for name in ("late", "wing-0"):
+                    publisher.publish(f"wings/{name}", json.dumps(record), qos=1)
+        boxes = fleet._sources[0]._inboxes  # type: ignore[union-attr]
+        if [len(box.came) for box in boxes.values()] == [TURNS, TURNS - 3]:  # all that came meanwhile
+            (north / "late").unlink(missing_ok=True)
+            (north / "wing-0" / "published").write_text("")
+            fleet._again = dict.fromkeys(fleet._again, 0.0)
 
     def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
         told.append(decision["turn"])
-        fleet.asked = decision["turn"] == TURNS - 1
+        fleet.asked = len(told) == 2 * TURNS
 
     fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
+    north = tmp_path / "out" / "north"
+    north.mkdir()
+    (north / "late").write_text("no folder")  # an asset whose first taking up fails
     fleet.run(send)
     broker.stop()
-    assert told == [0, 1, 2, 2, 3, 4, 5]
-    assert notes[1:3] == [
+    assert sorted(told) == sorted([*range(TURNS)] * 2)
+    assert notes[1].startswith("north/late is not watched: ")
+    assert notes[2:5] == [
         "north/wing-0 is not watched: ZeroDivisionError: division by zero",
+        "north/late is watched again.",
         "north/wing-0 is watched again.",
     ]
     assert fleet.assets["north/wing-0"].keep.intake.counts.missing == 0
@@ -337,7 +345,7 @@ def test_an_asset_that_falls_silent_while_another_is_heard(
 ) -> None:
     """Also one that was watched before; and what was decided of it and never published is."""
     monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
-    monkeypatch.setattr("twin_master.fleet.watching.STATE_SECONDS", 0.0)
+    monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.0)
     with (tmp_path / "wing.toml").open("a") as file:
         file.write("\n[watch]\nquiet_after_seconds = 0.5\n")
@@ -359,8 +367,9 @@ def test_an_asset_that_falls_silent_while_another_is_heard(
     fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
     fleet.run(lambda: send() if notes else None)
     assert fleet.asked
+    assert fleet.failures == {}
     published = tmp_path / "out" / "north" / "two" / "published"
-    published.write_text("0")  # as if a kill had come before the broker had it
+    published.write_text("?")  # as if a kill had come before the broker had it
     client.publish("wings/one", "no observation", qos=1).wait_for_publish(20)
     again = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", lambda *_: None, notes.append)
 

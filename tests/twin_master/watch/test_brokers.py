@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,10 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import Flight
 from twin_master.scenario.reading import LoadedScenario
+from twin_master.watch.broker import PASSWORD_VARIABLE, Broker, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
-from twin_master.watch.mqtt import PASSWORD_VARIABLE, Broker, MqttFeed, broker_of
+from twin_master.watch.mqtt import MqttFeed
 from twin_master.watch.snapshot import flown
 from uav_twin.cli import app
 
@@ -44,6 +46,7 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")
     with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
         watch.run(MqttFeed(where, watch, str), lambda _decision: None)
+    assert not [*watch.folder.glob("*.mqtt")]  # a client that never was in is no client that was forgotten
     monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
     notes: list[str] = []
     feed = MqttFeed(where, watch, notes.append)
@@ -169,8 +172,9 @@ def message(turn: int) -> str:
 
 @needs_mosquitto
 def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
-    scenario: LoadedScenario, base: Watch, broker: Mosquitto, tmp_path: Path
-) -> None:
+    scenario: LoadedScenario, base: Watch, broker: Mosquitto, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     publisher, notes = broker.client("publisher"), list[str]()
 
     def publish(*turns: int) -> None:
@@ -190,6 +194,16 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     watch = begun(base, tmp_path / "watch")
     assert watched(watch, 3, 0, 1, 2).received == 3
     assert watched(watch, 4, 3) == Counts(received=4)  # the third does not come again
+    heard: list[dict[str, Any]] = []
+    publisher.on_message = lambda _client, _data, one: heard.append(json.loads(one.payload))
+    publisher.subscribe([("wing/7/decision", 1), ("wing/7/heartbeat", 1)])
+    (watch.folder / "published").write_text("0" * 20)
+    watched(watch, 4)  # nothing more is wanted, and what was not published is
+    wait_until(lambda: {one["turn"] for one in heard if "control" in one} == {0, 1, 2, 3})
+    feed = MqttFeed(where_of(broker), watch, lambda _note: publish(4))
+    with pytest.raises(ZeroDivisionError), closing(feed):
+        watch.run(feed, lambda decision: decision["turn"] // 0)
+    wait_until(lambda: heard[-1].get("state") == "lost")
     names = [path.read_text() for path in watch.folder.glob("*.mqtt")]
     other = begun(base, tmp_path / "other")
     watched(other, 1, 0)
@@ -209,8 +223,11 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     beginning = threading.Thread(target=begin)
     beginning.start()
     words = ["watch", str(scenario.path), "--observations", f"mqtt://wing@127.0.0.1:{broker.port}/wing/7"]
-    words += ["--out", str(watch.folder), "--replace", "--turns", "1", "--no-report"]
-    result = CliRunner().invoke(app, words)
+    words += ["--out", str(watch.folder), "--turns", "1", "--no-report"]
+    monkeypatch.setenv(PASSWORD_VARIABLE, "another")  # the first attempt fails, and the wish is kept
+    assert "refuses the twin" in str(CliRunner().invoke(app, [*words, "--replace"]).exception)
+    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
+    result = CliRunner().invoke(app, [*words, "--resume"])
     beginning.join()
     assert [json.loads(line)["turn"] for line in result.stdout.splitlines()] == [0]
     assert "1 messages." in result.stderr

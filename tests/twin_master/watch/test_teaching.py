@@ -25,6 +25,7 @@ from twin_master.mission.loop import Flight
 from twin_master.network.inference import known_control
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
+from twin_master.watch.replay import replay
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
 from twin_master.watch.trial import Judge, Outcome, patched_model, policy_change
 from uav_twin.cli import app
@@ -187,7 +188,8 @@ def test_live_turns_do_not_wait_for_the_patched_model(
         found = twin.turn(row, int(mission.control_index[number]))
     assert lines(watch)[-1]["filtered"] == found.filtered.tolist()
     again = watchful(watch, tmp_path / "again")
-    assert again._replayed(None).twin.save_state() == watch._replayed(None).twin.save_state()
+    twins = [replay(one._path, one.models, one.scenario.watch.lag).twin for one in (again, watch)]
+    assert twins[0].save_state() == twins[1].save_state()
 
 
 def test_a_policy_that_changes_is_told(base: Watch) -> None:

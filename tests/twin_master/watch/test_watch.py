@@ -31,7 +31,7 @@ from twin_master.network.estimator import ExactFilter
 from twin_master.report.reading import open_run as stored_run
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.viewer.flight import Flight as SeenFlight
-from twin_master.watch.decision import journalled_decision, last_decision
+from twin_master.watch.decision import journalled_decision
 from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, file_feed
 from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.intake import Feed
@@ -264,7 +264,7 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(
         watch.run(feed, lambda _decision: None, turns=turns)
         with monkeypatch.context() as patched:
             patched.setattr("twin_master.mission.journal.whole_record", counting(read, whole_record))
-            last_decision(journal, watch.scenario, watch.models[0].knowledge.model)
+            watch.last_decision()
             watch.run(feed, lambda _decision: None, turns=turns)
         counts.append(len(read))
         read.clear()
@@ -297,21 +297,22 @@ def counting(seen: list[int], inner: Callable[..., object]) -> Callable[..., obj
 
 def test_the_last_decision_is_read_from_the_journal(base: Watch, whole: Path, tmp_path: Path) -> None:
     decisions = json.loads((whole / "decisions.json").read_text())
-    model, journal = base.models[0].knowledge.model, tmp_path / JOURNAL_NAME
+    watch, journal = begun(base, tmp_path / "watch"), tmp_path / "watch" / JOURNAL_NAME
     lines = (whole / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
     again = {"told_again": True}
     for cut in (lines, [*lines, lines[-1][:90]], [*lines, line_of({"turn": 49, "model": {}})]):
         journal.write_bytes(b"".join(cut))
-        assert last_decision(journal, base.scenario, model) == decisions[-1] | again
+        assert watch.last_decision() == decisions[-1] | again
     # What came late is told with the control of the last turn, not with that of its own.
     late = json.loads(lines[-1][65:]) | {"observation_turn": 40, "control_index": 0, "observed": [None] * 24}
     journal.write_bytes(b"".join([*lines, line_of(late | {"control_in_force": 1})]))
-    told = last_decision(journal, base.scenario, model)
+    told = watch.last_decision()
     changed = {"control": "3g", "lost_sensors": 24, "revised_by_turn": 40}
     assert told == decisions[-1] | changed | again
     journal.write_bytes(lines[0])
-    assert last_decision(journal, base.scenario, model) is None
-    assert last_decision(tmp_path / "none", base.scenario, model) is None
+    assert watch.last_decision() is None
+    journal.unlink()
+    assert watch.last_decision() is None
 
 
 def test_a_line_of_the_journal_says_what_was_told(base: Watch, mission: Flight, tmp_path: Path) -> None:
@@ -367,7 +368,8 @@ def test_silence_is_told_and_journalled(base: Watch, mission: Flight, tmp_path: 
     while flight.update():
         pass
     seen = [[notice.kind for notice in turn.notices] for turn in flight.seen(0, 4)]
-    assert seen == [["heard", "quiet"], ["heard", "quiet"], ["heard"], []]
+    assert seen == [["heard", "quiet", "quiet"], ["heard", "quiet"], ["heard"], []]
+    assert [turn for turn, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
 
 
 def test_a_reader_that_leaves_ends_the_watch_in_order(
