@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import socket
 import subprocess
 import sys
@@ -313,10 +314,24 @@ def test_what_is_not_confined_is_said_once(
     assert caplog.messages[0].startswith("This kernel has no Landlock (Linux 5.13 or later)")
 
 
+def sampled(fmu: Path, folder: Path) -> tuple[Path, SamplingGrid]:
+    """Return the file of a binding, and a grid of two points."""
+    file = folder / "hostile.toml"
+    file.write_text(
+        '[binding]\nname = "hostile"\nstep_size = 1.0\n[control.u]\nvariable = "u"\nunit = "m/s"\n'
+        '[health.damage]\nvariable = "d"\nunit = "1"\n'
+        '[observation.y]\nvariables = "y"\nunit = "m"\n'
+    )
+    return file, SamplingGrid(
+        fmu=str(fmu), binding=str(file), role="y", parameter="", draws=(0.0,), settling_steps=5,
+        states={"damage": (0.0, 0.1)}, controls={"go": {"u": 1.0}},
+    )  # fmt: skip
+
+
 def test_components_and_samplers_are_confined_too(
     foreign_fmu: Any, key: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A system of FMUs, and a library, whose FMU flies in the process that samples it."""
+    """A system of FMUs, and a library."""
     monkeypatch.setenv("HOSTILE_TARGET", str(key))
     fmu = foreign_fmu("hostile2", "ATTEMPT=unlink(TARGET)")
     structure = SystemStructure(name="one", components=(Component("thief", fmu),))
@@ -330,16 +345,7 @@ def test_components_and_samplers_are_confined_too(
         system.step(), system.step()
         with pytest.raises(FmuCallError, match=rf"it cannot have {key}: Permission denied"):
             system.step()
-    file = tmp_path / "hostile.toml"
-    file.write_text(
-        '[binding]\nname = "hostile"\nstep_size = 1.0\n[control.u]\nvariable = "u"\nunit = "m/s"\n'
-        '[health.damage]\nvariable = "d"\nunit = "1"\n'
-        '[observation.y]\nvariables = "y"\nunit = "m"\n'
-    )
-    grid = SamplingGrid(
-        fmu=str(fmu), binding=str(file), role="y", parameter="", draws=(0.0,), settling_steps=5,
-        states={"damage": (0.0, 0.1)}, controls={"go": {"u": 1.0}},
-    )  # fmt: skip
+    file, grid = sampled(fmu, tmp_path)
     with pytest.raises(FmuCallError, match=rf"it cannot have {key}: Permission denied"):
         sample_library(grid, tmp_path / "library.nc", workers=1)
     assert key.exists()
@@ -347,6 +353,28 @@ def test_components_and_samplers_are_confined_too(
     with pytest.raises(InvalidObservationLibraryError):  # an integrator does not settle
         sample_library(grid, tmp_path / "library.nc", workers=1, replace_existing=True)
     assert not key.exists()
+
+
+class Order:
+    """What is carried out by whoever unpickles it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self._path),)
+
+
+def test_what_a_sampled_fmu_writes_to_its_descriptors_is_not_carried_out(
+    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The processes of a sampling send each other pickles, and the FMU is in none of them."""
+    made = tmp_path / "made"
+    monkeypatch.setenv("HOSTILE_TARGET", pickle.dumps(Order(made), protocol=0).decode())
+    fmu = foreign_fmu("hostile2", "ATTEMPT=write_message(TARGET)")
+    with pytest.raises(FmuWorkerError, match="closed its pipe, or wrote something else into it"):
+        sample_library(sampled(fmu, tmp_path)[1], tmp_path / "library.nc", workers=1)
+    assert not made.exists()
 
 
 @pytest.mark.parametrize("version", range(1, 7))
