@@ -368,7 +368,7 @@ def test_an_answer_to_another_request_is_not_taken(foreign_fmu: Any, described: 
             asset.step()
 
 
-@pytest.mark.parametrize("what", ["HANG", "START_PROCESS"])
+@pytest.mark.parametrize("what", ["HANG", "START_PROCESS", "ATTEMPT=(hold_pipes(),hang(),0)"])
 def test_nothing_is_left_when_the_twin_is_killed_during_a_step(
     foreign_fmu: Any, scratch: Path, what: str
 ) -> None:

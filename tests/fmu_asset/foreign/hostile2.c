@@ -9,9 +9,16 @@
 #include <signal.h>
 #include <spawn.h>
 #include <stdio.h>
+#include <sched.h>
+#include <sys/inotify.h>
+#include <sys/msg.h>
 #include <sys/prctl.h>
+#include <sys/resource.h>
+#include <sys/sem.h>
+#include <sys/shm.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
+#include <sys/syscall.h>
 #include <sys/un.h>
 #include <sys/wait.h>
 #include <unistd.h>
@@ -44,6 +51,17 @@ static int write_message(const char *text) { /* as Python's multiprocessing.conn
     struct { unsigned length; char text[512]; } message = {htonl(strlen(text))};
     strcpy(message.text, text);
     return write_everywhere(&message, 4 + strlen(text));
+}
+static int send_by_pair(const char *path) {
+    struct sockaddr_un there = {AF_UNIX};
+    int pair[2];
+    strcpy(there.sun_path, path);
+    if (socketpair(AF_UNIX, SOCK_DGRAM, 0, pair) < 0) return -1;
+    return sendto(pair[0], "key", 3, 0, (struct sockaddr *)&there, sizeof there);
+}
+static void hold_pipes(void) { /* open for oneself what the twin has open */
+    char name[40];
+    for (int k = 3; k < 64; k++) if (sprintf(name, "/proc/self/fd/%d", k)) open(name, O_RDWR | O_NONBLOCK);
 }
 static int call(int kind, int protocol, const char *port) {
     struct sockaddr_in there = {AF_INET, htons(atoi(port)), {htonl(INADDR_LOOPBACK)}};

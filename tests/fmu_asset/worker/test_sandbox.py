@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import pickle
+import resource
 import socket
 import subprocess
 import sys
@@ -87,6 +89,47 @@ class Targets:
     def service(self) -> tuple[str, Attempted]:
         return self._listening(socket.AF_UNIX, socket.SOCK_STREAM, str(self._folder / "service"))
 
+    def mailbox(self) -> tuple[str, Attempted]:
+        return self._listening(socket.AF_UNIX, socket.SOCK_DGRAM, str(self._folder / "mailbox"))
+
+    def watch(self) -> tuple[str, Attempted]:
+        return str(self._folder), lambda: True
+
+    def share(self) -> tuple[str, Attempted]:
+        return self._shared("shm", 4096)
+
+    def semaphore(self) -> tuple[str, Attempted]:
+        return self._shared("sem", 1)
+
+    def message(self) -> tuple[str, Attempted]:
+        return self._shared("msg")
+
+    def _shared(self, kind: str, *size: int) -> tuple[str, Attempted]:
+        libc = ctypes.CDLL(None)
+        number = getattr(libc, f"{kind}get")(0, *size, 0o600)
+        remove = getattr(libc, f"{kind}ctl")
+        remove_now = (0, 0) if kind == "sem" else (0,)  # IPC_RMID, of a semaphore after its number
+        self._cleaner.callback(remove, number, *remove_now, None)
+        return str(number), lambda: True
+
+    def queue(self) -> tuple[str, Attempted]:
+        name = f"uav-twin-{os.getpid()}"
+        return name, lambda: ctypes.CDLL(None).mq_unlink(f"/{name}".encode()) == 0
+
+    def disturb(self) -> tuple[str, Attempted]:
+        return self.kill()[0], lambda: True
+
+    def hamper(self) -> tuple[str, Attempted]:
+        number = int(self.kill()[0])
+
+        def measured() -> tuple[object, ...]:
+            limits = resource.prlimit(number, resource.RLIMIT_NOFILE)
+            way = os.sched_getscheduler(number), os.sched_getaffinity(number)
+            return limits, os.getpriority(os.PRIO_PROCESS, number), way
+
+        before = measured()
+        return str(number), lambda: measured() != before
+
     def kill(self) -> tuple[str, Attempted]:
         process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
         self._cleaner.callback(process.communicate)
@@ -138,8 +181,28 @@ ATTEMPTS = [
     ("call", "call(SOCK_STREAM,262,TARGET)", "Permission denied"),  # multipath TCP
     ("datagram", "call(SOCK_DGRAM,0,TARGET)", "Permission denied"),
     ("service", "call_service(TARGET)", "Permission denied"),
+    ("mailbox", "send_by_pair(TARGET)", "Permission denied"),
+    ("watch", "inotify_add_watch(inotify_init(),TARGET,IN_OPEN)", "Permission denied"),
+    ("share", "shmat(atoi(TARGET),NULL,0)==(void*)-1?-1:0", "Permission denied"),
+    ("hamper", "prlimit(atoi(TARGET),RLIMIT_NOFILE,&(struct rlimit){9,9},NULL)", "Permission denied"),
+    ("hamper", "setpriority(PRIO_PROCESS,atoi(TARGET),9)", "Permission denied"),
+    ("hamper", "sched_setaffinity(atoi(TARGET),8,&(long){1})", "Permission denied"),
+    ("hamper", "sched_setscheduler(atoi(TARGET),SCHED_BATCH,&(struct sched_param){0})", "Permission denied"),
+    (
+        "hamper",
+        "syscall(SYS_sched_setattr,atoi(TARGET),&(unsigned[12]){48,SCHED_BATCH},0)",
+        "Permission denied",
+    ),
+    ("disturb", "sched_setparam(atoi(TARGET),&(struct sched_param){0})", "Permission denied"),
+    ("disturb", "syscall(SYS_ioprio_set,1,atoi(TARGET),16391)", "Permission denied"),
+    ("semaphore", "semctl(atoi(TARGET),0,SETVAL,1)", "Permission denied"),
+    ("message", "msgsnd(atoi(TARGET),(long[]){1,2},8,IPC_NOWAIT)", "Permission denied"),
+    ("queue", "syscall(SYS_mq_open,TARGET,O_RDWR|O_CREAT,0600,NULL)", "Permission denied"),
     ("kill", "kill(atoi(TARGET),SIGKILL)", "Operation not permitted"),
 ]
+
+
+WITHOUT_TRACE = ("read", "spy", "watch", "share", "semaphore", "message", "disturb")
 
 
 @pytest.mark.parametrize(("what", "attempt", "reason"), ATTEMPTS, ids=[case[1] for case in ATTEMPTS])
@@ -155,7 +218,7 @@ def test_what_is_not_its_own_is_out_of_reach(
         with pytest.raises(FmuCallError, match=rf"(?s)step 2 .*it cannot have {target}: {reason}") as caught:
             asset.step()
     assert ("granted by `read`, `write`, `ports`" in str(caught.value)) == (reason == "Permission denied")
-    assert what in ("read", "spy") or not happened()
+    assert what in WITHOUT_TRACE or not happened()
     with FmiAsset(fmu, binding(sandbox=False)) as asset:
         for _ in range(3):
             asset.step()
