@@ -94,6 +94,7 @@ IN_THE_THIRD_STEP = [
     ("EXIT", FmuWorkerError, r"exit status 3: the FMU's code ended its own process"),
     ("HANG", FmuTimeoutError, r"longer than 0\.5 s for the step.*more `step_time` in .*otherwise it hangs"),
     ("IGNORE_SIGNALS", FmuTimeoutError, r"longer than 0\.5 s for the step"),
+    ("HALF_AN_ANSWER", FmuTimeoutError, r"longer than 0\.5 s for the step"),
     ("LEAK_IN_STEP", FmuMemoryError, r"MiB of memory during the step, more than the limit of 400 MiB.*leaks"),
     ("FILL_DISK", FmuWorkerError, r"SIGXFSZ\): the FMU wrote more than 2 GiB to one file"),
     ("NOT_A_NUMBER", FmuOutputError, r"values that are not finite at t = 3 s: y\."),

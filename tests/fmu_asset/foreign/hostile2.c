@@ -223,6 +223,9 @@ int model_step(Model *m, double time, double size) {
     for (int k = 3; k < 64; k++) close(k);
 #elif defined WRITE_INTO_PIPES
     for (int k = 3; k < 64; k++) if (write(k, "rubbish rubbish rubbish", 23) < 0) continue;
+#elif defined HALF_AN_ANSWER
+    write_everywhere("\1\0\0\0\0\0\0\0", 8);
+    hang();
 #elif defined START_PROCESS
     if (m->stepped == 2 && fork() == 0) for (;;) pause();
 #elif defined FORK_AND_RETURN
