@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import json
+import os
 import select
 import time
 from collections.abc import Callable, Mapping
@@ -26,7 +27,6 @@ from .protocol import (
     RESULT,
     Operation,
     look,
-    receive,
     send,
     separated,
 )
@@ -109,12 +109,14 @@ class WorkerInstance:
         self._busy = False
         self._process = WorkerProcess(scratch, plan.folder, limits.sandbox)
         self._out, self._in = self._process.outgoing, self._process.incoming
+        # The worker may leave it at half an answer.
+        os.set_blocking(self._in, False)
         self._next_glance = 0.0
         self._first_wait = 1000.0 * min(limits.step_time, _GLANCE)
         self._poll = select.poll()
         self._poll.register(self._in, select.POLLIN | select.POLLHUP)
         try:
-            self._call(Operation.OPEN, plan.to_json().encode(), _OPENING, limits.load_time)
+            self._call(Operation.OPEN, plan.to_json().encode(), _OPENING)
         except BaseException:
             self.close()
             raise
@@ -128,7 +130,7 @@ class WorkerInstance:
             "parameters": parameters,
             "inputs": bytes(self._request[16:]).hex() if with_inputs else "",
         }
-        self._call(Operation.INITIALISE, json.dumps(setting).encode(), _INITIALISING, self._limits.load_time)
+        self._call(Operation.INITIALISE, json.dumps(setting).encode(), _INITIALISING)
 
     def step(self) -> None:
         """Make the step that the request block describes."""
@@ -139,7 +141,7 @@ class WorkerInstance:
         except BrokenPipeError:
             raise self._died(what) from None
         look(self._poll)
-        kind, length = self._await(what, self._limits.step_time)
+        kind, length = self._await(what, len(self._reply))
         if kind == RESULT and length == len(self._reply):
             self._fill(self._reply, what)
             self._busy = False
@@ -162,7 +164,7 @@ class WorkerInstance:
             raise self._died(what) from None
         kind = PART
         while kind == PART:
-            kind, length = self._await(what, self._limits.step_time, part=True)
+            kind, length = self._await(what, len(series.replies), part=True)
             if kind == FAILURE:
                 self._fail(length, what)
             steps, rest = divmod(length, series.reply_size)
@@ -179,20 +181,24 @@ class WorkerInstance:
 
     def read(self) -> None:
         """Read the outputs of this moment."""
-        content = self._call(Operation.READ, b"", "reading the outputs", self._limits.step_time)
+        what = "reading the outputs"
+        content = self._call(Operation.READ, b"", what, len(self._reply))
+        if len(content) != len(self._reply):
+            raise self._died(what)
         self._reply[:] = content
 
     def save(self) -> bytes:
         """Return the serialised FMU state."""
-        return self._call(Operation.SAVE, b"", "saving the state", self._limits.step_time)
+        largest = int(self._limits.memory * _MEBIBYTE)
+        return self._call(Operation.SAVE, b"", "saving the state", largest)
 
     def restore(self, content: bytes) -> None:
         """Restore a serialised FMU state."""
-        self._call(Operation.RESTORE, content, "restoring the state", self._limits.step_time)
+        self._call(Operation.RESTORE, content, "restoring the state")
 
     def reset(self) -> None:
         """Bring the instance back to the moment after its instantiation."""
-        self._call(Operation.RESET, b"", _RESETTING, self._limits.load_time)
+        self._call(Operation.RESET, b"", _RESETTING)
 
     def take_log(self) -> list[tuple[int, str]]:
         """Return and forget the messages that the FMU has logged: status and text."""
@@ -200,7 +206,7 @@ class WorkerInstance:
             return []
         self._logged = False
         what = "reading the log"
-        content = self._call(Operation.LOG, b"", what, self._limits.step_time)
+        content = self._call(Operation.LOG, b"", what)
         texts = separated(content) if content else []
         try:
             return [(int(status), text) for status, _, text in (entry.partition(" ") for entry in texts)]
@@ -209,7 +215,7 @@ class WorkerInstance:
 
     def renew(self) -> None:
         """Free the instance and make a new one in the same process."""
-        self._call(Operation.RENEW, b"", _RENEWING, self._limits.load_time)
+        self._call(Operation.RENEW, b"", _RENEWING)
 
     @property
     def has_log(self) -> bool:
@@ -245,7 +251,7 @@ class WorkerInstance:
         self._process.end(CLOSE_LIMIT if kindly else 0.0)
         remove_folder(self._folder)
 
-    def _call(self, operation: Operation, content: bytes, what: str, limit: float) -> bytes:
+    def _call(self, operation: Operation, content: bytes, what: str, largest: int = LARGEST_MESSAGE) -> bytes:
         self._begin()
         try:
             send(self._out, HEADER.pack(operation, 0, self._number, len(content)), content)
@@ -253,7 +259,7 @@ class WorkerInstance:
             raise self._died(what) from None
         if operation in QUICK:
             look(self._poll)
-        kind, length = self._await(what, limit)
+        kind, length = self._await(what, largest)
         if kind == FAILURE:
             self._fail(length, what)
         answer = bytearray(length)
@@ -268,20 +274,23 @@ class WorkerInstance:
         self._busy = True
         self._number = (self._number + 1) % 2**32
 
-    def _await(self, what: str, limit: float, *, part: bool = False) -> tuple[int, int]:
+    def _await(self, what: str, largest: int, *, part: bool = False) -> tuple[int, int]:
         # The first wait covers the usual step; a longer one is a chance to look at the worker's memory.
         if not self._poll.poll(self._first_wait):
-            self._await_long(what, limit, REPORT_PERIOD if part else 0.0)
+            slack = REPORT_PERIOD * part - self._first_wait / 1000.0
+            self._await_long(what, time.monotonic() + self._limit(what) + slack)
         self._fill(self._header_view, what)
         kind, logged, number, length = HEADER.unpack(self._header)
         known = kind in (RESULT, FAILURE, PART if part else RESULT) and number == self._number
-        if not known or length > LARGEST_MESSAGE:
+        if not known or length > (LARGEST_MESSAGE if kind == FAILURE else largest):
             raise self._died(what)
         self._logged = self._logged or logged != 0
         return kind, length
 
-    def _await_long(self, what: str, limit: float, slack: float) -> None:
-        deadline = time.monotonic() + limit + slack - self._first_wait / 1000.0
+    def _limit(self, what: str) -> float:
+        return self._limits.load_time if what in _LOADING else self._limits.step_time
+
+    def _await_long(self, what: str, deadline: float) -> None:
         while True:
             self._check_memory(what)
             left = deadline - time.monotonic()
@@ -293,8 +302,9 @@ class WorkerInstance:
         self._process.kill()
         name = "load_time" if what in _LOADING else "step_time"
         raise FmuTimeoutError(
-            f"The FMU took longer than {limit:g} s for {what}; its worker was stopped. If it is only slow, "
-            f"give it more `{name}` in the table [limits] of its binding; otherwise it hangs."
+            f"The FMU took longer than {self._limit(what):g} s for {what}; its worker was stopped. "
+            f"If it is only slow, give it more `{name}` in the table [limits] of its binding; "
+            "otherwise it hangs."
         )
 
     def _check_memory(self, what: str) -> None:
@@ -310,8 +320,17 @@ class WorkerInstance:
             )
 
     def _fill(self, target: memoryview, what: str) -> None:
-        if not receive(self._in, target):
-            raise self._died(what)
+        filled, deadline = 0, 0.0
+        while filled < len(target):
+            try:
+                count = os.readv(self._in, [target[filled:]])
+            except BlockingIOError:
+                deadline = deadline or time.monotonic() + self._limit(what)
+                self._await_long(what, deadline)
+                continue
+            if count == 0:
+                raise self._died(what)
+            filled += count
 
     def _fail(self, length: int, what: str) -> None:
         content = bytearray(length)

@@ -39,6 +39,9 @@ def keep(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -
     import resource
 
     twin, keeper = os.getppid(), os.getpid()
+    gone = os.pidfd_open(twin)  # the pipe's end does not tell: an FMU can open its other side for itself
+    if os.getppid() != twin:
+        os._exit(0)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     prctl = ctypes.CDLL(None).prctl
     prctl(_CHILD_SUBREAPER, 1, 0, 0, 0)
@@ -62,6 +65,7 @@ def keep(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
         os.close(woken)
         os.close(waker)
+        os.close(gone)
         os.setpgid(0, 0)
         prctl(_DEATH_SIGNAL, int(signal.SIGKILL), 0, 0, 0)
         if os.getppid() != keeper:
@@ -71,9 +75,9 @@ def keep(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     os.write(outgoing, WORKER_NUMBER.pack(worker))
     os.close(outgoing)
-    deserted, status = _await_end(worker, incoming, woken)
+    deserted, status = _await_end(worker, incoming, gone, woken)
     _end_descendants()
-    if deserted and not asked and status != 0 and _orphaned(twin):
+    if deserted and not asked and status != 0 and _ended(gone):
         remove_folder(scratch)
         remove_folder(shared)
     if os.WIFSIGNALED(status):
@@ -102,11 +106,12 @@ def _work(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) 
     os._exit(OWN_FAILURE)
 
 
-def _await_end(worker: int, incoming: int, woken: int) -> tuple[bool, int]:
-    """Return whether the twin let go of its pipe, and the worker's exit status."""
+def _await_end(worker: int, incoming: int, gone: int, woken: int) -> tuple[bool, int]:
+    """Return whether the twin let go of its pipe or is gone, and the worker's exit status."""
     poll = select.poll()
     poll.register(woken, select.POLLIN)
     poll.register(incoming, 0)  # the end of a pipe is reported in any case
+    poll.register(gone, select.POLLIN)
     deadline: float | None = None
     while True:
         status = _reaped(worker)
@@ -116,10 +121,10 @@ def _await_end(worker: int, incoming: int, woken: int) -> tuple[bool, int]:
         events = [descriptor for descriptor, _ in poll.poll(limit)]
         if woken in events:
             os.read(woken, 4096)
-        if incoming in events:
-            poll.unregister(incoming)
+        for descriptor in {incoming, gone}.intersection(events):
+            poll.unregister(descriptor)
             deadline = time.monotonic() + _GRACE
-        elif deadline is not None and time.monotonic() >= deadline:
+        if deadline is not None and time.monotonic() >= deadline:
             os.kill(worker, signal.SIGKILL)
             deadline = time.monotonic() + _GRACE
 
@@ -169,10 +174,8 @@ def _children() -> list[tuple[int, int]]:
     return found
 
 
-def _orphaned(twin: int) -> bool:
+def _ended(process: int) -> bool:
     """Return whether the twin is dead; its pipes are closed a moment before it is."""
-    for _ in range(100):
-        if os.getppid() != twin:
-            return True
-        time.sleep(0.01)
-    return False
+    poll = select.poll()
+    poll.register(process, select.POLLIN)
+    return bool(poll.poll(1000))

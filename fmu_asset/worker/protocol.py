@@ -18,8 +18,8 @@ from enum import IntEnum
 HEADER = struct.Struct("<HHIQ")
 WORKER_NUMBER = struct.Struct("<q")
 """First of all, the process number of the worker."""
-LARGEST_MESSAGE = 2**34
-"""Bytes; a header that announces more does not come from the other side's program."""
+LARGEST_MESSAGE = 2**23
+"""Bytes of an answer in words; a header that announces more does not come from the other side's program."""
 
 
 class Operation(IntEnum):

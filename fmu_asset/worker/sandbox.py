@@ -146,31 +146,46 @@ def _allow(rules: int, paths: Iterable[str], access: int) -> None:
 
 # ---------------------------------------------------------------------- system calls
 
-_LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06  # of the packet filter, <linux/bpf_common.h>
-_NUMBER, _PROCESSOR, _FIRST_ARGUMENT, _THIRD_ARGUMENT = 0, 4, 16, 32  # of `seccomp_data`, in bytes
+_LOAD, _AND, _EQUAL, _AT_LEAST, _RETURN = (
+    0x20,
+    0x54,
+    0x15,
+    0x35,
+    0x06,
+)  # of the packet filter, <linux/bpf_common.h>
+_NUMBER, _PROCESSOR, _FIRST_ARGUMENT = 0, 4, 16  # of `seccomp_data`, in bytes; each argument has eight
 _GRANTED, _ERROR = 0x7FFF0000, 0x50000
 _OTHER_NUMBERS = 0x40000000  # of the same calls, for another size of pointers
 _INTERNET, _PLAIN_PROTOCOLS = (2, 10), (0, 6, 17)  # IPv4 and IPv6; TCP, and UDP for the names of hosts
+_LOCAL, _STREAM, _KIND, _WHOLE = (1,), (1,), 0xF, 0xFFFFFFFF  # the kind of a socket, without its flags
 
-# By processor: its number, those of socket() and truncate(), calls that are refused (io_uring, by which
-# sockets could be made all the same, and the user's keys), and calls that return OK and do nothing: the
-# rights, owners, times and attributes of files, whoever's they are; who copies a file changes them in vain.
-_CALLS: dict[str, tuple[int, int, int, tuple[int, ...], tuple[int, ...]]] = {
+# By processor: its number, those of socket(), socketpair(), setpriority() and ioprio_set(), of truncate(), of
+# calls whose first argument is the process that they change, and calls that are refused (memory, semaphores
+# and messages that the user's processes share, notices of what is done to files, io_uring, by which sockets
+# could be made all the same, and the user's keys), and calls that return OK and do nothing: the rights,
+# owners, times and attributes of files, whoever's they are; who copies a file changes them in vain.
+_Numbers = tuple[int, ...]
+_CALLS: dict[str, tuple[int, tuple[int, int, int, int], int, _Numbers, _Numbers, _Numbers]] = {
     "x86_64": (
-        0xC000003E, 41, 76, (248, 249, 250, 425),
-        (90, 91, 92, 93, 94, 132, 188, 189, 190, 197, 198, 199, 235, 260, 261, 268, 280, 452, 463, 466),
+        0xC000003E, (41, 53, 141, 251), 76, (142, 144, 203, 302, 314),
+        (29, 30, 31, *range(64, 72), 220, 240, 241, 248, 249, 250, 254, 425),
+        (90, 91, 92, 93, 94, 132, 188, 189, 190, 197, 198, 199, 235, 260, 261, 268, 280, 452, 463, 466, 469),
     ),
     "aarch64": (
-        0xC00000B7, 198, 45, (217, 218, 219, 425), (5, 6, 7, 14, 15, 16, 52, 53, 54, 55, 88, 452, 463, 466),
+        0xC00000B7, (198, 199, 140, 30), 45, (118, 119, 122, 261, 274),
+        (27, 180, 181, *range(186, 198), 217, 218, 219, 425),
+        (5, 6, 7, 14, 15, 16, 52, 53, 54, 55, 88, 452, 463, 466, 469),
     ),
 }  # fmt: skip
 
 
 def _filter_calls(*, tcp: bool) -> None:
-    """Refuse sockets, but for those of the internet where a port is granted, which Landlock then watches."""
+    """Refuse what else reaches other processes; sockets of the internet only where a port is granted."""
     if os.uname().machine not in _CALLS or sys.maxsize < 2**32:
         return
-    processor, socket, truncate, refused, idle = _CALLS[os.uname().machine]
+    processor, (socket, pair, priority, io_priority), truncate, of_process, refused, idle = _CALLS[
+        os.uname().machine
+    ]
     if landlock_version() < 3:  # which does not know that this empties a file
         refused += (truncate,)
     granted, denied, done = (
@@ -181,19 +196,29 @@ def _filter_calls(*, tcp: bool) -> None:
         return struct.pack("HBBI", _LOAD, 0, 0, place)
 
     def where(test: int, value: int, then: bytes, *, otherwise: bool = False) -> bytes:
-        return struct.pack("HBBI", test, int(otherwise), int(not otherwise), value) + then
+        skipped = len(then) // 8
+        return struct.pack("HBBI", test, skipped * otherwise, skipped * (not otherwise), value) + then
 
+    def among(argument: int, values: tuple[int, ...], bits: int = _WHOLE) -> bytes:
+        """Go on if an argument is one of the values; upper halves count for none of these calls."""
+        code = load(_FIRST_ARGUMENT + 8 * argument) + struct.pack("HBBI", _AND, 0, 0, bits)
+        for following, value in zip(range(len(values), 0, -1), values, strict=True):
+            code += struct.pack("HBBI", _EQUAL, following, 0, value)
+        return code + denied
+
+    # Other protocols, such as multipath TCP, Landlock does not watch. Pairs of datagram sockets can send to
+    # anybody. The priority of all processes of a user is changed by the number 0, too.
+    conditions = {
+        socket: among(0, _INTERNET) + among(2, _PLAIN_PROTOCOLS) if tcp else denied,
+        pair: among(0, _LOCAL) + among(1, _STREAM, _KIND),
+        priority: among(0, (0,)) + among(1, (0,)),
+        io_priority: among(0, (1,)) + among(1, (0,)),
+    } | dict.fromkeys(of_process, among(0, (0, os.getpid())))
     code = load(_PROCESSOR) + where(_EQUAL, processor, denied, otherwise=True) + load(_NUMBER)
     code += where(_AT_LEAST, _OTHER_NUMBERS, denied)
     code += b"".join(where(_EQUAL, number, denied) for number in refused)
     code += b"".join(where(_EQUAL, number, done) for number in idle)
-    code += where(_EQUAL, socket, granted, otherwise=True)
-    if tcp:
-        code += load(_FIRST_ARGUMENT) + struct.pack("HBBI", _EQUAL, 2, 0, _INTERNET[0])
-        code += where(_EQUAL, _INTERNET[1], denied, otherwise=True) + load(_THIRD_ARGUMENT)
-        # Others, such as multipath TCP, Landlock does not watch.
-        code += b"".join(where(_EQUAL, number, granted) for number in _PLAIN_PROTOCOLS)
-    code += denied
+    code += b"".join(where(_EQUAL, number, then + granted) for number, then in conditions.items()) + granted
     content = ctypes.create_string_buffer(code, len(code))
     filter_ = ctypes.create_string_buffer(struct.pack("HxxxxxxQ", len(code) // 8, ctypes.addressof(content)))
     _done(_libc().prctl(_SET_FILTER, 2, filter_, 0, 0))

@@ -94,6 +94,7 @@ IN_THE_THIRD_STEP = [
     ("EXIT", FmuWorkerError, r"exit status 3: the FMU's code ended its own process"),
     ("HANG", FmuTimeoutError, r"longer than 0\.5 s for the step.*more `step_time` in .*otherwise it hangs"),
     ("IGNORE_SIGNALS", FmuTimeoutError, r"longer than 0\.5 s for the step"),
+    ("HALF_AN_ANSWER", FmuTimeoutError, r"longer than 0\.5 s for the step"),
     ("LEAK_IN_STEP", FmuMemoryError, r"MiB of memory during the step, more than the limit of 400 MiB.*leaks"),
     ("FILL_DISK", FmuWorkerError, r"SIGXFSZ\): the FMU wrote more than 2 GiB to one file"),
     ("NOT_A_NUMBER", FmuOutputError, r"values that are not finite at t = 3 s: y\."),
@@ -368,7 +369,7 @@ def test_an_answer_to_another_request_is_not_taken(foreign_fmu: Any, described: 
             asset.step()
 
 
-@pytest.mark.parametrize("what", ["HANG", "START_PROCESS"])
+@pytest.mark.parametrize("what", ["HANG", "START_PROCESS", "ATTEMPT=(hold_pipes(),hang(),0)"])
 def test_nothing_is_left_when_the_twin_is_killed_during_a_step(
     foreign_fmu: Any, scratch: Path, what: str
 ) -> None:

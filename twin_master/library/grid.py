@@ -9,9 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmu_asset.door.observation import Observation
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuError
+from fmu_asset.errors import (
+    FmuEndedError,
+    FmuError,
+    FmuInputError,
+    FmuMemoryError,
+    FmuOutputError,
+    FmuTimeoutError,
+    FmuWorkerError,
+)
 from twin_master.errors import InvalidObservationLibraryError
 
 Float = NDArray[np.float64]
@@ -105,7 +112,7 @@ class SamplingGrid:
 
 
 class GridSampler:
-    """An FMU in this process that is asked for the observations of blocks of a grid.
+    """An FMU that is asked for the observations of blocks of a grid.
 
     Every block begins with a reset, so that what it gives does not depend on the blocks before it.
 
@@ -122,7 +129,7 @@ class GridSampler:
 
     def __init__(self, grid: SamplingGrid) -> None:
         self._grid = grid
-        self._asset = FmiAsset(grid.fmu, grid.binding, isolated=False)
+        self._asset = FmiAsset(grid.fmu, grid.binding, step_timeout=grid.step_timeout)
         self._chosen = self._asset.binding.observation_slice(grid.role)
 
     def close(self) -> None:
@@ -139,15 +146,13 @@ class GridSampler:
         FmuError
             The FMU failed; the sentence names the point.
         """
-        rows = []
-        started = -1
-        for index in range(first, last):
-            draw = self._grid.point(index)[0]
-            if self._grid.settling_steps or draw != started:
-                self._start(index)
-                started, begin = draw, index
-            rows.append(self._ask(index))
-        values = np.array(rows)
+        length = 1 if self._grid.settling_steps else self._grid.size // len(self._grid.draws)
+        parts, end = [], first
+        while end < last:
+            begin, end = end, min(end - end % length + length, last)
+            self._start(begin)
+            parts.append(self._ask(begin, end))
+        values = np.concatenate(parts)
         if self._grid.settling_steps:
             self._check_settled(last - 1, values[-1])
         else:
@@ -171,18 +176,33 @@ class GridSampler:
         except FmuError as error:
             raise self._located(error, index) from error
 
-    def _ask(self, index: int) -> Float:
-        grid = self._grid
-        _, state, control = grid.point(index)
+    def _ask(self, first: int, last: int) -> Float:
+        """Return the observations of points of one draw, of which each may have its steps to settle."""
+        grid, before = self._grid, self._asset.step_index
+        steps = max(grid.settling_steps, 1)
+        points = [point for point in map(grid.point, range(first, last)) for _ in range(steps)]
+        controls = [grid.controls[control] for _, _, control in points]
         try:
-            for _ in range(max(grid.settling_steps, 1)):
-                seen: Observation = self._asset.step(grid.controls[control], state, grid.load)
+            seen = self._asset.simulate(
+                {name: [control[name] for control in controls] for name in controls[0]},
+                {name: [state[name] for _, state, _ in points] for name in grid.states},
+                grid.load,
+                steps=len(points),
+            )
+            if seen.ended:
+                raise FmuEndedError(seen.ended)
+        except FmuInputError:
+            raise  # before the first step; it names the value
         except FmuError as error:
-            raise self._located(error, index) from error
-        return seen.values[self._chosen]
+            made = self._asset.step_index - before - isinstance(error, FmuOutputError)
+            raise self._located(error, first + min(made // steps, last - first - 1)) from error
+        return seen.values[steps - 1 :: steps, self._chosen]
 
     def _located(self, error: FmuError, index: int) -> FmuError:
-        return type(error)(f"at {self._name(index)}: {error.sentence}", error.messages)
+        # What ends a worker is located by its last report only.
+        later = isinstance(error, FmuWorkerError | FmuTimeoutError | FmuMemoryError)
+        where = "at or soon after" if later else "at"
+        return type(error)(f"{where} {self._name(index)}: {error.sentence}", error.messages)
 
     def _name(self, index: int) -> str:
         grid = self._grid
@@ -193,7 +213,7 @@ class GridSampler:
         return ", ".join(parts)
 
     def _check_memory(self, index: int, before: Float) -> None:
-        again = self._ask(index)
+        again = self._ask(index, index + 1)[0]
         change = np.abs(again - before)
         if np.any(change > MEMORY_TOLERANCE * np.maximum(np.abs(before), np.abs(again))):
             worst = int(np.argmax(change))
@@ -204,7 +224,7 @@ class GridSampler:
             )
 
     def _check_settled(self, index: int, before: Float) -> None:
-        after = self._ask(index)
+        after = self._ask(index, index + 1)[0]
         change = np.abs(after - before)
         if np.any(change > SETTLED_TOLERANCE * np.maximum(np.abs(before), np.abs(after))):
             worst = int(np.argmax(change))

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import math
 import os
 import shutil
 import time
@@ -156,16 +155,13 @@ def _sampled(grid: SamplingGrid, todo: list[int], count: int) -> Iterator[tuple[
             busy = {worker.connection: worker for worker in workers if worker.load}
             if not busy:
                 return
-            limit = min(worker.deadline for worker in busy.values()) - time.monotonic()
-            for connection in wait(list(busy), timeout=None if math.isinf(limit) else max(limit, 0.0)):
+            for connection in wait(list(busy)):
                 worker = busy[connection]  # type: ignore[index]
                 result = worker.take()
                 if waiting and worker.load < _AHEAD:  # before the block is written
                     number = waiting.pop()
                     worker.ask(number, *grid.blocks[number])
                 yield result
-            for worker in busy.values():
-                worker.check_time()
     finally:
         for worker in workers:
             worker.close()

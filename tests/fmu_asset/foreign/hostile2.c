@@ -9,9 +9,16 @@
 #include <signal.h>
 #include <spawn.h>
 #include <stdio.h>
+#include <sched.h>
+#include <sys/inotify.h>
+#include <sys/msg.h>
 #include <sys/prctl.h>
+#include <sys/resource.h>
+#include <sys/sem.h>
+#include <sys/shm.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
+#include <sys/syscall.h>
 #include <sys/un.h>
 #include <sys/wait.h>
 #include <unistd.h>
@@ -35,6 +42,26 @@ static int create(const char *path) { return open(path, O_WRONLY | O_CREAT, 0600
 static int look_into(const char *path) {
     char some[8];
     return open(path, O_RDONLY) < 0 ? -1 : read(open(path, O_RDONLY), some, 8) > 0 ? 0 : -1;
+}
+static int write_everywhere(const void *what, size_t size) {
+    for (int k = 3; k < 64; k++) if (write(k, what, size) < 0) continue;
+    return 0;
+}
+static int write_message(const char *text) { /* as Python's multiprocessing.connection sends it */
+    struct { unsigned length; char text[512]; } message = {htonl(strlen(text))};
+    strcpy(message.text, text);
+    return write_everywhere(&message, 4 + strlen(text));
+}
+static int send_by_pair(const char *path) {
+    struct sockaddr_un there = {AF_UNIX};
+    int pair[2];
+    strcpy(there.sun_path, path);
+    if (socketpair(AF_UNIX, SOCK_DGRAM, 0, pair) < 0) return -1;
+    return sendto(pair[0], "key", 3, 0, (struct sockaddr *)&there, sizeof there);
+}
+static void hold_pipes(void) { /* open for oneself what the twin has open */
+    char name[40];
+    for (int k = 3; k < 64; k++) if (sprintf(name, "/proc/self/fd/%d", k)) open(name, O_RDWR | O_NONBLOCK);
 }
 static int call(int kind, int protocol, const char *port) {
     struct sockaddr_in there = {AF_INET, htons(atoi(port)), {htonl(INADDR_LOOPBACK)}};
@@ -196,6 +223,9 @@ int model_step(Model *m, double time, double size) {
     for (int k = 3; k < 64; k++) close(k);
 #elif defined WRITE_INTO_PIPES
     for (int k = 3; k < 64; k++) if (write(k, "rubbish rubbish rubbish", 23) < 0) continue;
+#elif defined HALF_AN_ANSWER
+    write_everywhere("\1\0\0\0\0\0\0\0", 8);
+    hang();
 #elif defined START_PROCESS
     if (m->stepped == 2 && fork() == 0) for (;;) pause();
 #elif defined FORK_AND_RETURN

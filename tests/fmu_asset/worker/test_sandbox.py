@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
+import pickle
+import resource
 import socket
 import subprocess
 import sys
@@ -86,6 +89,47 @@ class Targets:
     def service(self) -> tuple[str, Attempted]:
         return self._listening(socket.AF_UNIX, socket.SOCK_STREAM, str(self._folder / "service"))
 
+    def mailbox(self) -> tuple[str, Attempted]:
+        return self._listening(socket.AF_UNIX, socket.SOCK_DGRAM, str(self._folder / "mailbox"))
+
+    def watch(self) -> tuple[str, Attempted]:
+        return str(self._folder), lambda: True
+
+    def share(self) -> tuple[str, Attempted]:
+        return self._shared("shm", 4096)
+
+    def semaphore(self) -> tuple[str, Attempted]:
+        return self._shared("sem", 1)
+
+    def message(self) -> tuple[str, Attempted]:
+        return self._shared("msg")
+
+    def _shared(self, kind: str, *size: int) -> tuple[str, Attempted]:
+        libc = ctypes.CDLL(None)
+        number = getattr(libc, f"{kind}get")(0, *size, 0o600)
+        remove = getattr(libc, f"{kind}ctl")
+        remove_now = (0, 0) if kind == "sem" else (0,)  # IPC_RMID, of a semaphore after its number
+        self._cleaner.callback(remove, number, *remove_now, None)
+        return str(number), lambda: True
+
+    def queue(self) -> tuple[str, Attempted]:
+        name = f"uav-twin-{os.getpid()}"
+        return name, lambda: ctypes.CDLL(None).mq_unlink(f"/{name}".encode()) == 0
+
+    def disturb(self) -> tuple[str, Attempted]:
+        return self.kill()[0], lambda: True
+
+    def hamper(self) -> tuple[str, Attempted]:
+        number = int(self.kill()[0])
+
+        def measured() -> tuple[object, ...]:
+            limits = resource.prlimit(number, resource.RLIMIT_NOFILE)
+            way = os.sched_getscheduler(number), os.sched_getaffinity(number)
+            return limits, os.getpriority(os.PRIO_PROCESS, number), way
+
+        before = measured()
+        return str(number), lambda: measured() != before
+
     def kill(self) -> tuple[str, Attempted]:
         process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
         self._cleaner.callback(process.communicate)
@@ -137,8 +181,28 @@ ATTEMPTS = [
     ("call", "call(SOCK_STREAM,262,TARGET)", "Permission denied"),  # multipath TCP
     ("datagram", "call(SOCK_DGRAM,0,TARGET)", "Permission denied"),
     ("service", "call_service(TARGET)", "Permission denied"),
+    ("mailbox", "send_by_pair(TARGET)", "Permission denied"),
+    ("watch", "inotify_add_watch(inotify_init(),TARGET,IN_OPEN)", "Permission denied"),
+    ("share", "shmat(atoi(TARGET),NULL,0)==(void*)-1?-1:0", "Permission denied"),
+    ("hamper", "prlimit(atoi(TARGET),RLIMIT_NOFILE,&(struct rlimit){9,9},NULL)", "Permission denied"),
+    ("hamper", "setpriority(PRIO_PROCESS,atoi(TARGET),9)", "Permission denied"),
+    ("hamper", "sched_setaffinity(atoi(TARGET),8,&(long){1})", "Permission denied"),
+    ("hamper", "sched_setscheduler(atoi(TARGET),SCHED_BATCH,&(struct sched_param){0})", "Permission denied"),
+    (
+        "hamper",
+        "syscall(SYS_sched_setattr,atoi(TARGET),&(unsigned[12]){48,SCHED_BATCH},0)",
+        "Permission denied",
+    ),
+    ("disturb", "sched_setparam(atoi(TARGET),&(struct sched_param){0})", "Permission denied"),
+    ("disturb", "syscall(SYS_ioprio_set,1,atoi(TARGET),16391)", "Permission denied"),
+    ("semaphore", "semctl(atoi(TARGET),0,SETVAL,1)", "Permission denied"),
+    ("message", "msgsnd(atoi(TARGET),(long[]){1,2},8,IPC_NOWAIT)", "Permission denied"),
+    ("queue", "syscall(SYS_mq_open,TARGET,O_RDWR|O_CREAT,0600,NULL)", "Permission denied"),
     ("kill", "kill(atoi(TARGET),SIGKILL)", "Operation not permitted"),
 ]
+
+
+WITHOUT_TRACE = ("read", "spy", "watch", "share", "semaphore", "message", "disturb")
 
 
 @pytest.mark.parametrize(("what", "attempt", "reason"), ATTEMPTS, ids=[case[1] for case in ATTEMPTS])
@@ -154,7 +218,7 @@ def test_what_is_not_its_own_is_out_of_reach(
         with pytest.raises(FmuCallError, match=rf"(?s)step 2 .*it cannot have {target}: {reason}") as caught:
             asset.step()
     assert ("granted by `read`, `write`, `ports`" in str(caught.value)) == (reason == "Permission denied")
-    assert what in ("read", "spy") or not happened()
+    assert what in WITHOUT_TRACE or not happened()
     with FmiAsset(fmu, binding(sandbox=False)) as asset:
         for _ in range(3):
             asset.step()
@@ -313,10 +377,24 @@ def test_what_is_not_confined_is_said_once(
     assert caplog.messages[0].startswith("This kernel has no Landlock (Linux 5.13 or later)")
 
 
+def sampled(fmu: Path, folder: Path) -> tuple[Path, SamplingGrid]:
+    """Return the file of a binding, and a grid of two points."""
+    file = folder / "hostile.toml"
+    file.write_text(
+        '[binding]\nname = "hostile"\nstep_size = 1.0\n[control.u]\nvariable = "u"\nunit = "m/s"\n'
+        '[health.damage]\nvariable = "d"\nunit = "1"\n'
+        '[observation.y]\nvariables = "y"\nunit = "m"\n'
+    )
+    return file, SamplingGrid(
+        fmu=str(fmu), binding=str(file), role="y", parameter="", draws=(0.0,), settling_steps=5,
+        states={"damage": (0.0, 0.1)}, controls={"go": {"u": 1.0}},
+    )  # fmt: skip
+
+
 def test_components_and_samplers_are_confined_too(
     foreign_fmu: Any, key: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A system of FMUs, and a library, whose FMU flies in the process that samples it."""
+    """A system of FMUs, and a library."""
     monkeypatch.setenv("HOSTILE_TARGET", str(key))
     fmu = foreign_fmu("hostile2", "ATTEMPT=unlink(TARGET)")
     structure = SystemStructure(name="one", components=(Component("thief", fmu),))
@@ -330,16 +408,7 @@ def test_components_and_samplers_are_confined_too(
         system.step(), system.step()
         with pytest.raises(FmuCallError, match=rf"it cannot have {key}: Permission denied"):
             system.step()
-    file = tmp_path / "hostile.toml"
-    file.write_text(
-        '[binding]\nname = "hostile"\nstep_size = 1.0\n[control.u]\nvariable = "u"\nunit = "m/s"\n'
-        '[health.damage]\nvariable = "d"\nunit = "1"\n'
-        '[observation.y]\nvariables = "y"\nunit = "m"\n'
-    )
-    grid = SamplingGrid(
-        fmu=str(fmu), binding=str(file), role="y", parameter="", draws=(0.0,), settling_steps=5,
-        states={"damage": (0.0, 0.1)}, controls={"go": {"u": 1.0}},
-    )  # fmt: skip
+    file, grid = sampled(fmu, tmp_path)
     with pytest.raises(FmuCallError, match=rf"it cannot have {key}: Permission denied"):
         sample_library(grid, tmp_path / "library.nc", workers=1)
     assert key.exists()
@@ -347,6 +416,28 @@ def test_components_and_samplers_are_confined_too(
     with pytest.raises(InvalidObservationLibraryError):  # an integrator does not settle
         sample_library(grid, tmp_path / "library.nc", workers=1, replace_existing=True)
     assert not key.exists()
+
+
+class Order:
+    """What is carried out by whoever unpickles it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self._path),)
+
+
+def test_what_a_sampled_fmu_writes_to_its_descriptors_is_not_carried_out(
+    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The processes of a sampling send each other pickles, and the FMU is in none of them."""
+    made = tmp_path / "made"
+    monkeypatch.setenv("HOSTILE_TARGET", pickle.dumps(Order(made), protocol=0).decode())
+    fmu = foreign_fmu("hostile2", "ATTEMPT=write_message(TARGET)")
+    with pytest.raises(FmuWorkerError, match="closed its pipe, or wrote something else into it"):
+        sample_library(sampled(fmu, tmp_path)[1], tmp_path / "library.nc", workers=1)
+    assert not made.exists()
 
 
 @pytest.mark.parametrize("version", range(1, 7))

@@ -20,7 +20,6 @@ from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.packing.script import build_script_fmu
 from twin_master.assets.observation_library import load_observation_library
 from twin_master.errors import InvalidObservationLibraryError
-from twin_master.library import worker as library_worker
 from twin_master.library.grid import SamplingGrid
 from twin_master.library.request import grid_of_fmu, parse_grid
 from twin_master.library.sampling import blocks_folder, sample_library
@@ -180,7 +179,7 @@ def test_an_fmu_that_remembers_is_refused_and_sampled_from_a_fresh_start(
 
 
 def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(
-    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    files: tuple[Path, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "lever.nc"
     with pytest.raises(
@@ -189,10 +188,9 @@ def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(
         sample_library(grid(files, REFUSE), out, workers=2)
     # What came before is kept, so that the user can mend the FMU's surroundings and go on.
     assert list(blocks_folder(out).glob("block_*.npz"))
-    with pytest.raises(FmuWorkerError, match=r"died \(signal 6\)"):
+    with pytest.raises(FmuWorkerError, match=r"at or soon after wear = .*ended by signal 6 \(SIGABRT\)"):
         sample_library(grid(files, DIE), out, workers=1, replace_existing=True)
-    monkeypatch.setattr(library_worker, "_START_LIMIT", 10.0)  # for a busy machine
-    with pytest.raises(FmuTimeoutError, match=r"longer than 0\.1 s a step"):
+    with pytest.raises(FmuTimeoutError, match=r"longer than 0\.1 s for a step"):
         sample_library(grid(files, SLEEP, step_timeout=0.1), out, workers=1, replace_existing=True)
     assert not out.exists()
 
