@@ -141,20 +141,18 @@ class Predicted:
 
     def mixed(self, share: float, control: Float) -> "Predicted":
         """Return it where with probability `share` the controls are p(U) (U,), whatever the state is."""
-        return Predicted(
-            self.predicted,
-            (1.0 - share) * self.control_probability + share * control,
-            (1.0 - share) * self.joint + share * self.predicted[..., None] * control,
-        )
+        chosen = (1.0 - share) * self.control_probability + share * control
+        joint = (1.0 - share) * self.joint + share * self.predicted[..., None] * control
+        return Predicted(self.predicted, chosen, joint)
 
 
 def _checked_controls(model: GraphicalModel, control_index: ArrayLike) -> Index:
     """Return the controls as the compiled loops expect them."""
     control = np.array(control_index, dtype=np.int64, order="C")
     if control.size and (control.min() < 0 or control.max() >= len(model.controls)):
+        least, largest = control.min(), control.max()
         raise InvalidModelError(
-            f"expected control indices between 0 and {len(model.controls) - 1}, "
-            f"got {control.min()} to {control.max()}"
+            f"expected control indices from 0 to {len(model.controls) - 1}, got {least} to {largest}"
         )
     return control
 
@@ -162,13 +160,11 @@ def _checked_controls(model: GraphicalModel, control_index: ArrayLike) -> Index:
 def _checked_rows(model: GraphicalModel, control: Index, rows: ArrayLike, *, what: str) -> Float:
     """Return rows of logarithms, one for each control, as the compiled loops expect them."""
     rows = np.require(rows, np.float64, ["C", "W"])
-    if rows.shape != (*control.shape, model.states.size):
-        raise InvalidModelError(
-            f"{what}: expected shape {(*control.shape, model.states.size)} for controls of shape "
-            f"{control.shape} and {model.states.size} states, got {rows.shape}"
-        )
+    expected = (*control.shape, model.states.size)
+    if rows.shape != expected:
+        raise InvalidModelError(f"{what}: expected {expected}, controls and states, got {rows.shape}")
     if not np.all(rows < np.inf):  # NaN fails this as well
-        where = tuple(int(i) for i in np.argwhere(~(rows < np.inf))[0])
+        where = tuple(np.argwhere(~(rows < np.inf))[0].tolist())
         raise InvalidObservationError(f"{what} at {where} is {rows[where]}; expected a number or -inf")
     return rows
 
