@@ -37,6 +37,7 @@ _SYSTEM = (
     "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/version", "/proc/filesystems",
     "/proc/sys", "/sys/devices/system", "/sys/fs/cgroup", *(f"/etc/{name}" for name in _CONFIGURATION),
 )  # fmt: skip
+_ROOT, _PACKAGES = os.path.realpath(f"{__file__}/../../.."), ("fmu_asset", "fe", "reporting")
 _DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
 
 
@@ -131,7 +132,10 @@ def _paths_of_python() -> Iterator[str]:
     home = os.path.realpath(os.path.expanduser("~"))  # noqa: PTH111
     libraries = os.environ.get("LD_LIBRARY_PATH", "").split(":")
     for path in {sys.prefix, sys.base_prefix, *sys.path, *libraries}:
-        if path and os.path.commonpath((home, os.path.realpath(path))) != os.path.realpath(path):
+        place = os.path.realpath(path)
+        if path and place == _ROOT and os.path.exists(f"{_ROOT}/pyproject.toml"):  # noqa: PTH110
+            yield from (f"{_ROOT}/{name}" for name in _PACKAGES)  # a checkout holds much else
+        elif path and os.path.commonpath((home, place)) != place:
             yield path
 
 

@@ -162,7 +162,9 @@ def _checked_rows(model: GraphicalModel, control: Index, rows: ArrayLike, *, wha
     rows = np.require(rows, np.float64, ["C", "W"])
     expected = (*control.shape, model.states.size)
     if rows.shape != expected:
-        raise InvalidModelError(f"{what}: expected {expected}, controls and states, got {rows.shape}")
+        raise InvalidModelError(
+            f"{what}: expected shape {expected}, of controls and states, got {rows.shape}"
+        )
     if not np.all(rows < np.inf):  # NaN fails this as well
         where = tuple(np.argwhere(~(rows < np.inf))[0].tolist())
         raise InvalidObservationError(f"{what} at {where} is {rows[where]}; expected a number or -inf")

@@ -70,6 +70,9 @@ class Targets:
     def read(self) -> tuple[str, Attempted]:
         return str(self._key), lambda: True  # what the FMU returns says it
 
+    def project(self) -> tuple[str, Attempted]:
+        return str(Path(__file__).parents[3] / "pyproject.toml"), lambda: True
+
     def spy(self) -> tuple[str, Attempted]:
         return f"/proc/{os.getpid()}/environ", lambda: True
 
@@ -173,6 +176,7 @@ ATTEMPTS = [
     ("delete", 'rename(TARGET,"mine")', "Permission denied"),
     ("read", "look_into(TARGET)", "Permission denied"),
     ("read", 'link(TARGET,"mine")', "Invalid cross-device link"),
+    ("project", "look_into(TARGET)", "Permission denied"),  # beside the packages of a checkout
     ("spy", "look_into(TARGET)", "Permission denied"),
     ("make", "create(TARGET)", "Permission denied"),
     ("make", "mkdir(TARGET,0700)", "Permission denied"),
@@ -202,7 +206,7 @@ ATTEMPTS = [
 ]
 
 
-WITHOUT_TRACE = ("read", "spy", "watch", "share", "semaphore", "message", "disturb")
+WITHOUT_TRACE = ("read", "project", "spy", "watch", "share", "semaphore", "message", "disturb")
 
 
 @pytest.mark.parametrize(("what", "attempt", "reason"), ATTEMPTS, ids=[case[1] for case in ATTEMPTS])
