@@ -150,10 +150,8 @@ def _checked_controls(model: GraphicalModel, control_index: ArrayLike) -> Index:
     """Return the controls as the compiled loops expect them."""
     control = np.array(control_index, dtype=np.int64, order="C")
     if control.size and (control.min() < 0 or control.max() >= len(model.controls)):
-        least, largest = control.min(), control.max()
-        raise InvalidModelError(
-            f"expected control indices from 0 to {len(model.controls) - 1}, got {least} to {largest}"
-        )
+        found = f"{control.min()} to {control.max()}"
+        raise InvalidModelError(f"expected indices between 0 and {len(model.controls) - 1}, got {found}")
     return control
 
 
@@ -162,9 +160,7 @@ def _checked_rows(model: GraphicalModel, control: Index, rows: ArrayLike, *, wha
     rows = np.require(rows, np.float64, ["C", "W"])
     expected = (*control.shape, model.states.size)
     if rows.shape != expected:
-        raise InvalidModelError(
-            f"{what}: expected shape {expected}, of controls and states, got {rows.shape}"
-        )
+        raise InvalidModelError(f"{what}: expected shape {expected} (turns, states), got {rows.shape}")
     if not np.all(rows < np.inf):  # NaN fails this as well
         where = tuple(np.argwhere(~(rows < np.inf))[0].tolist())
         raise InvalidObservationError(f"{what} at {where} is {rows[where]}; expected a number or -inf")
