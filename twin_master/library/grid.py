@@ -10,15 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import (
-    FmuEndedError,
-    FmuError,
-    FmuInputError,
-    FmuMemoryError,
-    FmuOutputError,
-    FmuTimeoutError,
-    FmuWorkerError,
-)
+from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuInputError, FmuOutputError
 from twin_master.errors import InvalidObservationLibraryError
 
 Float = NDArray[np.float64]
@@ -200,7 +192,7 @@ class GridSampler:
 
     def _located(self, error: FmuError, index: int) -> FmuError:
         # What ends a worker is located by its last report only.
-        later = isinstance(error, FmuWorkerError | FmuTimeoutError | FmuMemoryError)
+        later = not isinstance(error, FmuCallError | FmuInputError | FmuOutputError)
         where = "at or soon after" if later else "at"
         return type(error)(f"{where} {self._name(index)}: {error.sentence}", error.messages)
 
