@@ -295,15 +295,15 @@ def test_nothing_is_left_when_the_keeper_is_killed(
             if end == "(void)0":
                 kill_keeper(asset.worker_process_id)
             assert asset.step().values[0] == 4.0
-            await_processes(scratch, 2)  # the worker, and the process that has left it
+            await_processes(scratch, 1, 2)  # the worker, and mostly the process that has left it
     assert not left_behind(scratch)
 
 
-def await_processes(of: Path, count: int) -> None:
+def await_processes(of: Path, *counts: int) -> None:
     deadline = time.monotonic() + 20.0
-    while len(processes(of)) != count and time.monotonic() < deadline:
+    while len(processes(of)) not in counts and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert len(processes(of)) == count
+    assert len(processes(of)) in counts
 
 
 def kill_keeper(worker: int | None) -> None:

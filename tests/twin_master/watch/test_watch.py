@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -101,7 +102,7 @@ def killed(watch: Watch, feed: CsvFeed, size: int) -> bool:
     child = os.fork()
     if not child:
         try:
-            watch.run(feed, lambda _decision: None)
+            watch.run(feed, lambda _decision: time.sleep(0.005))
             os._exit(0)
         finally:
             os._exit(1)
@@ -115,7 +116,10 @@ def killed(watch: Watch, feed: CsvFeed, size: int) -> bool:
     return ended[1] == signal.SIGKILL
 
 
-def test_a_kill_at_any_moment_loses_no_turn(base: Watch, recorded: Path, whole: Path, tmp_path: Path) -> None:
+def test_a_kill_at_any_moment_loses_no_turn(
+    base: Watch, recorded: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twin_master.watch.folder.FLUSH_SECONDS", 0.0)  # so that each line may be the last
     folder = tmp_path / "watch"
     watch = begun(base, folder)
     feed = CsvFeed(recorded, watch.scenario)
