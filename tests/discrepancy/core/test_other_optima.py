@@ -41,9 +41,9 @@ def test_a_mass_is_found_on_the_other_side_of_an_antinode() -> None:
         return fit(problem, Candidate((term,)), at)
 
     stuck = begun_at(1.2)
+    assert stuck.objective > 1000.0
     assert abs(stuck.point.effect[1] - TRUTH[1]) > 0.3
     found = elsewhere(problem, stuck)
     np.testing.assert_allclose(found.point.effect, TRUTH, atol=2e-3)
-    assert stuck.objective > found.objective + 500.0
     right = begun_at(-0.5)
     assert elsewhere(problem, right) is right
