@@ -53,8 +53,8 @@ def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path
     try:
         yield begin
         if process is not None and process.is_alive():
-            _say("The view stays until Ctrl-C.")
-            with suppress(KeyboardInterrupt):
+            with suppress(KeyboardInterrupt):  # from the sentence on, which a quick hand may answer at once
+                _say("The view stays until Ctrl-C.")
                 process.join()
     finally:
         if process is not None:
