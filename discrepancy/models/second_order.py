@@ -5,7 +5,7 @@ the structural part of a patch, keeps it, and asks it for a `Motion`; rows of it
 `Response`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, eigh
 from scipy.linalg.lapack import dpotrs
 
-from discrepancy.campaign.records import Release
+from discrepancy.campaign.records import Quantity, Release
 from discrepancy.campaign.sampling import is_even
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.free_motion import free_motion
+from discrepancy.models.ported import OutputRows, PortedSystem, modal_system
 from discrepancy.models.second_order_motion import Motion
 from discrepancy.models.stepwise import simulate_at
 from fe.runtime.errors import SolutionError
@@ -305,6 +306,27 @@ class SecondOrderSystem:
                 memory=memory, feed=np.outer(acting, feed[0]), refinement=refinement,
             )  # fmt: skip
         return Motion(self, times, moved.q, moved.v, acting, input_row, moved.port_forces, moved.lagged, laws)
+
+    def ported(
+        self, rows: FloatArray, quantities: Sequence[Quantity], shapes: FloatArray | None = None
+    ) -> PortedSystem:
+        """Return the system that outputs at rows (C, n) see missing forces by, in given shapes (n, M)."""
+        base = self.shapes if shapes is None else shapes
+        modal = rows @ base
+        kept = [
+            np.array([quantity is own for quantity in quantities])[:, None] * modal
+            for own in (Quantity.VELOCITY, Quantity.ACCELERATION)
+        ]
+        names = list(self.ports)
+        port_rows = np.array(list(self.ports.values())).reshape(len(names), len(self.mass))
+        still = np.array([not quantity.is_rate for quantity in quantities])
+        left_out = -(port_rows @ self.residual(rows.T)) * still if self.truncated else None
+        shown = OutputRows(
+            still[:, None] * modal, *kept, np.zeros((len(names), len(rows))) if left_out is None else left_out
+        )
+        ports = {name: (row @ base, row @ base) for name, row in self.ports.items()}
+        matrices = [base.T @ matrix @ base for matrix in (self.mass, self.damping, self.stiffness)]
+        return modal_system(*matrices, ports, shown, base.shape[1])  # type: ignore[misc]
 
     # ------------------------------------------------------------ parts
 

@@ -1,0 +1,1 @@
+"""The force that a model lacks: seen in time, found at a port, named by the laws it follows."""

@@ -1,0 +1,135 @@
+"""Effects of the catalogue as columns: what a unit of one does along the motion that was."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.errors import DiscrepancyError
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.problem import Problem
+from discrepancy.models.sensing import observe_response
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws.interface import PortForce
+from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
+
+from .law_courses import law_course
+from .trial import SeenTrial
+from .view import Column, Motion, Part, View
+
+FloatArray = NDArray[np.float64]
+
+LEVELS = (-1.3, -0.4, 0.4, 1.3)
+"""Standard normal values at which the numbers of an effect that are no magnitudes are tried."""
+MOST_VARIANTS = 16
+
+
+def variants(term: Term) -> list[FloatArray]:
+    """Return standard normal values (E,) of a term's parameters at which it is tried."""
+    free = [number for number, item in enumerate(term.effect.parameters) if not item.magnitude]
+    levels = [LEVELS if len(free) < 2 else LEVELS[::3]] * len(free)
+    found = []
+    for chosen in list(product(*levels))[:MOST_VARIANTS]:
+        values = term.start()
+        values[free] = chosen
+        found.append(values)
+    return found
+
+
+class Columns:
+    """Makes columns of effects along the motion of a view.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    numbers : sequence of int
+        Which trials of the problem the view's are.
+    point : Point
+        About which the view's trials are linear.
+    """
+
+    def __init__(self, problem: Problem, numbers: Sequence[int], point: Point) -> None:
+        self.problem, self.numbers, self.point = problem, numbers, point
+
+    def of(self, view: View, motions: Sequence[Motion], term: Term, values: FloatArray) -> Column | None:
+        """Return the column of a term at values of its parameters, in units of what they say; None: nothing.
+
+        Its prior precision is zero; it is for the caller to set.
+        """
+        try:
+            patch = Candidate((term,)).patch(self.problem.setting, values)
+            parts = [
+                self._part(view, trial, motion, number, patch, term)
+                for trial, motion, number in zip(view.trials, motions, self.numbers, strict=True)
+            ]
+        except (DiscrepancyError, InvalidPatchError):
+            return None
+        finite = all(np.all(np.isfinite(part.readings)) for part in parts)
+        if not finite or not any(np.any(part.readings) for part in parts):
+            return None
+        return Column(parts, 0.0)
+
+    def _part(
+        self, view: View, trial: SeenTrial, motion: Motion, number: int, patch: ModelPatch, term: Term
+    ) -> Part:
+        data = self.problem.trials[number]
+        nothing = Part(np.zeros_like(trial.residual))
+        if data.trial.kind not in term.effect.acts_on:
+            return nothing
+        own = patch.in_trial(data.trial.name)
+        sensors = own.of(*SENSORS)
+        forces = ModelPatch(tuple(item for item in own if isinstance(item, PortForce)))
+        rest = ModelPatch(tuple(item for item in own if item not in (*forces, *sensors)))
+        if len(forces):
+            return self._forced(trial, motion, forces)
+        if len(rest) or not len(sensors) or sensors.of(LoggerClock):
+            return Part(self._changed(number, own, trial)) if len(own) else nothing
+        return Part(self._shown(view, trial, motion, number, sensors))
+
+    def _forced(self, trial: SeenTrial, motion: Motion, laws: ModelPatch) -> Part:
+        """Return what forces at ports do."""
+        names = trial.system.ports
+        added = np.zeros_like(motion.added)
+        readings = np.zeros_like(trial.residual)
+        forces: dict[int, FloatArray] = {}
+        time = trial.fine_time
+        for law in laws:
+            port = names.index(law.port)  # type: ignore[attr-defined]
+            position, speed = trial.port_motion(port, motion.added)
+            course = law_course(law, time, position, speed)  # type: ignore[arg-type]
+            state = trial.pushed(port, course)
+            added += state
+            readings += trial.readings(state, port, course)
+            forces[port] = forces.get(port, 0.0) + course
+        return Part(readings, added, forces)
+
+    def _changed(self, number: int, patch: ModelPatch, trial: SeenTrial) -> FloatArray:
+        """Return what a patch changes in the model's own response."""
+        shared, local = self.point.shared, self.point.local[number]
+        with_it, _ = self.problem.response(number, shared, local, patch)
+        without, _ = self.problem.response(number, shared, local, ModelPatch())
+        gains = 1.0 + self.problem.shared.gains(shared, self.problem.trials[number].trial.channels)
+        return trial.over_noise((with_it - without) * gains)
+
+    def _shown(
+        self, view: View, trial: SeenTrial, motion: Motion, number: int, sensors: ModelPatch
+    ) -> FloatArray:
+        """Return what sensors make of the motion that was."""
+        problem, data = self.problem, self.problem.trials[number]
+        shared, local = self.point.shared, self.point.local[number]
+        values, rates = problem.response(number, shared, local, ModelPatch())
+        added = trial.readings(motion.added, view.port, motion.force) * trial.deviation
+        true = values + added
+        slope = np.gradient(true, trial.time, axis=0) if rates is not None else None
+        conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(shared), local)
+        with_it = observe_response(problem.campaign, data.trial, sensors, conditions, true, slope)
+        return trial.over_noise(with_it.values - true)
+
+
+def with_prior(column: Column, deviation: float) -> Column:
+    """Return a column whose unknown has a prior deviation."""
+    return replace(column, precision=1.0 / deviation**2)

@@ -1,0 +1,177 @@
+"""The Kalman filter with a missing force at one port: evidence of columns, and the force and motion seen.
+
+The force is a Gaussian process in time of deviation `size` and correlation time `time`: Matern 3/2, two
+states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for Signal Processing), or 1/2.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from fe.compilation import callable_when_compiled, compiled
+
+from . import kalman_kernels as kernels
+from .trial import SeenTrial
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+callable_when_compiled(kernels.is_steady)
+_covariances = compiled(kernels.covariances)
+_whitened = compiled(kernels.whitened)
+_smoothed = compiled(kernels.smoothed)
+_between = compiled(kernels.between)
+_variances = compiled(kernels.variances)
+
+
+@dataclass(frozen=True)
+class Process:
+    """The missing force as a process.
+
+    Attributes
+    ----------
+    size : float
+        Deviation [N, N m or the port's flow].
+    time : float
+        Correlation time [s].
+    rough : bool
+        Whether it may jump (Matern 1/2), not bend only (3/2).
+    """
+
+    size: float
+    time: float
+    rough: bool = False
+
+    @property
+    def generator(self) -> FloatArray:
+        """Of its states (1 or 2), the force over `size` first."""
+        if self.rough:
+            return np.array([[-1.0 / self.time]])
+        rate = np.sqrt(3.0) / self.time
+        return rate * np.array([[0.0, 1.0], [-1.0, -2.0]])
+
+    @property
+    def intensity(self) -> float:
+        """Spectral density of the white noise that drives the last state."""
+        return 2.0 / self.time if self.rough else 4.0 * np.sqrt(3.0) / self.time
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """A trial with a missing force at a port.
+
+    Attributes
+    ----------
+    trial : SeenTrial
+        Which.
+    port : int
+        Number of the port.
+    process : Process
+        The force.
+    """
+
+    trial: SeenTrial
+    port: int
+    process: Process
+
+    @cached_property
+    def _scale(self) -> FloatArray:
+        """Units (n,) of the state: those of a force of `size` at the frequencies of the system."""
+        system = self.trial.system
+        n = len(system.generator)
+        pace = max(float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9)
+        push = max(float(np.max(np.abs(system.actions[self.port]), initial=0.0)), 1e-300) * self.process.size
+        units = np.full(n, push / pace)
+        half = n // 2 if 2 * (n // 2) == n else 0
+        units[:half] /= pace
+        return units
+
+    @cached_property
+    def _system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Generator, noise intensity, rows of the readings, covariance at the first sample."""
+        trial, own = self.trial, self.process.generator
+        n, units = len(trial.system.generator), self._scale
+        whole = n + len(own)
+        generator = np.zeros((whole, whole))
+        generator[:n, :n] = trial.system.generator * units / units[:, None]
+        generator[:n, n] = -trial.system.actions[self.port] * self.process.size / units
+        generator[n:, n:] = own
+        intensity = np.zeros((whole, whole))
+        intensity[-1, -1] = self.process.intensity
+        rows = np.zeros((len(trial.deviation), whole))
+        rows[:, :n] = trial.system.outputs * units / trial.deviation[:, None]
+        rows[:, n] = -trial.system.through[self.port] * self.process.size / trial.deviation
+        start = np.zeros((whole, whole))
+        start[n:, n:] = np.eye(len(own))
+        if trial.settled:  # at rest under the missing force too
+            begun = np.linalg.lstsq(generator[:n, :n], -generator[:n, n], rcond=1e-12)[0]
+            start[:n, :n], start[:n, n], start[n, :n] = np.outer(begun, begun), begun, begun
+        return generator, intensity, rows, start
+
+    def _steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return transitions and noises (J, n, n) of steps (Van Loan 1978)."""
+        generator, intensity, _, _ = self._system
+        n, largest = len(generator), float(np.linalg.norm(generator, 1))
+        moves, noises = [], []
+        for length in lengths:
+            halvings = max(int(np.ceil(np.log2(max(largest * length, 1e-300)))), 0)
+            both = np.zeros((2 * n, 2 * n))
+            both[:n, :n], both[:n, n:], both[n:, n:] = -generator, intensity, generator.T
+            found = expm(both * (length / 2**halvings))
+            move = found[n:, n:].T
+            noise = move @ found[:n, n:]
+            for _ in range(halvings):  # what decays within a step grows beyond all numbers backwards
+                noise = move @ noise @ move.T + noise
+                move = move @ move
+            moves.append(move)
+            noises.append(0.5 * (noise + noise.T))
+        return np.ascontiguousarray(moves), np.ascontiguousarray(noises)
+
+    @cached_property
+    def _passed(self) -> tuple[FloatArray, ...]:
+        lengths, which = self.trial.steps
+        moves, noises = self._steps(lengths)
+        _, _, rows, start = self._system
+        return moves, *_covariances(moves, noises, which, rows, self.trial.used, start)
+
+    @property
+    def log_determinant(self) -> float:
+        """Half the sum of the logarithms of the readings' variances given those before [nat]."""
+        _, slot, _, sizes, _, _ = self._passed
+        return 0.5 * float(np.sum(np.log(sizes[slot]) * self.trial.used))
+
+    def whitened(self, columns: FloatArray) -> FloatArray:
+        """Return columns (K, N, C) as independent numbers of variance one (N C, K)."""
+        moves, slot, gains, sizes, _, _ = self._passed
+        given = np.ascontiguousarray(np.moveaxis(columns, 0, -1))
+        found = _whitened(
+            moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, given
+        )
+        return np.asarray(found.reshape(-1, found.shape[-1]))
+
+    def smoothed(self, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the added state (F, n) and the missing force (F,) at the fine stamps, given readings."""
+        moves, slot, gains, sizes, _, filtered = self._passed
+        lengths, which = self.trial.steps
+        rows = self._system[2]
+        means, later = _smoothed(
+            moves, which, rows, self.trial.used, slot, gains, sizes, np.ascontiguousarray(readings)
+        )
+        parts = self.trial.parts
+        fine = self._steps(lengths / parts)
+        found = _between(parts, *fine, which, slot, filtered, means, later)
+        n = len(self._scale)
+        return np.asarray(found[:, :n] * self._scale), np.asarray(found[:, n] * self.process.size)
+
+    def deviation(self) -> FloatArray:
+        """Return the deviation (N,) of the missing force at the samples, all columns being known."""
+        moves, slot, gains, sizes, predicted, _ = self._passed
+        shown = np.zeros((1, len(self._system[0])))
+        shown[0, len(self._scale)] = self.process.size
+        found = _variances(
+            moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, predicted, shown
+        )
+        return np.asarray(np.sqrt(found[:, 0]))

@@ -1,0 +1,52 @@
+"""Forces of laws along a motion that is known: what they would have been, had the port moved so."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.models.compiled_motion import law_functions
+from fe.compilation import compiled
+from fe.runtime.laws import LAWS, advance, force, steady
+from fe.runtime.laws.interface import HEAD, PARAMETERS, PortForce
+from fe.runtime.motion_arrays import FIRST_PARTS
+
+FloatArray = NDArray[np.float64]
+
+
+def along(
+    number: int, of_speed: bool, law: FloatArray, elements: FloatArray, x: FloatArray, v: FloatArray,
+    memory: FloatArray, found: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `found` (F,) with the force of a law at positions and speeds (F,) that follow one another."""
+    for k in range(len(x)):
+        if of_speed:
+            found[k] = steady(number, law, x[k], v[k])
+        else:
+            advance(number, law, elements, memory, x[k], FIRST_PARTS if k == 0 else 1)
+            memory[1] = x[k]
+            found[k] = force(number, law, memory, x[k])
+
+
+@cache
+def _compiled_along() -> Callable[..., None]:
+    return compiled(along, law_functions(), "numpy")
+
+
+def law_course(law: PortForce, time: FloatArray, position: FloatArray, speed: FloatArray) -> FloatArray:
+    """Return the force (F,) of a law along a motion (F,) of its port; zero outside of its windows."""
+    elements = np.asarray(law.elements(), dtype=np.float64)
+    elements = elements if len(elements) else np.zeros(1)
+    values = np.pad(np.array(law.row, dtype=np.float64), (0, PARAMETERS - len(law.row)))
+    found = np.zeros(len(position))
+    memory = np.zeros(HEAD + len(elements))
+    motion = (np.ascontiguousarray(position), np.ascontiguousarray(speed))
+    _compiled_along()(LAWS.index(type(law)), type(law).of_speed, values, elements, *motion, memory, found)
+    if law.windows:
+        inside = np.zeros(len(found), dtype=bool)
+        for window in law.windows:
+            begin, end = window.span
+            inside |= (time >= begin) & (time < end)
+        found *= inside
+    return found

@@ -1,0 +1,206 @@
+"""A trial in which a missing force is looked for: what is left of its readings, and what unknowns do to them.
+
+Readings and columns are over the deviations of their noise. The unknowns are those of `fits.unknowns`, taken
+at their prior means; a calibrated parameter acts on the motion that the model has (a column) and on what the
+missing force adds to it (`slopes`), so that both together are exact along the motion that was.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.problem import Problem
+from discrepancy.models.ported import PortedSystem, refined
+from fe.compilation import compiled
+
+from . import kalman_kernels as kernels
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+FINEST, COARSEST = 16, 4
+"""Steps of an interval on which laws are evaluated, at most and at least."""
+FINE_PHASE = 0.15
+"""Radians of the fastest mode that such a step may span."""
+SMALL = 1e-3
+"""Step of the derivative of a system by a parameter, in prior deviations."""
+
+_driven = compiled(kernels.driven)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenTrial:
+    """A dynamic trial.
+
+    Attributes
+    ----------
+    name : str
+        Of the trial.
+    time : (N,) ndarray
+        Stamps [s].
+    residual : (N, C) ndarray
+        Readings less the model, as if it were linear between the prior means and the point.
+    used : (N, C) ndarray of bool
+        Readings that count.
+    deviation : (C,) ndarray
+        Of the noise.
+    shared, local : (K, N, C), (L, N, C) ndarray
+        What a unit of each scaled unknown does to readings.
+    local_precision : (L,) ndarray
+        Prior precision of the latter.
+    system : PortedSystem
+        At the point.
+    slopes : sequence of (n, n) ndarray or None
+        Derivative of its generator by each shared unknown.
+    parts : int
+        Fine steps of an interval.
+    positions, speeds : (F, P) ndarray
+        Motion of the ports by the model at the fine stamps.
+    settled : bool
+        Whether it begins at rest under what acts.
+    """
+
+    name: str
+    time: FloatArray
+    residual: FloatArray
+    used: BoolArray
+    deviation: FloatArray
+    shared: FloatArray
+    local: FloatArray
+    local_precision: FloatArray
+    system: PortedSystem
+    slopes: Sequence[FloatArray | None]
+    parts: int
+    positions: FloatArray
+    speeds: FloatArray
+    settled: bool
+
+    @cached_property
+    def steps(self) -> tuple[FloatArray, IntArray]:
+        """Different lengths (J,) of the intervals [s], and which of them leads to each sample (N,)."""
+        lengths = np.diff(self.time)
+        mean = float(lengths.mean())
+        if np.all(np.abs(lengths - mean) < 1e-3 * mean):
+            return np.array([mean]), np.zeros(len(self.time), dtype=np.int64)
+        found, which = np.unique(np.round(lengths / mean, 9), return_inverse=True)
+        return found * mean, np.concatenate(([0], which)).astype(np.int64)
+
+    @cached_property
+    def fine(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Transition (J, n, n) of a fine step, and what a push at its begin and end does (J, n, n)."""
+        n = len(self.system.generator)
+        found = []
+        for length in self.steps[0] / self.parts:
+            block = np.zeros((3 * n, 3 * n))
+            block[:n, :n], block[:n, n : 2 * n] = self.system.generator * length, np.eye(n) * length
+            block[n : 2 * n, 2 * n :] = np.eye(n)
+            whole = _exponential(block)
+            found.append((whole[:n, :n], whole[:n, n : 2 * n] - whole[:n, 2 * n :], whole[:n, 2 * n :]))
+        moves, begins, ends = (np.ascontiguousarray(items) for items in zip(*found, strict=True))
+        return moves, begins, ends
+
+    @cached_property
+    def fine_time(self) -> FloatArray:
+        """Fine stamps (F,) [s]."""
+        count = len(self.time)
+        return np.interp(np.arange((count - 1) * self.parts + 1) / self.parts, np.arange(count), self.time)
+
+    def port_motion(self, port: int, added: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return position and speed (F,) of a port: the model's, and of an added state (F, n)."""
+        return (
+            self.positions[:, port] + added @ self.system.positions[port],
+            self.speeds[:, port] + added @ self.system.speeds[port],
+        )
+
+    def pushed(self, port: int, force: FloatArray) -> FloatArray:
+        """Return the state (F, n) that a force (F,) at a port adds."""
+        push = -self.system.actions[port]
+        start = np.zeros(len(push))
+        if self.settled and force[0] != 0.0:
+            start = np.linalg.lstsq(self.system.generator, -push * force[0], rcond=1e-12)[0]
+        return self._moved(start, push[:, None], force[:, None])
+
+    def turned(self, slope: FloatArray, added: FloatArray) -> FloatArray:
+        """Return the state (F, n) that a change of the generator makes of an added state (F, n)."""
+        rows = np.flatnonzero(np.any(slope, axis=1))
+        return self._moved(np.zeros(len(slope)), np.eye(len(slope))[:, rows], added @ slope[rows].T)
+
+    def _moved(self, start: FloatArray, directions: FloatArray, pushes: FloatArray) -> FloatArray:
+        moves, begins, ends = self.fine
+        given = (begins @ directions, ends @ directions, self.steps[1], start, pushes)
+        return np.asarray(_driven(self.parts, moves, *(np.ascontiguousarray(item) for item in given)))
+
+    def readings(self, states: FloatArray, port: int = 0, force: FloatArray | None = None) -> FloatArray:
+        """Return what readings (N, C) show of an added state (F, n), and at once of a force (F,) at a port."""
+        shown = states[:: self.parts] @ self.system.outputs.T
+        if force is not None:
+            shown -= np.outer(force[:: self.parts], self.system.through[port])
+        return self.over_noise(shown)
+
+    def over_noise(self, columns: FloatArray) -> FloatArray:
+        """Return columns (..., N, C) over the noise's deviations, zero where a reading does not count."""
+        return np.asarray(columns / self.deviation * self.used)
+
+
+def _exponential(matrix: FloatArray) -> FloatArray:
+    from scipy.linalg import expm
+
+    return np.asarray(expm(matrix))
+
+
+def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
+    """Return a dynamic trial of a problem, linear about a point; its model must tell how ports move."""
+    data, model, campaign = problem.trials[number], problem.model.inner, problem.campaign
+    trial, shared, unknowns = data.trial, problem.shared, data.unknowns
+    parts = problem.linearise(number, point, Candidate())
+    gains = 1.0 + shared.gains(point.shared, trial.channels)
+    used = data.weight > 0.0
+
+    def over(columns: FloatArray) -> FloatArray:
+        return np.asarray(columns / data.deviation * used)
+
+    of_gains = np.zeros((len(shared.gain_channels), *parts.response.shape))
+    for row, name in enumerate(shared.gain_channels):
+        if name in trial.channels:
+            column = trial.channels.index(name)
+            of_gains[row, :, column] = shared.gain_scale[row] * parts.response[:, column]
+    zeros = np.zeros((unknowns.zeros, *parts.response.shape))
+    zeros[np.arange(unknowns.zeros), :, unknowns.zero_columns] = unknowns.zero_scale[:, None]
+    outputs = tuple((campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels)
+
+    def system(u: FloatArray) -> PortedSystem:
+        return model.ported(trial, outputs, shared.parameters(u))  # type: ignore[attr-defined, no-any-return]
+
+    base = system(point.shared)
+    slopes: list[FloatArray | None] = []
+    for k in range(shared.size):
+        if k >= len(shared.parameter_mean):
+            slopes.append(None)
+            continue
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = point.shared.copy()
+            moved[k] = sign * SMALL
+            ends.append(system(moved).generator)
+        slopes.append((ends[0] - ends[1]) / (2.0 * SMALL))
+    interval = float(np.median(np.diff(trial.time)))
+    fastest = float(np.max(np.abs(np.linalg.eigvals(base.generator)), initial=0.0))
+    count = int(np.clip(np.ceil(fastest * interval / FINE_PHASE), COARSEST, FINEST))
+    conditions = unknowns.conditions(trial, shared.parameters(point.shared), point.local[number])
+    positions, speeds = model.port_motion(refined(trial, count), conditions)  # type: ignore[attr-defined]
+    by_shared = over(np.concatenate((parts.parameters * gains, of_gains)))
+    by_local = over(np.concatenate((zeros, parts.local * gains)))
+    residual = over(trial.values - problem.prediction(number, point, parts.response))
+    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
+    return SeenTrial(
+        trial.name, trial.time, residual, used,
+        data.deviation, by_shared, by_local, unknowns.precision, base, slopes, count,
+        positions, speeds, trial.begins.value == "settled" and trial.kind.value != "ringdown",
+    )  # fmt: skip
+

@@ -1,0 +1,150 @@
+"""A model in motion as a linear system with ports: what a force that nobody knows of would do to readings.
+
+s' = A s - sum_p b_p g_p, y = C s - sum_p e_p g_p, in the coordinates s = (q, q') of the modes. What is known
+to act is in the model's own response; s is what a missing force adds to it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import Hold, Trial, TrialKind
+from discrepancy.models.input_course import Course
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PortedSystem:
+    """A linear system with ports.
+
+    Attributes
+    ----------
+    generator : (n, n) ndarray
+        A [1/s].
+    ports : tuple of str
+        Names, P of them.
+    actions : (P, n) ndarray
+        b of each port: what takes its force from the state.
+    positions, speeds : (P, n) ndarray
+        Rows by which a port moves.
+    outputs : (C, n) ndarray
+        Rows of the outputs.
+    through : (P, C) ndarray
+        e of each port: what an output shows of its force at once.
+    """
+
+    generator: FloatArray
+    ports: tuple[str, ...]
+    actions: FloatArray
+    positions: FloatArray
+    speeds: FloatArray
+    outputs: FloatArray
+    through: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PortedMotion:
+    """A trial as a model has it, and what a missing force would add.
+
+    Attributes
+    ----------
+    system : PortedSystem
+        The latter.
+    positions, speeds : (N, P) ndarray
+        Motion of the ports by the model at the trial's stamps.
+    """
+
+    system: PortedSystem
+    positions: FloatArray
+    speeds: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class OutputRows:
+    """What outputs show: rows of q, q', q'' (C, M) each, and what they show of a port's force (P, C)."""
+
+    displacement: FloatArray
+    speed: FloatArray
+    acceleration: FloatArray
+    force: FloatArray
+
+
+def modal_system(
+    mass: FloatArray,
+    damping: FloatArray,
+    stiffness: FloatArray,
+    ports: dict[str, tuple[FloatArray, FloatArray]],
+    shown: OutputRows,
+    moving: int,
+) -> PortedSystem:
+    """Return the linear system of M q'' + D q' + K q = -sum_p acts_p g_p.
+
+    Parameters
+    ----------
+    mass, damping, stiffness : (M, M) ndarray
+        In modal coordinates.
+    ports : dict of str to ((M,) ndarray, (M,) ndarray)
+        Row by which each port moves, and row along which its force acts.
+    shown : OutputRows
+        Of the outputs.
+    moving : int
+        The first coordinates; of the others, which are states, only the speeds are kept.
+    """
+    count = len(mass)
+    sees, acts = (np.array([rows[k] for rows in ports.values()]).reshape(len(ports), count) for k in (0, 1))
+    by_stiffness, by_damping = np.linalg.solve(mass, stiffness), np.linalg.solve(mass, damping)
+    push = np.linalg.solve(mass, acts.T).T
+    generator = np.zeros((moving + count, moving + count))
+    generator[:moving, moving : 2 * moving] = np.eye(moving)
+    generator[moving:, :moving] = -by_stiffness[:, :moving]
+    generator[moving:, moving:] = -by_damping
+    outputs = np.hstack(
+        (
+            (shown.displacement - shown.acceleration @ by_stiffness)[:, :moving],
+            shown.speed - shown.acceleration @ by_damping,
+        )
+    )
+    none = np.zeros((len(sees), count))
+    held = np.hstack((sees[:, :moving], none))
+    # the position of a port of states is their sum: the speeds of their coordinates
+    held[:, 2 * moving :] += sees[:, moving:]
+    speeds = np.hstack((none[:, :moving], sees))
+    speeds[:, 2 * moving :] = 0.0
+    of_states = np.any(sees[:, moving:], axis=1)
+    speeds[of_states] = held[of_states] @ generator
+    return PortedSystem(
+        generator, tuple(ports), np.hstack((none[:, :moving], push)), held, speeds, outputs,
+        push @ shown.acceleration.T - shown.force,
+    )  # fmt: skip
+
+
+def refined(trial: Trial, parts: int) -> Trial:
+    """Return a trial with stamps that are `parts` times denser, its inputs as they are between samples."""
+    count = len(trial.time)
+    at = np.arange((count - 1) * parts + 1) / parts
+    row = np.minimum(at.astype(np.int64), count - 2)
+    time = np.interp(at, np.arange(count), trial.time)
+    time[::parts] = trial.time
+
+    def dense(values: FloatArray) -> FloatArray:
+        share = (at - row).reshape((-1, *(1,) * (values.ndim - 1)))
+        return np.asarray((1.0 - share) * values[row] + share * values[row + 1])
+
+    def held(values: FloatArray, hold: Hold) -> FloatArray:
+        if hold is Hold.ZERO_ORDER:
+            return np.asarray(values[np.minimum((at + 1e-9).astype(np.int64), count - 1)])
+        return Course.of(trial.time, values, hold).at(time)
+
+    return replace(
+        trial, time=time, values=dense(trial.values), used=np.ones((len(time), trial.used.shape[1]), bool),
+        force=dense(trial.force), load_factor=dense(trial.load_factor), temperature=dense(trial.temperature),
+        health=dense(trial.health), health_deviation=dense(trial.health_deviation),
+        inputs=tuple(replace(item, values=held(item.values, item.hold)) for item in trial.inputs),
+    )  # fmt: skip
+
+
+def can_be_seen(trial: Trial) -> bool:
+    """Whether a trial has a motion in which a missing force can be seen."""
+    return trial.kind in (TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN)
