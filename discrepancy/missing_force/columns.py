@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.linearisation import Point
@@ -25,6 +26,8 @@ FloatArray = NDArray[np.float64]
 LEVELS = (-1.3, -0.4, 0.4, 1.3)
 """Standard normal values at which the numbers of an effect that are no magnitudes are tried."""
 MOST_VARIANTS = 16
+AWAY = 0.5
+"""Standard normal value of a magnitude, in whose units its column is."""
 
 
 def variants(term: Term) -> list[FloatArray]:
@@ -34,6 +37,7 @@ def variants(term: Term) -> list[FloatArray]:
     found = []
     for chosen in list(product(*levels))[:MOST_VARIANTS]:
         values = term.start()
+        values[: len(term.effect.parameters)] = AWAY  # the middle of a prior of both signs is no effect at all
         values[free] = chosen
         found.append(values)
     return found
@@ -62,32 +66,49 @@ class Columns:
         """
         try:
             patch = Candidate((term,)).patch(self.problem.setting, values)
+        except DiscrepancyError:
+            return None
+        found = self.of_patch(view, motions, patch, term.effect.acts_on)
+        magnitudes = [item.prior for item in term.effect.parameters if item.magnitude]
+        both = any(prior.low < 0.0 for prior in magnitudes)
+        return None if found is None else replace(found, both_signs=both)
+
+    def of_patch(
+        self,
+        view: View,
+        motions: Sequence[Motion],
+        patch: ModelPatch,
+        acts_on: frozenset[TrialKind] = frozenset(TrialKind),
+    ) -> Column | None:
+        """Return the column of a patch, None where it does nothing or cannot be."""
+        try:
             parts = [
-                self._part(view, trial, motion, number, patch, term)
+                self._part(view, trial, motion, number, patch.in_trial(trial.name), acts_on)
                 for trial, motion, number in zip(view.trials, motions, self.numbers, strict=True)
             ]
         except (DiscrepancyError, InvalidPatchError):
             return None
         finite = all(np.all(np.isfinite(part.readings)) for part in parts)
-        if not finite or not any(np.any(part.readings) for part in parts):
-            return None
-        return Column(parts, 0.0)
+        return Column(parts, 0.0) if finite and any(np.any(part.readings) for part in parts) else None
 
     def _part(
-        self, view: View, trial: SeenTrial, motion: Motion, number: int, patch: ModelPatch, term: Term
+        self,
+        view: View,
+        trial: SeenTrial,
+        motion: Motion,
+        number: int,
+        patch: ModelPatch,
+        acts_on: frozenset[TrialKind],
     ) -> Part:
-        data = self.problem.trials[number]
-        nothing = Part(np.zeros_like(trial.residual))
-        if data.trial.kind not in term.effect.acts_on:
-            return nothing
-        own = patch.in_trial(data.trial.name)
-        sensors = own.of(*SENSORS)
-        forces = ModelPatch(tuple(item for item in own if isinstance(item, PortForce)))
-        rest = ModelPatch(tuple(item for item in own if item not in (*forces, *sensors)))
+        kind = self.problem.trials[number].trial.kind
+        if kind not in acts_on or not len(patch):
+            return Part(np.zeros_like(trial.residual))
+        sensors = patch.of(*SENSORS)
+        forces = ModelPatch(tuple(item for item in patch if isinstance(item, PortForce)))
         if len(forces):
             return self._forced(trial, motion, forces)
-        if len(rest) or not len(sensors) or sensors.of(LoggerClock):
-            return Part(self._changed(number, own, trial)) if len(own) else nothing
+        if len(sensors) < len(patch) or len(sensors.of(LoggerClock)):
+            return Part(self._changed(number, patch, trial))
         return Part(self._shown(view, trial, motion, number, sensors))
 
     def _forced(self, trial: SeenTrial, motion: Motion, laws: ModelPatch) -> Part:
@@ -97,7 +118,7 @@ class Columns:
         readings = np.zeros_like(trial.residual)
         forces: dict[int, FloatArray] = {}
         time = trial.fine_time
-        for law in laws:
+        for law in self.problem.model.inner.at_ports(laws):  # type: ignore[attr-defined]
             port = names.index(law.port)  # type: ignore[attr-defined]
             position, speed = trial.port_motion(port, motion.added)
             course = law_course(law, time, position, speed)  # type: ignore[arg-type]

@@ -90,25 +90,36 @@ class Filtered:
         return units
 
     @cached_property
+    def _white(self) -> FloatArray:
+        """Deviation (C,) of each channel's noise over that of what is white of it."""
+        found = np.ones(len(self.trial.deviation))
+        for channel, share, _ in self.trial.coloured:
+            found[channel] = 1.0 / np.sqrt(1.0 - share)
+        return found
+
+    @cached_property
     def _system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Generator, noise intensity, rows of the readings, covariance at the first sample."""
         trial, own = self.trial, self.process.generator
-        n, units = len(trial.system.generator), self._scale
-        whole = n + len(own)
-        generator = np.zeros((whole, whole))
+        n, units, noises = len(trial.system.generator), self._scale, len(trial.coloured)
+        force = slice(n, n + len(own))
+        whole = n + len(own) + noises
+        generator, intensity, start = np.zeros((3, whole, whole))
         generator[:n, :n] = trial.system.generator * units / units[:, None]
         generator[:n, n] = -trial.system.actions[self.port] * self.process.size / units
-        generator[n:, n:] = own
-        intensity = np.zeros((whole, whole))
-        intensity[-1, -1] = self.process.intensity
+        generator[force, force] = own
+        intensity[force.stop - 1, force.stop - 1] = self.process.intensity
         rows = np.zeros((len(trial.deviation), whole))
         rows[:, :n] = trial.system.outputs * units / trial.deviation[:, None]
         rows[:, n] = -trial.system.through[self.port] * self.process.size / trial.deviation
-        start = np.zeros((whole, whole))
-        start[n:, n:] = np.eye(len(own))
+        start[force, force] = np.eye(len(own))
         if trial.settled:  # at rest under the missing force too
             begun = np.linalg.lstsq(generator[:n, :n], -generator[:n, n], rcond=1e-12)[0]
             start[:n, :n], start[:n, n], start[n, :n] = np.outer(begun, begun), begun, begun
+        for at, (channel, share, rate) in enumerate(trial.coloured, force.stop):
+            generator[at, at], intensity[at, at], start[at, at] = -rate, 2.0 * rate, 1.0
+            rows[channel, at] = np.sqrt(share)
+        rows *= self._white[:, None]
         return generator, intensity, rows, start
 
     def _steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -141,12 +152,13 @@ class Filtered:
     def log_determinant(self) -> float:
         """Half the sum of the logarithms of the readings' variances given those before [nat]."""
         _, slot, _, sizes, _, _ = self._passed
-        return 0.5 * float(np.sum(np.log(sizes[slot]) * self.trial.used))
+        white = np.sum(self.trial.used * np.log(self._white))
+        return 0.5 * float(np.sum(np.log(sizes[slot]) * self.trial.used)) - float(white)
 
     def whitened(self, columns: FloatArray) -> FloatArray:
         """Return columns (K, N, C) as independent numbers of variance one (N C, K)."""
         moves, slot, gains, sizes, _, _ = self._passed
-        given = np.ascontiguousarray(np.moveaxis(columns, 0, -1))
+        given = np.ascontiguousarray(np.moveaxis(columns * self._white, 0, -1))
         found = _whitened(
             moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, given
         )
@@ -158,7 +170,7 @@ class Filtered:
         lengths, which = self.trial.steps
         rows = self._system[2]
         means, later = _smoothed(
-            moves, which, rows, self.trial.used, slot, gains, sizes, np.ascontiguousarray(readings)
+            moves, which, rows, self.trial.used, slot, gains, sizes, np.ascontiguousarray(readings * self._white)
         )
         parts = self.trial.parts
         fine = self._steps(lengths / parts)

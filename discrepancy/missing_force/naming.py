@@ -15,7 +15,7 @@ from .columns import Columns, variants, with_prior
 from .filtered import Process
 from .regression import Solution
 from .trial import seen_trial
-from .view import Column, Motion, View
+from .view import SHARES, Column, Motion, View
 
 FloatArray = NDArray[np.float64]
 
@@ -69,9 +69,9 @@ class Seen:
         return found
 
 
-def seen(view: View, about: Process) -> Seen:
+def seen(view: View, about: Process, shares: Sequence[float] = SHARES) -> Seen:
     """Return the missing force at a view's port."""
-    process, evidence = view.most_probable(about)
+    process, evidence = view.most_probable(about, shares)
     return Seen(view, process, evidence, *view.smoothed(process))
 
 
@@ -101,21 +101,35 @@ class ForceSearch:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+        linear, self.laws = problem.model.inner.apart()  # type: ignore[attr-defined]
+        trials = tuple(data.trial for data in problem.trials)
+        self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.at: dict[str, Seen] = {}
+        self.point = self.problem.start(Candidate())
 
     def locate(self) -> dict[str, Seen]:
-        """Return the missing force at each port."""
+        """Return the missing force at each port.
+
+        First along the model's own motion, for the initial states; then along the motion that was, with the
+        parameters about where they are and the laws that the model has itself.
+        """
         problem = self.problem
-        point = problem.start(Candidate())
-        for _ in range(2):  # parameters and initial states first, then linear about these
-            trials = [seen_trial(problem, number, point) for number in self.numbers]
+        for turn in range(2):
+            trials = [seen_trial(problem, number, self.point) for number in self.numbers]
+            columns = Columns(problem, self.numbers, self.point)
             for port, name in enumerate(problem.model.ports()):
                 view = View(trials, port, problem.shared.precision)
-                self.at[name] = seen(view, self.at[name].process if name in self.at else self._about(name))
-            point = self._point(self.best())
-        self.point = point
+                if not turn:
+                    self.at[name] = seen(view, self._about(name), SHARES[:1])
+                    continue
+                before = self.at[name]
+                found = view.smoothed(before.process)
+                own = columns.of_patch(view, found[2], self.laws) if len(self.laws) else None
+                view = replace(view, motions=found[2], certain=() if own is None else (own,))
+                self.at[name] = seen(view, before.process)
+            if not turn:
+                self.point = self._point(self.best())
         return self.at
 
     def best(self) -> Seen:
@@ -187,9 +201,10 @@ class ForceSearch:
                 products = whole.products(process)
                 for number in range(len(columns)):
                     chosen = [*range(count), count + number]
-                    value = products.solve(chosen, whole.precision[chosen]).evidence
-                    best[number] = max(best[number], value)
-        return [(float(value), number) for number, value in enumerate(best)]
+                    solution = products.solve(chosen, whole.precision[chosen])
+                    if solution.mean[-1] > 0.0 or columns[number].both_signs:
+                        best[number] = max(best[number], solution.evidence)
+        return [(float(value), number) for number, value in enumerate(best) if np.isfinite(value)]
 
     def _followed(
         self, columns: Columns, at: Seen, term: Term, values: FloatArray, column: Column

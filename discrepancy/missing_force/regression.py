@@ -75,12 +75,14 @@ def local_solution(
     return coefficients, whitened.T @ whitened - cross.T @ coefficients, half
 
 
-def regression(filtered: Sequence[Filtered], columns: Sequence[FloatArray]) -> Regression:
-    """Return the products of residuals and columns (K, N, C), one set of a trial each, whitened alike."""
+def regression(
+    filtered: Sequence[Filtered], residuals: Sequence[FloatArray], columns: Sequence[FloatArray]
+) -> Regression:
+    """Return the products of residuals (N, C) and columns (K, N, C), one of a trial each, whitened alike."""
     total, log_determinant = 0.0, 0.0
-    for one, given in zip(filtered, columns, strict=True):
+    for one, residual, given in zip(filtered, residuals, columns, strict=True):
         trial = one.trial
-        whole = one.whitened(np.concatenate((trial.residual[None], given, trial.local)))
+        whole = one.whitened(np.concatenate((residual[None], given, trial.local)))
         split = 1 + len(given)
         _, products, half = local_solution(whole[:, :split], whole[:, split:], trial.local_precision)
         total = total + products

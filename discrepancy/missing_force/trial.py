@@ -11,7 +11,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
+from discrepancy.campaign.noise import NoiseModel
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
@@ -28,6 +30,8 @@ FINEST, COARSEST = 16, 4
 """Steps of an interval on which laws are evaluated, at most and at least."""
 FINE_PHASE = 0.15
 """Radians of the fastest mode that such a step may span."""
+LONGEST_MEMORY, LEAST_WHITE = 2000, 1e-3
+"""Samples that a coloured noise remembers at most; the least share of its variance that is taken as white."""
 SMALL = 1e-3
 """Step of the derivative of a system by a parameter, in prior deviations."""
 
@@ -50,6 +54,8 @@ class SeenTrial:
         Readings that count.
     deviation : (C,) ndarray
         Of the noise.
+    coloured : sequence of (int, float, float)
+        Channels whose noise has a part that decays in time: its share of the variance, and its rate [1/s].
     shared, local : (K, N, C), (L, N, C) ndarray
         What a unit of each scaled unknown does to readings.
     local_precision : (L,) ndarray
@@ -71,6 +77,7 @@ class SeenTrial:
     residual: FloatArray
     used: BoolArray
     deviation: FloatArray
+    coloured: Sequence[tuple[int, float, float]]
     shared: FloatArray
     local: FloatArray
     local_precision: FloatArray
@@ -154,16 +161,37 @@ def _exponential(matrix: FloatArray) -> FloatArray:
     return np.asarray(expm(matrix))
 
 
+def decaying_part(noise: NoiseModel, interval: float) -> tuple[float, float] | None:
+    """Return the share of a noise's variance that decays in time, and its rate [1/s]; None: it is white.
+
+    From the correlation at one and two samples: exact for an autoregression of first order.
+    """
+    if not noise.applies(interval):
+        return None
+    answer = lfilter([1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_MEMORY)])
+    at = [float(answer[: len(answer) - lag] @ answer[lag:]) for lag in range(3)]
+    if not 0.0 < at[2] < at[1]:
+        return None
+    decay = at[2] / at[1]
+    return min(at[1] / decay / at[0], 1.0 - LEAST_WHITE), -float(np.log(decay)) / interval
+
+
 def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     """Return a dynamic trial of a problem, linear about a point; its model must tell how ports move."""
     data, model, campaign = problem.trials[number], problem.model.inner, problem.campaign
     trial, shared, unknowns = data.trial, problem.shared, data.unknowns
     parts = problem.linearise(number, point, Candidate())
     gains = 1.0 + shared.gains(point.shared, trial.channels)
-    used = data.weight > 0.0
+    used = trial.used
+    deviation = trial.noise_factor * np.array([item.static_deviation for item in data.noise])
+    coloured = [
+        (number, *part)
+        for number, item in enumerate(data.noise)
+        if trial.whitened_at is not None and (part := decaying_part(item, trial.whitened_at)) is not None
+    ]
 
     def over(columns: FloatArray) -> FloatArray:
-        return np.asarray(columns / data.deviation * used)
+        return np.asarray(columns / deviation * used)
 
     of_gains = np.zeros((len(shared.gain_channels), *parts.response.shape))
     for row, name in enumerate(shared.gain_channels):
@@ -200,7 +228,7 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
     return SeenTrial(
         trial.name, trial.time, residual, used,
-        data.deviation, by_shared, by_local, unknowns.precision, base, slopes, count,
+        deviation, coloured, by_shared, by_local, unknowns.precision, base, slopes, count,
         positions, speeds, trial.begins.value == "settled" and trial.kind.value != "ringdown",
     )  # fmt: skip
 

@@ -52,10 +52,21 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """An effect as a column: its part in each trial, and the prior precision of its unknown."""
+    """An effect as a column.
+
+    Attributes
+    ----------
+    parts : sequence of Part
+        By trial.
+    precision : float
+        Prior precision of its unknown.
+    both_signs : bool
+        Whether that may be negative.
+    """
 
     parts: Sequence[Part]
     precision: float
+    both_signs: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +84,9 @@ class View:
     motions : sequence of Motion
         By trial, along which laws and parameters act; empty: that of the model.
     effects : sequence of Column
-        What acts for certain.
+        What may be a part of it, each in proportion to one more unknown.
+    certain : sequence of Column
+        What is known to act, as it is.
     """
 
     trials: Sequence[SeenTrial]
@@ -81,6 +94,7 @@ class View:
     shared_precision: FloatArray
     motions: Sequence[Motion] = ()
     effects: Sequence[Column] = ()
+    certain: Sequence[Column] = ()
 
     @cached_property
     def precision(self) -> FloatArray:
@@ -110,20 +124,32 @@ class View:
             found.append(np.concatenate((columns, *effects)))
         return found
 
+    @cached_property
+    def residuals(self) -> list[FloatArray]:
+        """Residuals (N, C) beside what is certain, by trial."""
+        found = []
+        for number, trial in enumerate(self.trials):
+            known = [item.parts[number].readings for item in self.certain]
+            found.append(trial.residual - sum(known) if known else trial.residual)
+        return found
+
     def filtered(self, process: Process) -> list[Filtered]:
         """Return the filters of a process."""
         return [Filtered(trial, self.port, process) for trial in self.trials]
 
     def products(self, process: Process) -> Regression:
         """Return the products of all columns beside a process."""
-        return regression(self.filtered(process), self.columns)
+        return regression(self.filtered(process), self.residuals, self.columns)
 
     def solve(self, process: Process) -> Solution:
         """Return evidence and values of all unknowns beside a process."""
         return self.products(process).solve(range(len(self.precision)), self.precision)
 
-    def most_probable(self, about: Process) -> tuple[Process, float]:
-        """Return the process of the largest evidence times its prior about one, and its logarithm [nat]."""
+    def most_probable(self, about: Process, shares: Sequence[float] = SHARES) -> tuple[Process, float]:
+        """Return the process of the largest evidence times its prior about one, and its logarithm [nat].
+
+        It is looked for from each of some shares of the size.
+        """
 
         def objective(logs: FloatArray) -> float:
             size, time = np.exp(np.clip(logs, -12.0, 12.0))
@@ -131,7 +157,7 @@ class View:
             return float(0.5 * (logs[0] / SIZE_DOUBT) ** 2 + 0.5 * (logs[1] / TIME_DOUBT) ** 2 - value)
 
         best, least = np.zeros(2), np.inf
-        for share in SHARES:
+        for share in shares:
             first = np.array([np.log(share), 0.0])
             simplex = np.array([first, first + [0.9, 0.0], first + [0.0, 0.7]])
             options = {"xatol": 0.05, "fatol": 0.2, "maxfev": MOST_PASSES, "initial_simplex": simplex}
@@ -147,7 +173,7 @@ class View:
         motions, local = [], []
         for number, one in enumerate(self.filtered(process)):
             trial = one.trial
-            left = trial.residual - np.tensordot(solution.mean, self.columns[number], 1)
+            left = self.residuals[number] - np.tensordot(solution.mean, self.columns[number], 1)
             if len(trial.local):
                 whole = one.whitened(np.concatenate((left[None], trial.local)))
                 values = local_solution(whole[:, :1], whole[:, 1:], trial.local_precision)[0][:, 0]
@@ -159,11 +185,12 @@ class View:
             for mean, state in zip(solution.mean[:count], self.turned[number], strict=True):
                 if state is not None:
                     added = added + mean * state
-            for mean, item in zip(solution.mean[count:], self.effects, strict=True):
+            weights = (*solution.mean[count:], *(1.0 for _ in self.certain))
+            for mean, item in zip(weights, (*self.effects, *self.certain), strict=True):
                 part = item.parts[number]
                 if part.added is not None:
                     added = added + mean * part.added
-                if self.port in part.forces:
+                if self.port in part.forces and item not in self.certain:
                     force = force + mean * part.forces[self.port]
             motions.append(Motion(added, force))
             local.append(values)

@@ -267,6 +267,19 @@ class LumpedModel:
             lumped.shown(outputs, drives), self._rig(mean, (), warm).rig(drives).free_shapes
         )
 
+    @staticmethod
+    def at_ports(forces: ModelPatch) -> ModelPatch:
+        """Return forces as they act at the ports of `ported`: as they are."""
+        return forces
+
+    def apart(self) -> "tuple[LumpedModel, ModelPatch]":
+        """Return the linear model, and the laws that it has beside that, at the prior means."""
+        if not self.description.law:
+            return self, ModelPatch()
+        mean = np.array([item.mean for item in self._parameters])
+        laws = self._rig(mean, (), 0.0).own_laws
+        return LumpedModel(self.description.model_copy(update={"law": []})), laws
+
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         warm = float(trial.temperature[0])

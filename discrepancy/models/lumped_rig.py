@@ -329,10 +329,8 @@ class LumpedRig:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         rig, acting, _ = self.acting(trial, conditions, 0.0, 0.0, None)
         motion = rig.motion(acting, NO_LAWS)
-        n, rows = rig.displacements, np.array(list(rig.ports.values())).reshape(-1, self.width)
-        of_u, of_x = rows[:, :n] @ rig.shapes[:n], rows[:, n:] @ rig.shapes[n:]
-        positions = motion.q @ of_u.T + motion.velocity @ of_x.T
-        return positions, motion.velocity @ of_u.T + motion.acceleration @ of_x.T
+        shapes = np.array(list(rig.ports.values())).reshape(-1, self.width) @ rig.shapes
+        return motion.q @ shapes.T, motion.velocity @ shapes.T
 
     def shown(
         self,

@@ -28,7 +28,7 @@ class PortedSystem:
     actions : (P, n) ndarray
         b of each port: what takes its force from the state.
     positions, speeds : (P, n) ndarray
-        Rows by which a port moves.
+        Rows by which a port moves. A port of a state moves at the speed that the state is.
     outputs : (C, n) ndarray
         Rows of the outputs.
     through : (P, C) ndarray
@@ -107,13 +107,7 @@ def modal_system(
         )
     )
     none = np.zeros((len(sees), count))
-    held = np.hstack((sees[:, :moving], none))
-    # the position of a port of states is their sum: the speeds of their coordinates
-    held[:, 2 * moving :] += sees[:, moving:]
-    speeds = np.hstack((none[:, :moving], sees))
-    speeds[:, 2 * moving :] = 0.0
-    of_states = np.any(sees[:, moving:], axis=1)
-    speeds[of_states] = held[of_states] @ generator
+    held, speeds = np.hstack((sees[:, :moving], none)), np.hstack((none[:, :moving], sees))
     return PortedSystem(
         generator, tuple(ports), np.hstack((none[:, :moving], push)), held, speeds, outputs,
         push @ shown.acceleration.T - shown.force,

@@ -22,6 +22,7 @@ from discrepancy.models.interface import (
     check_plain,
 )
 from discrepancy.models.memory import Memory
+from discrepancy.models.ported import PortedSystem
 from discrepancy.models.wing_structure import MovingWing, Outputs, Stiffness, WingStructure
 from fe.reduction.patch_cache import patch_arrays
 from fe.reduction.stages import Progress
@@ -382,6 +383,39 @@ class WingModel:
             motion.values(self._structure.output_rows(outputs, number, losses) @ basis) for number in (1, 2)
         )
         return Response(response.values, response.rates, across, shear)
+
+    def ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+        """Return the system by which outputs see missing forces in a trial, in the modes of the prior means."""
+        mean = np.array([item.mean for item in self._parameters])
+        base, moved = (self._moved(trial, values) for values in (mean, parameters))
+        rows = self._structure.output_rows(outputs, 0, ModelPatch())
+        # both bases hold nearly the same shapes of the whole wing
+        shapes = np.linalg.lstsq(moved.basis, base.basis @ base.system.shapes, rcond=None)[0]
+        return moved.system.ported(rows @ moved.basis, [quantity for _, quantity in outputs], shapes)
+
+    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
+        """Return positions and speeds (N, P) of the ports in a dynamic trial."""
+        moved = self._moved(trial, conditions.parameters, conditions.health)
+        row = self.wing.force_row(trial.load_place) @ moved.basis
+        if trial.kind is TrialKind.RINGDOWN and trial.release is not None:
+            motion = moved.system.ringdown(
+                row, trial.release, conditions.initial, trial.time, NO_LAWS, clock=conditions.clock
+            )
+        else:
+            motion = moved.system.forced(row, trial.force, trial.time, NO_LAWS, clock=conditions.clock)
+        rows = np.array(list(moved.system.ports.values()))
+        return motion.values(rows), motion.velocity @ (rows @ moved.system.shapes).T
+
+    def _moved(self, trial: Trial, parameters: FloatArray, health: FloatArray | None = None) -> MovingWing:
+        losses = self._losses(trial.health[:1] if health is None else health)[0]
+        warm = float(trial.temperature[0])
+        return self._structure.moving(
+            parameters, tuple(losses), ModelPatch(), warm, trial.load_place, STATION_PORTS
+        )
+
+    def at_ports(self, forces: ModelPatch) -> ModelPatch:
+        """Return forces as they act at the ports of `ported`."""
+        return self.wing.internal_forces(forces)
 
     # ------------------------------------------------------------ parts
 
