@@ -108,13 +108,16 @@ class ForceSearch:
         self.at: dict[str, Seen] = {}
         self.point = self.problem.start(Candidate())
 
-    def locate(self) -> dict[str, Seen]:
+    def locate(self, about: Point | None = None) -> dict[str, Seen]:
         """Return the missing force at each port.
 
         First along the model's own motion, for the initial states; then along the motion that was, with the
-        parameters about where they are and the laws that the model has itself.
+        parameters about where they are and the laws that the model has itself. `about`: where these are, if a
+        fit tells it; what a law alone shows (the speed at which a body began to fall) it alone knows.
         """
         problem = self.problem
+        if about is not None:
+            self.point = Point(about.shared, about.local, np.zeros(0))
         for turn in range(2):
             trials = [seen_trial(problem, number, self.point) for number in self.numbers]
             columns = Columns(problem, self.numbers, self.point)
@@ -128,7 +131,7 @@ class ForceSearch:
                 own = columns.of_patch(view, found[2], self.laws) if len(self.laws) else None
                 view = replace(view, motions=found[2], certain=() if own is None else (own,))
                 self.at[name] = seen(view, before.process)
-            if not turn:
+            if not turn and about is None:
                 self.point = self._point(self.best())
         return self.at
 

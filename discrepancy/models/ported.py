@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Hold, Trial, TrialKind
+from discrepancy.campaign.records import Hold, Trial
 from discrepancy.models.input_course import Course
 
 FloatArray = NDArray[np.float64]
@@ -139,6 +139,6 @@ def refined(trial: Trial, parts: int) -> Trial:
     )  # fmt: skip
 
 
-def can_be_seen(trial: Trial) -> bool:
-    """Whether a trial has a motion in which a missing force can be seen."""
-    return trial.kind in (TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN)
+def shows_ports(model: object) -> bool:
+    """Whether a model tells how its ports move (`ported`, `port_motion`, `at_ports` and `apart`)."""
+    return all(hasattr(model, name) for name in ("ported", "port_motion", "at_ports", "apart"))
