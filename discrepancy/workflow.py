@@ -33,6 +33,7 @@ from discrepancy.judgement.when import acting_sentence, begins_inside, when_sent
 from discrepancy.location.change_points import GapWindow, gap_windows
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
+from discrepancy.missing_force.force import MissingForce, missing_force
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.search.strategy import Search, solver_share
@@ -89,6 +90,8 @@ class Investigation:
         The conclusion.
     location : Location or None
         Where model and data disagree, before anything is added.
+    missing : MissingForce or None
+        The force that the model lacks at a port; None where there is none, or none can be seen.
     proof : Proof or None
         Where an effect was named, or is the most probable one.
     before, after : ResidualSet or None
@@ -111,6 +114,7 @@ class Investigation:
     search: Search | None = None
     fit: CandidateFit | None = None
     seconds: dict[str, float] | None = None
+    missing: MissingForce | None = None
 
 
 def investigate(
@@ -200,6 +204,10 @@ def investigate(
                 windows += gap_windows(after, seed=seed, with_effect=True)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
+    missing = None
+    if thorough:
+        with stage("Seeing the missing force", "force"):
+            missing = missing_force(problem, fit)
     proof = None
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
@@ -213,7 +221,19 @@ def investigate(
         not_fitted=not_fitted(problem.setting, catalogue, search), windows=windows,
     )  # fmt: skip
     return Investigation(
-        campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds
+        campaign,
+        model,
+        faults,
+        verdict,
+        location,
+        proof,
+        before,
+        after,
+        problem,
+        search,
+        fit,
+        seconds,
+        missing,
     )
 
 

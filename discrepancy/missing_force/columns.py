@@ -37,7 +37,9 @@ def variants(term: Term) -> list[FloatArray]:
     found = []
     for chosen in list(product(*levels))[:MOST_VARIANTS]:
         values = term.start()
-        values[: len(term.effect.parameters)] = AWAY  # the middle of a prior of both signs is no effect at all
+        values[: len(term.effect.parameters)] = (
+            AWAY  # the middle of a prior of both signs is no effect at all
+        )
         values[free] = chosen
         found.append(values)
     return found
@@ -119,9 +121,9 @@ class Columns:
         forces: dict[int, FloatArray] = {}
         time = trial.fine_time
         for law in self.problem.model.inner.at_ports(laws):  # type: ignore[attr-defined]
-            port = names.index(law.port)  # type: ignore[attr-defined]
+            port = names.index(law.port)
             position, speed = trial.port_motion(port, motion.added)
-            course = law_course(law, time, position, speed)  # type: ignore[arg-type]
+            course = law_course(law, time, position, speed)
             state = trial.pushed(port, course)
             added += state
             readings += trial.readings(state, port, course)

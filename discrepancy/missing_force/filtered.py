@@ -51,7 +51,7 @@ class Process:
         if self.rough:
             return np.array([[-1.0 / self.time]])
         rate = np.sqrt(3.0) / self.time
-        return rate * np.array([[0.0, 1.0], [-1.0, -2.0]])
+        return np.asarray(rate * np.array([[0.0, 1.0], [-1.0, -2.0]]))
 
     @property
     def intensity(self) -> float:
@@ -142,7 +142,9 @@ class Filtered:
         return np.ascontiguousarray(moves), np.ascontiguousarray(noises)
 
     @cached_property
-    def _passed(self) -> tuple[FloatArray, ...]:
+    def _passed(
+        self,
+    ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         lengths, which = self.trial.steps
         moves, noises = self._steps(lengths)
         _, _, rows, start = self._system
@@ -170,7 +172,14 @@ class Filtered:
         lengths, which = self.trial.steps
         rows = self._system[2]
         means, later = _smoothed(
-            moves, which, rows, self.trial.used, slot, gains, sizes, np.ascontiguousarray(readings * self._white)
+            moves,
+            which,
+            rows,
+            self.trial.used,
+            slot,
+            gains,
+            sizes,
+            np.ascontiguousarray(readings * self._white),
         )
         parts = self.trial.parts
         fine = self._steps(lengths / parts)

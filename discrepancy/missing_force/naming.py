@@ -175,7 +175,9 @@ class ForceSearch:
         for item in sorted(found, key=lambda item: item[0]):
             best[item[2].label, item[2].place] = item
         ranked = sorted(best.values(), key=lambda item: -item[0])[:KEPT]
-        return sorted((self._followed(columns, *item[1:]) for item in ranked), key=lambda item: -item.evidence)
+        return sorted(
+            (self._followed(columns, *item[1:]) for item in ranked), key=lambda item: -item.evidence
+        )
 
     @staticmethod
     def _scaled(column: Column, at: Seen) -> Column:

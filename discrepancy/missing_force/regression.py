@@ -79,7 +79,8 @@ def regression(
     filtered: Sequence[Filtered], residuals: Sequence[FloatArray], columns: Sequence[FloatArray]
 ) -> Regression:
     """Return the products of residuals (N, C) and columns (K, N, C), one of a trial each, whitened alike."""
-    total, log_determinant = 0.0, 0.0
+    total: FloatArray | float = 0.0
+    log_determinant = 0.0
     for one, residual, given in zip(filtered, residuals, columns, strict=True):
         trial = one.trial
         whole = one.whitened(np.concatenate((residual[None], given, trial.local)))

@@ -140,11 +140,12 @@ class SeenTrial:
 
     def _moved(self, start: FloatArray, directions: FloatArray, pushes: FloatArray) -> FloatArray:
         moves, begins, ends = self.fine
-        given = (begins @ directions, ends @ directions, self.steps[1], start, pushes)
-        return np.asarray(_driven(self.parts, moves, *(np.ascontiguousarray(item) for item in given)))
+        begins, ends = np.ascontiguousarray(begins @ directions), np.ascontiguousarray(ends @ directions)
+        pushes = np.ascontiguousarray(pushes)
+        return np.asarray(_driven(self.parts, moves, begins, ends, self.steps[1], start, pushes))
 
     def readings(self, states: FloatArray, port: int = 0, force: FloatArray | None = None) -> FloatArray:
-        """Return what readings (N, C) show of an added state (F, n), and at once of a force (F,) at a port."""
+        """Return what readings (N, C) show of an added state (F, n), and at once of a port's force (F,)."""
         shown = states[:: self.parts] @ self.system.outputs.T
         if force is not None:
             shown -= np.outer(force[:: self.parts], self.system.through[port])
@@ -200,7 +201,9 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
             of_gains[row, :, column] = shared.gain_scale[row] * parts.response[:, column]
     zeros = np.zeros((unknowns.zeros, *parts.response.shape))
     zeros[np.arange(unknowns.zeros), :, unknowns.zero_columns] = unknowns.zero_scale[:, None]
-    outputs = tuple((campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels)
+    outputs = tuple(
+        (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
+    )
 
     def system(u: FloatArray) -> PortedSystem:
         return model.ported(trial, outputs, shared.parameters(u))  # type: ignore[attr-defined, no-any-return]
@@ -231,4 +234,3 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         deviation, coloured, by_shared, by_local, unknowns.precision, base, slopes, count,
         positions, speeds, trial.begins.value == "settled" and trial.kind.value != "ringdown",
     )  # fmt: skip
-

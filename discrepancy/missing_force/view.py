@@ -107,7 +107,10 @@ class View:
         if not self.motions:
             return [[None] * len(trial.slopes) for trial in self.trials]
         return [
-            [None if slope is None or not np.any(slope) else trial.turned(slope, motion.added) for slope in trial.slopes]
+            [
+                None if slope is None or not np.any(slope) else trial.turned(slope, motion.added)
+                for slope in trial.slopes
+            ]
             for trial, motion in zip(self.trials, self.motions, strict=True)
         ]
 
@@ -159,7 +162,7 @@ class View:
         best, least = np.zeros(2), np.inf
         for share in shares:
             first = np.array([np.log(share), 0.0])
-            simplex = np.array([first, first + [0.9, 0.0], first + [0.0, 0.7]])
+            simplex = first + np.array([[0.0, 0.0], [0.9, 0.0], [0.0, 0.7]])
             options = {"xatol": 0.05, "fatol": 0.2, "maxfev": MOST_PASSES, "initial_simplex": simplex}
             found = minimize(objective, first, method="Nelder-Mead", options=options)
             if found.fun < least:

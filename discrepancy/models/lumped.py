@@ -253,7 +253,7 @@ class LumpedModel:
     def ported(
         self, trial: Trial, outputs: tuple[tuple[str, Quantity], ...], parameters: FloatArray
     ) -> PortedSystem:
-        """Return the system by which outputs see missing forces in a trial, in the modes of the prior means."""
+        """Return the system by which outputs see missing forces, in the modes of the prior means."""
         mean = np.array([item.mean for item in self._parameters])
         warm = float(trial.temperature[0])
         quantities = [quantity for _, quantity in outputs]

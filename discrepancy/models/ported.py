@@ -72,9 +72,7 @@ class OutputRows:
 
 
 def modal_system(
-    mass: FloatArray,
-    damping: FloatArray,
-    stiffness: FloatArray,
+    matrices: tuple[FloatArray, FloatArray, FloatArray],
     ports: dict[str, tuple[FloatArray, FloatArray]],
     shown: OutputRows,
     moving: int,
@@ -83,8 +81,8 @@ def modal_system(
 
     Parameters
     ----------
-    mass, damping, stiffness : (M, M) ndarray
-        In modal coordinates.
+    matrices : tuple of (M, M) ndarray
+        M, D and K in modal coordinates.
     ports : dict of str to ((M,) ndarray, (M,) ndarray)
         Row by which each port moves, and row along which its force acts.
     shown : OutputRows
@@ -92,6 +90,7 @@ def modal_system(
     moving : int
         The first coordinates; of the others, which are states, only the speeds are kept.
     """
+    mass, damping, stiffness = matrices
     count = len(mass)
     sees, acts = (np.array([rows[k] for rows in ports.values()]).reshape(len(ports), count) for k in (0, 1))
     by_stiffness, by_damping = np.linalg.solve(mass, stiffness), np.linalg.solve(mass, damping)

@@ -322,7 +322,7 @@ class Rig:
         return begin, end
 
     def ported(self, shown: Sequence[Shown], shapes: FloatArray | None = None) -> PortedSystem:
-        """Return the system that outputs see missing forces by, in given shapes (n + m, M) of what is free."""
+        """Return the system by which outputs see missing forces, in shapes (n + m, M) of what is free."""
         base = self._modes[1] if shapes is None else shapes
         n, count = self.displacements, base.shape[1]
         by_order = np.zeros((4, len(shown), count))
@@ -340,11 +340,10 @@ class Rig:
             else:
                 by_order[item.order, number] += item.row[:n] @ base[:n]
                 by_order[item.further + 1, number] += item.row[n:] @ base[n:]
-        ports = {
-            name: (row @ base, self.acting_rows[name] @ base) for name, row in self.ports.items()
-        }
+        ports = {name: (row @ base, self.acting_rows[name] @ base) for name, row in self.ports.items()}
         matrices = [base.T @ matrix @ base for matrix in (self.mass, self.damping, self.stiffness)]
-        return modal_system(*matrices, ports, OutputRows(*by_order[:3], force), self.moving)  # type: ignore[misc]
+        shown_rows = OutputRows(by_order[0], by_order[1], by_order[2], force)
+        return modal_system((matrices[0], matrices[1], matrices[2]), ports, shown_rows, self.moving)
 
     def load_at(self, acting: Acting, time: FloatArray) -> FloatArray:
         """Return the loads (N, n + m) at times, those that are held as they were just before."""

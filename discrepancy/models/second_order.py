@@ -313,20 +313,21 @@ class SecondOrderSystem:
         """Return the system that outputs at rows (C, n) see missing forces by, in given shapes (n, M)."""
         base = self.shapes if shapes is None else shapes
         modal = rows @ base
-        kept = [
-            np.array([quantity is own for quantity in quantities])[:, None] * modal
-            for own in (Quantity.VELOCITY, Quantity.ACCELERATION)
-        ]
-        names = list(self.ports)
-        port_rows = np.array(list(self.ports.values())).reshape(len(names), len(self.mass))
+
+        def of(*wanted: bool) -> FloatArray:
+            return np.array(wanted)[:, None] * modal
+
+        speed = of(*(quantity is Quantity.VELOCITY for quantity in quantities))
+        acceleration = of(*(quantity is Quantity.ACCELERATION for quantity in quantities))
         still = np.array([not quantity.is_rate for quantity in quantities])
-        left_out = -(port_rows @ self.residual(rows.T)) * still if self.truncated else None
-        shown = OutputRows(
-            still[:, None] * modal, *kept, np.zeros((len(names), len(rows))) if left_out is None else left_out
-        )
+        port_rows = np.array(list(self.ports.values())).reshape(len(self.ports), len(self.mass))
+        at_once = np.zeros((len(port_rows), len(rows)))
+        if self.truncated:
+            at_once = -(port_rows @ self.residual(rows.T)) * still
+        shown = OutputRows(of(*still), speed, acceleration, at_once)
         ports = {name: (row @ base, row @ base) for name, row in self.ports.items()}
         matrices = [base.T @ matrix @ base for matrix in (self.mass, self.damping, self.stiffness)]
-        return modal_system(*matrices, ports, shown, base.shape[1])  # type: ignore[misc]
+        return modal_system((matrices[0], matrices[1], matrices[2]), ports, shown, base.shape[1])
 
     # ------------------------------------------------------------ parts
 

@@ -385,13 +385,14 @@ class WingModel:
         return Response(response.values, response.rates, across, shear)
 
     def ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces in a trial, in the modes of the prior means."""
+        """Return the system by which outputs see missing forces, in the modes of the prior means."""
         mean = np.array([item.mean for item in self._parameters])
         base, moved = (self._moved(trial, values) for values in (mean, parameters))
         rows = self._structure.output_rows(outputs, 0, ModelPatch())
         # both bases hold nearly the same shapes of the whole wing
         shapes = np.linalg.lstsq(moved.basis, base.basis @ base.system.shapes, rcond=None)[0]
-        return moved.system.ported(rows @ moved.basis, [quantity for _, quantity in outputs], shapes)
+        quantities = [quantity for _, quantity in outputs]
+        return moved.system.ported(rows @ moved.basis, quantities, np.asarray(shapes, dtype=np.float64))
 
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial."""

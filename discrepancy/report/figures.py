@@ -1,6 +1,6 @@
 """The figures of the report with their captions, as far as the data allow them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from matplotlib.figure import Figure
 
@@ -14,6 +14,7 @@ from discrepancy.report.evidence_figures import (
     separability_figure,
     shares_figure,
 )
+from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.report.law_figures import backbone_figure, force_figure
 from discrepancy.report.motion_figures import (
     history_figure,
@@ -41,6 +42,14 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         if figure is not None:
             found[name] = ReportFigure(name, figure, title, caption)
 
+    missing = content.investigation.missing
+    if missing is not None:
+        add(
+            "missing_force", missing_force_figure(missing), "The missing force",
+            f"{missing.sentence} Dots and line: what a Kalman smoother sees of it in the fitted trials, with "
+            "its deviation; in time two deviations, in the trial where it is largest. Laws of a displacement "
+            "or of a speed show as lines in their panels, friction as a step, hysteresis as a loop.",
+        )  # fmt: skip
     before, after = content.investigation.before, after_of(content.investigation)
     if before is not None:
         both = after is not None
@@ -77,7 +86,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
             f"noise. Brackets are 90 % intervals of begin and end.{left}",
         )  # fmt: skip
         _add_worst_record(before, after, add)
-        _add_motion(before, after, add)
+        _add_motion(before, after, add, found)
     _add_evidence(content, add)
     explained = content.investigation.verdict.explained
     if explained is not None:
@@ -110,7 +119,10 @@ def _add_worst_record(
 
 
 def _add_motion(
-    before: ResidualSet, after: ResidualSet | None, add: Callable[[str, Figure | None, str, str], None]
+    before: ResidualSet,
+    after: ResidualSet | None,
+    add: Callable[[str, Figure | None, str, str], None],
+    shown: Collection[str],
 ) -> None:
     backbone = backbone_figure(before, after)
     if backbone is not None:
@@ -124,7 +136,7 @@ def _add_motion(
             "the "
             "frequency falls and the damping rises with A.",
         )  # fmt: skip
-    force = force_figure(before, after)
+    force = None if "missing_force" in shown else force_figure(before, after)
     if force is not None:
         add(
             "restoring_force", force[0], "Restoring force of the first mode",

@@ -47,6 +47,7 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
                 page.add_figure(drawings[name], item.caption, title=item.title)
 
     page.add_section("Verdict")
+    show("missing_force")
     add_verdict(page, content)
     show("shares")
     if verdict.kind is VerdictKind.DATA_ERROR:
