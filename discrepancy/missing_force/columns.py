@@ -120,7 +120,8 @@ class Columns:
         readings = np.zeros_like(trial.residual)
         forces: dict[int, FloatArray] = {}
         time = trial.fine_time
-        for law in self.problem.model.inner.at_ports(laws):  # type: ignore[attr-defined]
+        model = self.problem.model.inner
+        for law in model.at_ports(laws) if hasattr(model, "at_ports") else laws:
             port = names.index(law.port)
             position, speed = trial.port_motion(port, motion.added)
             course = law_course(law, time, position, speed)

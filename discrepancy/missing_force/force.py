@@ -167,7 +167,8 @@ def _with_laws(
     columns: Columns, found: Seen, port: str, patch: ModelPatch, fit: CandidateFit
 ) -> _Beside | None:
     """Return what is left at a port beside the laws there; None where none acts there."""
-    own = ModelPatch(tuple(item for item in patch if isinstance(item, PortForce) and item.port == port))
+    forces = (item for item in patch if isinstance(item, PortForce))
+    own = ModelPatch(tuple(item for item in forces if item.port == port))
     column = columns.of_patch(found.view, found.motions, own, fit.candidate.acts_on) if len(own) else None
     if column is None:
         return None

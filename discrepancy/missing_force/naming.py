@@ -10,6 +10,7 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
+from fe.runtime.patch import ModelPatch
 
 from .columns import Columns, variants, with_prior
 from .filtered import Process
@@ -101,7 +102,8 @@ class ForceSearch:
     """
 
     def __init__(self, problem: Problem) -> None:
-        linear, self.laws = problem.model.inner.apart()  # type: ignore[attr-defined]
+        model = problem.model.inner
+        linear, self.laws = model.apart() if hasattr(model, "apart") else (model, ModelPatch())
         trials = tuple(data.trial for data in problem.trials)
         self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]

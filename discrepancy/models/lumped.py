@@ -24,7 +24,7 @@ from discrepancy.models.lumped_rig import LumpedRig
 from discrepancy.models.lumped_scales import rig_scales, state_sizes
 from discrepancy.models.lumped_sections import Damping
 from discrepancy.models.memory import Memory
-from discrepancy.models.ported import PortedSystem
+from discrepancy.models.ported_lumped import PortedLumped
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.runtime.laws import LAWS
 from fe.runtime.motion import NO_LAWS, laws_of
@@ -53,7 +53,7 @@ LEAST_STIFFNESS = 0.05
 """A temperature that leaves less than this share of the stiffness is refused."""
 
 
-class LumpedModel:
+class LumpedModel(PortedLumped):
     """A lumped model (`discrepancy.models.interface.Model`).
 
     Parameters
@@ -249,49 +249,6 @@ class LumpedModel:
                 row, acting, trial.time, laws, clock=conditions.clock, refinement=refinement
             )  # fmt: skip
         return motion.response(rows, quantities)
-
-    def ported(
-        self, trial: Trial, outputs: tuple[tuple[str, Quantity], ...], parameters: FloatArray
-    ) -> PortedSystem:
-        """Return the system by which outputs see missing forces, in the modes of the prior means."""
-        mean = np.array([item.mean for item in self._parameters])
-        warm = float(trial.temperature[0])
-        quantities = [quantity for _, quantity in outputs]
-        if trial.kind is TrialKind.RINGDOWN:
-            rows = np.array([self._outputs[output] for output, _ in outputs]).reshape(len(outputs), -1)
-            base = self._system(mean, (), warm)
-            return self._system(parameters, (), warm).ported(rows, quantities, base.shapes)
-        lumped = self._rig(parameters, (), warm)
-        drives = lumped.acting(trial, Conditions(parameters), 0.0, 0.0, None)[2]
-        return lumped.rig(drives).ported(
-            lumped.shown(outputs, drives), self._rig(mean, (), warm).rig(drives).free_shapes
-        )
-
-    @staticmethod
-    def at_ports(forces: ModelPatch) -> ModelPatch:
-        """Return forces as they act at the ports of `ported`: as they are."""
-        return forces
-
-    def apart(self) -> "tuple[LumpedModel, ModelPatch]":
-        """Return the linear model, and the laws that it has beside that, at the prior means."""
-        if not self.description.law:
-            return self, ModelPatch()
-        mean = np.array([item.mean for item in self._parameters])
-        laws = self._rig(mean, (), 0.0).own_laws
-        return LumpedModel(self.description.model_copy(update={"law": []})), laws
-
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        warm = float(trial.temperature[0])
-        if trial.kind is TrialKind.RINGDOWN and trial.release is not None:
-            motion = self._system(conditions.parameters, (), warm).ringdown(
-                self._input_row(trial.load_place), trial.release, conditions.initial, trial.time, NO_LAWS,
-                clock=conditions.clock,
-            )  # fmt: skip
-            rows = np.array(list(self._ports.values())).reshape(-1, self.description.size)
-            shape = rows @ motion.system.shapes
-            return motion.q @ shape.T, motion.velocity @ shape.T
-        return self._rig(conditions.parameters, (), warm).port_motion(trial, conditions)
 
     @property
     def oscillates(self) -> bool:

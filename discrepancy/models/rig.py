@@ -19,7 +19,6 @@ from discrepancy.campaign.records import Quantity, Start
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Response
-from discrepancy.models.ported import OutputRows, PortedSystem, modal_system
 from discrepancy.models.rig_records import Acting, Effort, Shown
 from discrepancy.models.stepwise import Boundaries, CoupledModes, ExactSteps, advance, exact_steps, substeps
 from fe.runtime.errors import SolutionError
@@ -320,30 +319,6 @@ class Rig:
                 side[:, :count] -= np.outer(w[2], parts[2][:, number])
                 side[:, count + number] = np.sqrt(self._heavy) * w[2]
         return begin, end
-
-    def ported(self, shown: Sequence[Shown], shapes: FloatArray | None = None) -> PortedSystem:
-        """Return the system by which outputs see missing forces, in shapes (n + m, M) of what is free."""
-        base = self._modes[1] if shapes is None else shapes
-        n, count = self.displacements, base.shape[1]
-        by_order = np.zeros((4, len(shown), count))
-        force = np.zeros((len(self.ports), len(shown)))
-        acts = np.array(list(self.acting_rows.values())).reshape(len(self.ports), len(self.mass))
-        for number, item in enumerate(shown):
-            if item.reaction is not None:
-                along = self.lift[:, item.reaction]
-                for order, matrix in enumerate((self.stiffness, self.damping, self.mass)):
-                    by_order[order, number] = along @ matrix @ base
-                force[:, number] = acts @ along
-            elif item.effort is not None:
-                by_order[0, number] = item.effort.by_displacement @ base[:n]
-                by_order[1, number] = item.effort.by_speed @ base[:n] + item.effort.by_state @ base[n:]
-            else:
-                by_order[item.order, number] += item.row[:n] @ base[:n]
-                by_order[item.further + 1, number] += item.row[n:] @ base[n:]
-        ports = {name: (row @ base, self.acting_rows[name] @ base) for name, row in self.ports.items()}
-        matrices = [base.T @ matrix @ base for matrix in (self.mass, self.damping, self.stiffness)]
-        shown_rows = OutputRows(by_order[0], by_order[1], by_order[2], force)
-        return modal_system((matrices[0], matrices[1], matrices[2]), ports, shown_rows, self.moving)
 
     def load_at(self, acting: Acting, time: FloatArray) -> FloatArray:
         """Return the loads (N, n + m) at times, those that are held as they were just before."""

@@ -414,10 +414,6 @@ class WingModel:
             parameters, tuple(losses), ModelPatch(), warm, trial.load_place, STATION_PORTS
         )
 
-    def apart(self) -> "tuple[WingModel, ModelPatch]":
-        """Return the wing, which has no laws beside its linear model, and these."""
-        return self, ModelPatch()
-
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at the ports of `ported`."""
         return self.wing.internal_forces(forces)
