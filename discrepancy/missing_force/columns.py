@@ -122,6 +122,7 @@ class Columns:
         time = trial.fine_time
         model = self.problem.model.inner
         for law in model.at_ports(laws) if hasattr(model, "at_ports") else laws:
+            assert isinstance(law, PortForce)  # `_part` took these alone
             port = names.index(law.port)
             position, speed = trial.port_motion(port, motion.added)
             course = law_course(law, time, position, speed)

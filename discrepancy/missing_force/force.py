@@ -117,7 +117,8 @@ def missing_force(problem: Problem, fit: CandidateFit) -> MissingForce | None:
     None where a model does not tell how its ports move, where laws of the verdict act at several ports, and
     where nothing is missing.
 
-    It is that beside parameters within their priors, of the port with the most evidence, or of the port at which the verdict's effect acts.
+    It is that beside parameters within their priors, of the port at which the verdict's effect acts, or else
+    of the one with the most evidence.
     """
     model = problem.model.inner
     dynamic = [data for data in problem.trials if data.trial.is_dynamic]

@@ -103,6 +103,7 @@ class ForceSearch:
 
     def __init__(self, problem: Problem) -> None:
         model = problem.model.inner
+        self.laws: ModelPatch
         linear, self.laws = model.apart() if hasattr(model, "apart") else (model, ModelPatch())
         trials = tuple(data.trial for data in problem.trials)
         self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
