@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from fe.compilation import callable_when_compiled, compiled
 
@@ -20,6 +19,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 callable_when_compiled(kernels.is_steady)
+_discretised = compiled(kernels.discretised)
 _covariances = compiled(kernels.covariances)
 _whitened = compiled(kernels.whitened)
 _smoothed = compiled(kernels.smoothed)
@@ -123,23 +123,8 @@ class Filtered:
         return generator, intensity, rows, start
 
     def _steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return transitions and noises (J, n, n) of steps (Van Loan 1978)."""
-        generator, intensity, _, _ = self._system
-        n, largest = len(generator), float(np.linalg.norm(generator, 1))
-        moves, noises = [], []
-        for length in lengths:
-            halvings = max(int(np.ceil(np.log2(max(largest * length, 1e-300)))), 0)
-            both = np.zeros((2 * n, 2 * n))
-            both[:n, :n], both[:n, n:], both[n:, n:] = -generator, intensity, generator.T
-            found = expm(both * (length / 2**halvings))
-            move = found[n:, n:].T
-            noise = move @ found[:n, n:]
-            for _ in range(halvings):  # what decays within a step grows beyond all numbers backwards
-                noise = move @ noise @ move.T + noise
-                move = move @ move
-            moves.append(move)
-            noises.append(0.5 * (noise + noise.T))
-        return np.ascontiguousarray(moves), np.ascontiguousarray(noises)
+        """Return transitions and noises (J, n, n) of steps (J,) [s]."""
+        return _discretised(*self._system[:2], lengths)
 
     @cached_property
     def _passed(

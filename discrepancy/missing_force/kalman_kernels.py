@@ -14,8 +14,41 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+SMALL_PART, ORDERS = 0.25, 12
+"""Norm of what is summed as a series, and its orders: 1e-16 is left out."""
 STEADY = 1e-10
 """A covariance that moves less than this, over the deviations that it holds, is steady."""
+
+
+def discretised(
+    generator: FloatArray, intensity: FloatArray, lengths: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return transitions and noises (J, n, n) of steps of given lengths (J,) [s].
+
+    Series for a small part of a step, which is then doubled: what decays within a step would grow beyond all
+    numbers in an exponential of both signs.
+    """
+    n = len(generator)
+    largest = 0.0
+    for i in range(n):
+        largest = max(largest, np.sum(np.abs(generator[i])))
+    moves, noises = np.empty((len(lengths), n, n)), np.empty((len(lengths), n, n))
+    for k in range(len(lengths)):
+        doublings, part = 0, lengths[k]
+        while largest * part > SMALL_PART:
+            doublings, part = doublings + 1, 0.5 * part
+        move, term = np.eye(n), np.eye(n)
+        noise, grown = intensity * part, intensity * part
+        for order in range(1, ORDERS):
+            term = (generator @ term) * (part / order)
+            move = move + term
+            grown = (generator @ grown + grown @ generator.T) * (part / (order + 1))
+            noise = noise + grown
+        for _ in range(doublings):
+            noise = move @ noise @ move.T + noise
+            move = move @ move
+        moves[k], noises[k] = move, 0.5 * (noise + noise.T)
+    return moves, noises
 
 
 def covariances(
