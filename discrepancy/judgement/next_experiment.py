@@ -13,6 +13,7 @@ from scipy.special import logsumexp
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
+from discrepancy.fits.cholesky import Cholesky, finite
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
@@ -116,12 +117,12 @@ def mutual_information(
         local, shared, index = there.jacobian(0, point, parts, item.candidate)
         local, shared = local * noise_units, shared * noise_units
         means.append(data.standardised(there.prediction(0, point, parts.response)).ravel() * noise_units)
-        root = np.linalg.cholesky(item.covariance[np.ix_(index, index)] + 1e-12 * np.eye(len(index)))
+        root = Cholesky.of(item.covariance[np.ix_(index, index)] + 1e-12 * np.eye(len(index))).lower
         precision = np.maximum(data.unknowns.precision, 1e-4)  # a free zero is known to a hundred s0
         spreads.append(np.concatenate((local / np.sqrt(precision)[:, np.newaxis], root.T @ shared)))
     middle = np.average(means, axis=0, weights=weights)
     columns = np.concatenate((np.stack(means) - middle, *spreads))
-    _, values, basis = np.linalg.svd(columns, full_matrices=False)
+    _, values, basis = np.linalg.svd(finite(columns), full_matrices=False)
     basis = basis[values > 1e-6 * max(values[0], 1e-300)]
     means_in = [basis @ (mean - middle) for mean in means]
     roots = [
