@@ -201,6 +201,7 @@ def _trial(
         noise_factor=section.noise_factor,
         begins=section.begins or Start.SETTLED,
         inputs=inputs,
+        hold=section.hold,
     )
 
 

@@ -224,8 +224,9 @@ def _input_lines(item: RecordedInput) -> list[str]:
         f"name = {_quoted(item.name)}",
         f"quantity = {_quoted(item.quantity.value)}",
         f"unit = {_quoted(UNITS[item.quantity].si)}",
-        f"hold = {_quoted(item.hold.value)}",
     ]
+    if item.hold is not None:
+        lines.append(f"hold = {_quoted(item.hold.value)}")
     if item.quantity.moving and item.hold is not Hold.SMOOTH:
         lines.append("reference = true")
     return [
@@ -250,6 +251,8 @@ def _trial_lines(trial: Trial, file: str, order: list[str]) -> list[str]:
         values["start"] = _number(trial.start)
     if trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED:
         values["begins"] = _quoted(trial.begins.value)
+    if trial.hold is not None:
+        values["hold"] = _quoted(trial.hold.value)
     place = trial.load_place
     if place != "tip_load":
         values["load_place"] = (

@@ -46,7 +46,7 @@ class Cholesky:
             If it is not finite or not positive definite.
         """
         try:
-            return cls(np.linalg.cholesky(finite(matrix)))
+            return cls(np.asarray(np.linalg.cholesky(finite(matrix)), dtype=np.float64))
         except np.linalg.LinAlgError as cause:
             raise FitError(
                 "The normal equations of a fit are singular; a parameter has no influence."

@@ -12,6 +12,7 @@ from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_patch import SortedPatch
 from discrepancy.models.fmu_runs import FmuRuns
+from discrepancy.models.input_course import Course
 from discrepancy.models.interface import Conditions
 
 FloatArray = NDArray[np.float64]
@@ -85,9 +86,9 @@ class FmuTrials:
     def _forced(
         self, trial: Trial, patch: SortedPatch, step: float, steps: int
     ) -> list[tuple[Excitation, float]]:
-        at_ends = np.interp(step * np.arange(steps + 1), trial.time, trial.force)
-        held = 0.5 * (at_ends[1:] + at_ends[:-1])
-        on = (at_ends[1:] != 0.0) | (at_ends[:-1] != 0.0)
+        begins, ends = Course.of_force(trial).ends(np.linspace(0.0, steps * step, steps + 1))
+        held = 0.5 * (begins + ends)
+        on = (begins != 0.0) | (ends != 0.0)
         name = self._input_of(trial)
         loads = [(Excitation("input", name, held, float(trial.force[0])), 1.0 + patch.gain)]
         if patch.tare:
