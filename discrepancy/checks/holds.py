@@ -25,10 +25,9 @@ def hold_sentence(campaign: Campaign, model: Model, trial: Trial, conditions: Co
     curved = tuple(
         replace(item, hold=Hold.SMOOTH) if item.name in straight else item for item in trial.inputs
     )
-    other_hold = Hold.SMOOTH if forced else trial.hold
     one, other = (
         observe(model, campaign, item, ModelPatch(), conditions).values
-        for item in (trial, replace(trial, inputs=curved, hold=other_hold))
+        for item in (trial, replace(trial, inputs=curved, hold=Hold.SMOOTH if forced else trial.hold))
     )
     worst, where = 0.0, ""
     for column, name in enumerate(trial.channels):

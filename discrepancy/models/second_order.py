@@ -287,8 +287,7 @@ class SecondOrderSystem:
             solution = _solve(laws, linear[None], rows @ flexible)
             acts = begin * shape - solution.forces[0] @ laws.rows(modal.ports, modes)
             q, memory = acts / self.angular_frequency**2, solution.memory
-        beyond = self._feed(input_row, laws)
-        feed = np.stack((beyond, np.zeros(len(laws))))
+        feed = np.stack((self._feed(input_row, laws), np.zeros(len(laws))))
         if lead > LEAST_LEAD * float(time[-1] - time[0]):
             first = simulate(
                 modal, laws, q=q, v=v, memory=memory, force=np.array([begin, acting[0]]), interval=lead,
@@ -303,7 +302,7 @@ class SecondOrderSystem:
             )  # fmt: skip
         else:
             moved = simulate_at(
-                modal, laws, q=q, v=v, time=times, course=course, shape=shape, memory=memory, feed=beyond,
+                modal, laws, q=q, v=v, time=times, course=course, shape=shape, memory=memory, feed=feed[0],
                 refinement=refinement,
             )  # fmt: skip
         return Motion(self, times, moved.q, moved.v, acting, input_row, moved.port_forces, moved.lagged, laws)

@@ -210,8 +210,7 @@ def simulate_at(
     ModalMotion
         At the stamps, the first included.
     """
-    least = SMOOTH_PARTS if course.is_smooth else 1
-    boundaries = substeps(system, laws, time, refinement, least, laws.edges)
+    boundaries = substeps(system, laws, time, refinement, SMOOTH_PARTS if course.is_smooth else 1, laws.edges)
     begin, end = (np.outer(force, shape) for force in course.ends(boundaries.time))
     found = exact_steps(system, boundaries.lengths)
     fed = np.outer(course.at(boundaries.time), np.zeros(len(laws)) if feed is None else feed)

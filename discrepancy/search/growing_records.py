@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.errors import DiscrepancyError, FitError
+from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.fitting import CandidateFit, attempt, objective
+from discrepancy.fits.fitting import CandidateFit, attempt, fit, objective
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
@@ -122,10 +122,11 @@ class Beginnings:
             tuple(np.zeros_like(u) for u in base.point.local),
             base.point.effect,
         )
-        near = attempt(self.short, base.candidate, expected, local_only=True, evidence=False)
         try:
-            return None if near is None else Screen(self.short, near)
-        except FitError:
+            return Screen(
+                self.short, fit(self.short, base.candidate, expected, local_only=True, evidence=False)
+            )
+        except DiscrepancyError:
             return None
 
     def shortly(
