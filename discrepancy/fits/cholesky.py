@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from discrepancy.errors import FitError
 
@@ -26,15 +26,15 @@ def finite(values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Cholesky:
-    """A positive definite matrix by its factor, L L^T.
+    """A positive definite matrix by its factor, U^T U.
 
     Attributes
     ----------
-    lower : (n, n) ndarray
-        L.
+    upper : (n, n) ndarray
+        U; what stands below its diagonal means nothing.
     """
 
-    lower: FloatArray
+    upper: FloatArray
 
     @classmethod
     def of(cls, matrix: FloatArray) -> "Cholesky":
@@ -46,21 +46,21 @@ class Cholesky:
             If it is not finite or not positive definite.
         """
         try:
-            return cls(np.asarray(np.linalg.cholesky(finite(matrix)), dtype=np.float64))
+            return cls(cho_factor(finite(matrix), check_finite=False)[0])
         except np.linalg.LinAlgError as cause:
             raise FitError(
                 "The normal equations of a fit are singular; a parameter has no influence."
             ) from cause
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return (L L^T)^-1 b for columns b (n, ...)."""
-        return np.asarray(cho_solve((self.lower, True), right, check_finite=False))
+        """Return (U^T U)^-1 b for columns b (n, ...)."""
+        return np.asarray(cho_solve((self.upper, False), right, check_finite=False))
 
     def half(self, right: FloatArray) -> FloatArray:
-        """Return L^-1 b for columns b (n, ...), whose inner products are those by the matrix's inverse."""
-        return np.asarray(solve_triangular(self.lower, right, lower=True, check_finite=False))
+        """Return U^-T b for columns b (n, ...), whose inner products are those by the matrix's inverse."""
+        return np.asarray(solve_triangular(self.upper, right, trans="T", check_finite=False))
 
     @property
     def log_determinant(self) -> float:
         """Of the matrix, ln det."""
-        return 2.0 * float(np.log(np.diag(self.lower)).sum())
+        return 2.0 * float(np.log(np.diag(self.upper)).sum())

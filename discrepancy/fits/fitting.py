@@ -351,7 +351,7 @@ def _step(
     eliminated = []
     for block in blocks:
         local = block.local + damping * np.diag(np.diag(block.local))
-        solved = Cholesky.of(local).solve(np.column_stack((block.cross, block.local_gradient)))
+        solved = np.linalg.solve(finite(local), np.column_stack((block.cross, block.local_gradient)))
         inner, inner_gradient = solved[:, :-1], solved[:, -1]
         matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
         np.add.at(damped_diagonal, block.index, np.diag(block.shared))

@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.cholesky import Cholesky, finite
+from discrepancy.fits.cholesky import finite
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
@@ -117,7 +117,7 @@ def mutual_information(
         local, shared, index = there.jacobian(0, point, parts, item.candidate)
         local, shared = local * noise_units, shared * noise_units
         means.append(data.standardised(there.prediction(0, point, parts.response)).ravel() * noise_units)
-        root = Cholesky.of(item.covariance[np.ix_(index, index)] + 1e-12 * np.eye(len(index))).lower
+        root = np.linalg.cholesky(item.covariance[np.ix_(index, index)] + 1e-12 * np.eye(len(index)))
         precision = np.maximum(data.unknowns.precision, 1e-4)  # a free zero is known to a hundred s0
         spreads.append(np.concatenate((local / np.sqrt(precision)[:, np.newaxis], root.T @ shared)))
     middle = np.average(means, axis=0, weights=weights)
