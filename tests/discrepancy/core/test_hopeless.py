@@ -17,10 +17,11 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.cholesky import Cholesky
 from discrepancy.fits.fitting import attempt, fit
 from discrepancy.fits.problem import Problem
+from discrepancy.search.growing_records import Beginnings
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerStiffness
-from tests.discrepancy.rigs import measured
+from tests.discrepancy.rigs import FEW, measured
 
 EXPLOSIVE = """
 id = "explosive"
@@ -85,6 +86,15 @@ def test_a_fit_ends_with_finite_numbers_or_a_sentence(
         return
     assert np.isfinite(found.log_evidence)
     assert np.all(np.isfinite(found.covariance))
+
+
+def test_nothing_is_sought_beside_a_base_that_the_beginnings_cannot_follow(problem: Problem) -> None:
+    effect = softening(-1.0, 0.01)
+    candidate = Candidate((Term(effect, effect.places(problem.setting)[0]),))
+    none = fit(problem, Candidate(), problem.start(Candidate()))
+    base = replace(none, candidate=candidate, point=replace(none.point, effect=np.array([4.0])))
+    assert Beginnings(problem).screen(none) is not None
+    assert Beginnings(problem).scan(base, FEW) == []
 
 
 def test_a_search_tells_what_could_not_be_fitted_and_goes_on(tmp_path: Path) -> None:
