@@ -70,6 +70,24 @@ class VariableInfo:
         return self.kind in NUMERIC_KINDS
 
     @property
+    def base_type(self) -> str:
+        """Its type in the words of FMI 2 and SSP 1.0, which have one size of reals and one of integers."""
+        if self.kind in FLOAT_KINDS:
+            return "Real"
+        return "Integer" if self.kind.lstrip("U").startswith("Int") else self.kind
+
+    @property
+    def single(self) -> bool:
+        """Whether it is one number that is there at any time: no text, array or clocked variable."""
+        return self.numeric and not self.shape and not self.clocked
+
+    @property
+    def startable(self) -> bool:
+        """Whether it is an output or local variable with a start value, to be set before initialisation."""
+        free = self.causality in ("output", "local") and self.variability != "constant"
+        return free and self.start is not None
+
+    @property
     def continuous(self) -> bool:
         """Whether it is a real number that changes at any time."""
         return self.kind in FLOAT_KINDS and self.variability == "continuous"

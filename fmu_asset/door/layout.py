@@ -52,8 +52,8 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
     label : str
         Place in the binding, for the error.
     causality : {"input", "parameter", "output"}
-        What it must be; everything that is neither input nor parameter can be read, and a tunable parameter
-        can be sent at every step like an input (co-simulation).
+        What it must be; everything that is neither input nor parameter can be read, a tunable parameter can
+        be sent at every step like an input (co-simulation), and a start value be set like a parameter.
 
     Raises
     ------
@@ -72,7 +72,8 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
         and (variable.causality, variable.variability) == ("parameter", "tunable")
         and description.interface == "co-simulation"
     )
-    if variable.causality not in _CAUSALITY[causality] and not sent:
+    started = causality == "parameter" and variable.startable
+    if variable.causality not in _CAUSALITY[causality] and not sent and not started:
         raise BindingError(
             f"{label} must be of causality {causality}, but {name!r} is declared as {variable.causality} in "
             f"{description.path}."

@@ -10,7 +10,7 @@ from fmu_asset.coupling.experiment import every_output
 from fmu_asset.coupling.schedule import loop_sentence
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import Binding, Header, Vector
-from fmu_asset.door.units import between
+from fmu_asset.door.units import IDENTITY, between
 from fmu_asset.errors import FmuError, SspError
 from fmu_asset.folders import scratch_folder
 
@@ -40,6 +40,8 @@ class SspCheck:
         How many there are.
     loops : tuple of str
         Algebraic loops; a system with one is sound, but `ssp simulate` needs to be told how to break it.
+    unused : tuple of str
+        Parameters that the file sets and nothing takes, which SSP allows.
     """
 
     path: Path
@@ -48,6 +50,7 @@ class SspCheck:
     connections: int = 0
     parameters: int = 0
     loops: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -71,7 +74,7 @@ def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
     CouplingError, FmuFileError, FmuUnsupportedError
         If the system does not fit its FMUs.
     """
-    wiring = Wiring(system.structure.delayed(delayed))
+    wiring = Wiring(system.structure.delayed(delayed), leave_out_unknown=True)
     definitions = system.structure.units
     for end, declared in system.declared.items():
         variable = wiring.variable(end)
@@ -80,23 +83,29 @@ def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
                 f"The connector {end} is declared as {declared.kind}, but its FMU has it as "
                 f"{variable.causality}."
             )
-        if declared.type is not None and declared.type != variable.kind:
+        if declared.type is not None and declared.type != variable.base_type:
             raise SspError(
                 f"The connector {end} is declared of the type {declared.type}, but its FMU has it as "
                 f"{variable.kind}."
             )
         units = wiring.declared[end.component].description.units
-        if between(declared.unit, (*definitions, *units), variable.unit, units) is None:
+        if between(declared.unit, (*definitions, *units), variable.unit, units) != IDENTITY:
             raise SspError(
                 f"The connector {end} is declared in {declared.unit!r}, but its FMU has it in "
-                f"{variable.unit!r}."
-            )
-        if declared.unit is not None and declared.unit != variable.unit:
-            raise SspError(
-                f"The connector {end} is declared in {declared.unit!r} and its FMU has it in "
                 f"{variable.unit!r}; connectors of components must have the unit of the FMU."
             )
     return wiring
+
+
+def unused(system: SspSystem, wiring: Wiring) -> tuple[str, ...]:
+    """Return the names of parameters that a system sets, but neither it nor one of its FMUs has."""
+    taken = {component.name: component.settings for component in wiring.structure.components}
+    return system.unused + tuple(
+        f"{component.name}.{name}"
+        for component in system.structure.components
+        for name in component.settings
+        if name not in taken[component.name]
+    )
 
 
 def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
@@ -112,7 +121,8 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
         raise SspError(f"There is no SSP file {file}.")
     try:
         with scratch_folder() as folder:
-            wiring = join_ssp(read_ssp(file, folder))
+            system = read_ssp(file, folder)
+            wiring = join_ssp(system)
             plan = wiring.schedule
             problems = _trial(wiring)
         return SspCheck(
@@ -122,6 +132,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
             connections=len(wiring.structure.connections),
             parameters=sum(len(component.settings) for component in wiring.structure.components),
             loops=(loop_sentence(plan.loops),) if plan.loops else (),
+            unused=unused(system, wiring),
         )
     except FmuError as error:
         return SspCheck(file, (str(error),))

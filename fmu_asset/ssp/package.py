@@ -43,6 +43,11 @@ _SCHEMAS = {
 class SspPackage:
     """An SSP file that was checked: sound, safe, and with a system structure in it.
 
+    Attributes
+    ----------
+    unused : list of str
+        Names of parameters, gathered by those who read: what the file sets and nothing takes.
+
     Raises
     ------
     SspError
@@ -51,6 +56,7 @@ class SspPackage:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
+        self.unused: list[str] = []
         if not self.path.is_file():
             raise SspError(
                 f"There is no SSP file {self.path}; check the path, or write it with `uav-twin ssp export`."

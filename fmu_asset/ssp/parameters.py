@@ -1,8 +1,8 @@
 """Parameter sets (SSV) and mappings (SSM): read into plain values by target name."""
 
 from dataclasses import dataclass, replace
-from math import isclose, isfinite
-from typing import Any, NamedTuple
+from math import isfinite
+from typing import Any
 
 from fmu_asset.archive.fmu_file import UnitInfo
 from fmu_asset.coupling.structure import Setting, SettingValue
@@ -12,13 +12,6 @@ from .package import NAMESPACES, SspPackage, tag, validate
 
 _SET_TYPE = "application/x-ssp-parameter-set"
 _MAPPING_TYPE = "application/x-ssp-parameter-mapping"
-
-
-class ParameterBinding(NamedTuple):
-    """A parameter binding of an element: values by target name, and the units that the set defines."""
-
-    values: dict[str, Setting]
-    units: tuple[UnitInfo, ...]
 
 
 @dataclass(frozen=True)
@@ -52,28 +45,21 @@ def read_units(element: Any) -> tuple[UnitInfo, ...]:
     return tuple(found)
 
 
-def alike(one: UnitInfo, other: UnitInfo) -> bool:
-    """Return whether two definitions of a unit say the same, to the digits in which they are written."""
-    return one.exponents == other.exponents and all(
-        isclose(a, b, rel_tol=1e-9) for a, b in ((one.factor, other.factor), (one.offset, other.offset))
-    )
-
-
-def read_bindings(element: Any, package: SspPackage, where: str) -> list[ParameterBinding]:
-    """Return the parameter bindings of a component or system.
+def read_bindings(element: Any, package: SspPackage, where: str) -> dict[str, Setting]:
+    """Return what the parameter bindings of a component or system give, by target name; the last one counts.
 
     Raises
     ------
     SspError
         If a set or mapping is missing, not valid, or uses what is not supported.
     """
-    return [
-        _read_binding(item, package, where)
-        for item in element.findall("ssd:ParameterBindings/ssd:ParameterBinding", NAMESPACES)
-    ]
+    found: dict[str, Setting] = {}
+    for item in element.findall("ssd:ParameterBindings/ssd:ParameterBinding", NAMESPACES):
+        found |= _read_binding(item, package, where)
+    return found
 
 
-def _read_binding(element: Any, package: SspPackage, where: str) -> ParameterBinding:
+def _read_binding(element: Any, package: SspPackage, where: str) -> dict[str, Setting]:
     what = f"a parameter binding of {where}"
     if element.get("type", _SET_TYPE) != _SET_TYPE:
         raise SspError(
@@ -81,20 +67,24 @@ def _read_binding(element: Any, package: SspPackage, where: str) -> ParameterBin
         )
     root = _content(element, "ssd:ParameterValues", "ssv", "ParameterSet", package, what)
     prefix = element.get("prefix", "")
-    units = root.find(tag("ssv", "Units"))
+    defined = root.find(tag("ssv", "Units"))
+    units = () if defined is None else read_units(defined)
     values: dict[str, Setting] = {}
     for parameter in root.findall("ssv:Parameters/ssv:Parameter", NAMESPACES):
         name = prefix + parameter.get("name")
         if name in values:
             raise SspError(f"{what} in {package.path} gives {name!r} twice; keep one of the two.")
-        values[name] = _value(parameter, f"{what} in {package.path}")
+        values[name] = replace(_value(parameter, f"{what} in {package.path}"), units=units)
     mapping = element.find(tag("ssd", "ParameterMapping"))
     if mapping is not None and (mapping.get("source") or len(mapping)):  # an empty one maps nothing
         if mapping.get("type", _MAPPING_TYPE) != _MAPPING_TYPE:
             raise SspError(f"{what} in {package.path} has a mapping of the type {mapping.get('type')!r}.")
-        entries = _content(mapping, None, "ssm", "ParameterMapping", package, f"the mapping of {what}")
-        values = _mapped(values, _entries(entries, f"{what} in {package.path}"), f"{what} in {package.path}")
-    return ParameterBinding(values, () if units is None else read_units(units))
+        content = _content(mapping, None, "ssm", "ParameterMapping", package, f"the mapping of {what}")
+        entries = _entries(content, f"{what} in {package.path}")
+        # One mapping may serve several sets.
+        package.unused += [f"{where}.{entry.target}" for entry in entries if entry.source not in values]
+        values = _mapped(values, entries, f"{what} in {package.path}")
+    return values
 
 
 def _content(element: Any, inline: str | None, kind: str, name: str, package: SspPackage, what: str) -> Any:
@@ -192,7 +182,7 @@ def _mapped(values: dict[str, Setting], entries: list[_Entry], where: str) -> di
     found: dict[str, Setting] = {}
     for entry in entries:
         if entry.source not in values:
-            raise SspError(f"{where} maps {entry.source!r}, which is not in its parameter set.")
+            continue
         if entry.target in found:
             raise SspError(f"{where} maps two parameters to {entry.target!r}; keep one of the two.")
         setting = values[entry.source]

@@ -15,7 +15,6 @@ from fmu_asset.coupling.structure import (
     Connector,
     ConnectorKind,
     Endpoint,
-    Setting,
     SystemStructure,
 )
 from fmu_asset.instances.plan import Interface
@@ -23,7 +22,7 @@ from reporting.files import atomic_write_bytes
 
 from .flatten import flat_connections, flat_settings
 from .package import NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
-from .parameters import alike, flag, read_bindings, read_transformation, read_units
+from .parameters import flag, read_bindings, read_transformation, read_units
 from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree
 
 _INTERFACES: dict[str, Interface | None] = {
@@ -46,11 +45,14 @@ class SspSystem:
         The connectors of the components, as the file declares them.
     span : (float or None, float or None)
         Start and end of the default experiment [s], where the file says them.
+    unused : tuple of str
+        Names of parameters that are set, but are of no element of the system.
     """
 
     structure: SystemStructure
     declared: dict[Endpoint, DeclaredConnector]
     span: tuple[float | None, float | None] = (None, None)
+    unused: tuple[str, ...] = ()
 
 
 def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> SspSystem:
@@ -108,7 +110,7 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
         for node, declared in tree.connectors.items()
         if node.path in names
     }
-    return SspSystem(structure, inner, _span(root))
+    return SspSystem(structure, inner, _span(root), tuple(package.unused))
 
 
 def _span(root: Any) -> tuple[float | None, float | None]:
@@ -193,7 +195,7 @@ def _connectors(tree: Tree, element: Any, path: ElementPath) -> None:
         for name in ("Real", "Integer", "Boolean", "Enumeration", "String", "Binary"):
             item = connector.find(tag("ssc", name))
             if item is not None:
-                kind, unit = name, item.get("unit")
+                kind, unit = name, item.get("unit") or None
         if kind == "Binary":
             raise tree.error(f"the connector {str(node)!r} is binary, which is not supported.")
         tree.connectors[node] = DeclaredConnector(str(connector.get("kind")), kind, unit)
@@ -240,41 +242,22 @@ def _connection(tree: Tree, element: Any, path: ElementPath, children: set[str])
 def _bind(tree: Tree, element: Any, path: ElementPath) -> None:
     """Take the parameter bindings of an element; they go before those of the elements inside it."""
     where = f"the element {'.'.join(path) or str(element.get('name'))!r}"
-    own: dict[Node, Setting] = {}
-    for values, units in read_bindings(element, tree.package, where):
-        for unit in units:
-            if not alike(unit, tree.units.setdefault(unit.name, unit)):
-                raise tree.error(f"the unit {unit.name!r} is defined in two ways.")
-        for name, setting in values.items():
-            for node in _nodes_of(tree, name, path, where):
-                if node in own:
-                    raise tree.error(f"{where} sets {str(node)!r} twice; keep one of the two.")
-                own[node] = setting
-    tree.settings |= own
+    for name, setting in read_bindings(element, tree.package, where).items():
+        nodes = _nodes_of(tree, name, path)
+        tree.settings |= dict.fromkeys(nodes, setting)
+        tree.package.unused += [] if nodes else [str(Node(path, name))]
 
 
-def _nodes_of(tree: Tree, name: str, path: ElementPath, where: str) -> list[Node]:
-    """Return the variables of components, or connectors of systems, that a parameter name stands for."""
-    if path in tree.components:
-        return [Node(path, name)]
-    if Node(path, name) in tree.connectors:
-        return [Node(path, name)]
-    owners = [
-        place
-        for place in (*tree.components, *{node.path for node in tree.connectors})
-        if len(place) > len(path)
-        and place[: len(path)] == path
-        and name.startswith(".".join(place[len(path) :]) + ".")
-    ]
-    if not owners:
-        raise tree.error(f"{where} sets {name!r}, which begins with no element and is no connector of it.")
-    owner = max(owners, key=lambda place: len(".".join(place)))
-    node = Node(owner, name[len(".".join(owner[len(path) :])) + 1 :])
-    if owner not in tree.components and node not in tree.connectors:
-        raise tree.error(
-            f"{where} sets {name!r}, but {'.'.join(owner)!r} has no connector {node.connector!r}."
-        )
-    return [node]
+def _nodes_of(tree: Tree, name: str, path: ElementPath) -> list[Node]:
+    """Return the connectors of systems, and the variables that components may have, of a parameter's name."""
+    found = []
+    for place in dict.fromkeys((*tree.components, *(node.path for node in tree.connectors))):
+        before = "".join(f"{step}." for step in place[len(path) :])
+        node = Node(place, name.removeprefix(before))
+        known = place in tree.components or node in tree.connectors
+        if known and place[: len(path)] == path and name.startswith(before):
+            found.append(node)
+    return found
 
 
 def _names(tree: Tree) -> dict[ElementPath, str]:
