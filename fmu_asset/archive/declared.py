@@ -15,7 +15,7 @@ NUMERIC_KINDS = frozenset(
     {"Real", "Integer", "Enumeration", "Boolean", "Float32", "Float64"}
     | {f"{sign}{bits}" for sign in ("Int", "UInt") for bits in (8, 16, 32, 64)}
 )
-_LARGEST_ARRAY = 10_000_000
+LARGEST_ARRAY = 10_000_000
 FLOAT_KINDS = frozenset({"Real", "Float32", "Float64"})
 
 
@@ -38,9 +38,11 @@ class VariableInfo:
     minimum, maximum : float or None
         Declared range in `unit`.
     start : str or None
-        Declared start value; of an array, its elements.
+        Declared start value; of an array, its elements; empty if the array has another size by now.
     shape : tuple of int
         Of an array of FMI 3, with the start values of its structural parameters; empty for a scalar.
+    dimensions : tuple of int or str
+        For each number of the shape the same, or the name of the structural parameter that it is.
     clocked : bool
         Whether it changes with a clock of FMI 3 only.
     """
@@ -57,6 +59,7 @@ class VariableInfo:
     maximum: float | None
     start: str | None
     shape: tuple[int, ...] = ()
+    dimensions: tuple[int | str, ...] = ()
     clocked: bool = False
 
     @property
@@ -231,6 +234,11 @@ def read_declared(
         value = getattr(experiment, attribute, None)
         return None if value is None else float(value)
 
+    # fmpy 0.3.32 passes over the range of unsigned integers.
+    unsigned = {e.get("name"): e for e in root.iterfind("ModelVariables/*") if e.tag.startswith("UInt")}
+    for variable in declared.modelVariables:
+        if (element := unsigned.get(variable.name)) is not None:
+            variable.min, variable.max = element.get("min"), element.get("max")
     fixed = getattr(chosen, "fixedInternalStepSize", None)
     return FmuDescription(
         path=file,
@@ -275,7 +283,7 @@ def _variable(declared: Any) -> VariableInfo:
         )
 
     shape = tuple(declared.shape or ())
-    if any(length < 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
+    if any(length < 0 for length in shape) or math.prod(shape) > LARGEST_ARRAY:
         raise ValueError(f"{declared.name!r} is an array of {' x '.join(map(str, shape))} elements")
     return VariableInfo(
         name=str(declared.name),
@@ -290,6 +298,10 @@ def _variable(declared: Any) -> VariableInfo:
         maximum=None if of("max") is None else float(of("max")),
         start=None if declared.start is None else str(declared.start),
         shape=shape,
+        dimensions=tuple(
+            length if dimension.variable is None else str(dimension.variable.name)
+            for length, dimension in zip(shape, declared.dimensions or (), strict=True)
+        ),
         clocked=bool(declared.clocks),
     )
 

@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
-from fmu_asset.errors import BindingError
+from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
 from .binding import INPUT_ROLES, Binding, Input
+from .configuration import configured
 from .layout import BlockLayout, Place, element_names, find, start_values
 from .reading import OutputTable, Selection
 from .slots import Slot, in_unit, put, value_range
@@ -36,6 +37,8 @@ class Exchange:
 
     Attributes
     ----------
+    description : FmuDescription
+        The FMU, with the structural parameters of the binding.
     binding : Binding
         The binding, with arrays that are observed or recorded as their elements.
     plan : Plan
@@ -51,7 +54,8 @@ class Exchange:
     """
 
     def __init__(self, description: FmuDescription, binding: Binding) -> None:
-        self._description = description
+        structural = binding.binding.structural_parameters
+        self.description = self._description = description = configured(description, structural)
         wanted = binding.binding.fmi_version
         if wanted is not None and wanted[0] != description.fmi_version[0]:
             raise BindingError(
@@ -77,6 +81,11 @@ class Exchange:
             states=description.states,
             event_indicators=description.event_indicators,
             completed_step=description.completed_step,
+            configuration=[
+                (v.kind, v.reference, [float(v.start or 0)])
+                for v in description.variables
+                if v.name in structural
+            ],
         )
 
     # ------------------------------------------------------------------ resolving
@@ -309,6 +318,21 @@ class Exchange:
             values += start_values(self._description, variable)
         return values + values[2 : 2 + self.plan.linear_count]
 
+    def check_known(self, request: Sequence[float]) -> None:
+        """Refuse a request block in which a value of an array of another size than declared is missing."""
+        for variable in self._inputs.variables:
+            if variable.start != "":
+                continue
+            place = self._inputs.positions(Place(variable, None))
+            self._refuse_unknown(variable.name, request[place.start : place.stop])
+
+    def _refuse_unknown(self, name: str, values: Sequence[float]) -> None:
+        if any(value != value for value in values):
+            raise FmuInputError(
+                f"{name!r} of {self._description.path} has {len(values)} elements with these structural "
+                "parameters, and its start values are of another size; give all of them."
+            )
+
     def settings(self, parameters: Values) -> Settings:
         """Return what is set before initialisation: the values of the binding, then the caller's.
 
@@ -346,6 +370,8 @@ class Exchange:
                 start = start_values(self._description, variable) if variable.shape else [0.0]
                 set_values[variable.name] = (kind, variable.reference, start)
             put(set_values[variable.name][2], slots[name], value)
+        for name, (_, _, numbers) in set_values.items():
+            self._refuse_unknown(name, numbers)
         return list(set_values.values())
 
     def place(

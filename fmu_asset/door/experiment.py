@@ -11,6 +11,7 @@ from fmu_asset.errors import BindingError, FmuInputError
 from reporting.progress import Progress
 
 from .binding import INPUT_ROLES, Binding
+from .configuration import configured
 from .draft import trial_binding
 from .history_file import InputHistories
 from .observation import Observation
@@ -62,7 +63,7 @@ def default_experiment(
     step_size : float, optional
         Communication step size [s]; the FMU's own, or a 500th of the time to the end.
     values : mapping of str to float or list, optional
-        Parameters and inputs by the names of the FMU's variables, in its units.
+        Parameters (structural ones, too) and inputs by the names of the FMU's variables, in its units.
 
     Raises
     ------
@@ -74,8 +75,13 @@ def default_experiment(
     end = description.stop_time if stop_time is None else stop_time
     size = step_size or description.fixed_step or description.step_size
     _, steps, size = steps_to(description.start_time or 0.0, end, size)
-    binding = trial_binding(description, step_size=size)
-    places = {item.variable: ("parameter", name) for name, item in binding.parameter.items()}
+    kinds = {v.name for v in description.variables if v.causality == "structuralParameter"}
+    structural = {name: value for name, value in (values or {}).items() if name in kinds}
+    binding = trial_binding(configured(description, structural), step_size=size)
+    header = binding.binding.model_copy(update={"structural_parameters": structural})
+    binding = binding.model_copy(update={"binding": header})
+    places: dict[str, tuple[str, str]] = dict.fromkeys(kinds, ("structural", ""))
+    places |= {item.variable: ("parameter", name) for name, item in binding.parameter.items()}
     for role in INPUT_ROLES:
         places |= {item.variable: (role, name) for name, item in binding.inputs(role).items()}
     for name, port in binding.port.items():
@@ -89,7 +95,8 @@ def default_experiment(
                 f"{', ...' if len(places) > 20 else ''}."
             )
         role, name = places[variable]
-        given.setdefault(role, {})[name] = value
+        if variable not in structural:
+            given.setdefault(role, {})[name] = value
     return Experiment(binding, steps, given.pop("parameter", {}), given)
 
 

@@ -1,6 +1,7 @@
 """Names of a binding found in an FMU, and where their values stand in a block."""
 
 import difflib
+import math
 import re
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -177,11 +178,15 @@ class BlockLayout:
 def start_values(description: FmuDescription, variable: VariableInfo) -> list[float]:
     """Return the declared start values; one value stands for all elements of an array.
 
+    They are NaN where the array has another size than declared.
+
     Raises
     ------
     FmuFileError
         If one is no number, or their number does not fit.
     """
+    if variable.start == "":
+        return [math.nan] * variable.size
     words = (variable.start or "0").lower().split() or ["0"]
     try:
         values = [float({"true": "1", "false": "0"}.get(word, word)) for word in words]

@@ -50,9 +50,10 @@ class OpenedFmu(SteppedAsset):
         parameters: Values | None = None,
     ) -> None:
         given = binding if isinstance(binding, Binding) else load_binding(binding)
-        self._description = read_fmu(fmu_path, given.binding.interface)
+        description = read_fmu(fmu_path, given.binding.interface)
         limits = limits_of(given, step_timeout, load_timeout, memory_limit)
-        self._exchange = Exchange(self._description, given)
+        self._exchange = Exchange(description, given)
+        self._description = self._exchange.description
         self._housing = Housing(self._description, self._exchange.plan, limits, isolated=isolated)
         super().__init__(self._exchange.binding)
         self._settings = self._exchange.settings(parameters or {})
@@ -241,6 +242,7 @@ class OpenedFmu(SteppedAsset):
     # ------------------------------------------------------------------ inside
 
     def _begin(self, request: list[float], *, with_inputs: bool, renewed: bool = False) -> None:
+        self._exchange.check_known(request)
         if self._lines:
             request[-self._lines :] = request[2 : 2 + self._lines]
         start = Start(self._start_time, self._step_size, self._settings, request, with_inputs)
