@@ -1,21 +1,21 @@
 """What an FMU declares in its model description, as plain records for all FMI versions."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from fmu_asset.errors import visible
+from fmu_asset.errors import FmuInputError, visible
 from fmu_asset.instances.plan import Interface
 
 NUMERIC_KINDS = frozenset(
     {"Real", "Integer", "Enumeration", "Boolean", "Float32", "Float64"}
     | {f"{sign}{bits}" for sign in ("Int", "UInt") for bits in (8, 16, 32, 64)}
 )
-LARGEST_ARRAY = 10_000_000
+_LARGEST_ARRAY = 10_000_000
 FLOAT_KINDS = frozenset({"Real", "Float32", "Float64"})
 
 
@@ -38,11 +38,11 @@ class VariableInfo:
     minimum, maximum : float or None
         Declared range in `unit`.
     start : str or None
-        Declared start value; of an array, its elements; empty if the array has another size by now.
+        Declared start value; of an array, its elements.
     shape : tuple of int
         Of an array of FMI 3, with the start values of its structural parameters; empty for a scalar.
-    dimensions : tuple of int or str
-        For each number of the shape the same, or the name of the structural parameter that it is.
+    dimensions : tuple of str or None
+        For each number of the shape the name of the structural parameter that it is, if it is one.
     clocked : bool
         Whether it changes with a clock of FMI 3 only.
     """
@@ -59,13 +59,26 @@ class VariableInfo:
     maximum: float | None
     start: str | None
     shape: tuple[int, ...] = ()
-    dimensions: tuple[int | str, ...] = ()
+    dimensions: tuple[str | None, ...] = ()
     clocked: bool = False
 
     @property
     def size(self) -> int:
         """Number of values."""
         return math.prod(self.shape)
+
+    def resized(self, lengths: Mapping[str | None, int]) -> "VariableInfo":
+        """Return the variable with other values of structural parameters; one start value stands for all.
+
+        Raises
+        ------
+        FmuInputError
+            If it would be an array of too many elements.
+        """
+        shape = [lengths.get(name, length) for name, length in zip(self.dimensions, self.shape, strict=True)]
+        start = {*(self.start or "").split()}
+        alike = start.pop() if len(start) == 1 else self.start
+        return replace(self, shape=_checked(self.name, shape), start=alike)
 
     @property
     def numeric(self) -> bool:
@@ -273,6 +286,14 @@ def read_declared(
     )
 
 
+def _checked(name: str, shape: Sequence[int]) -> tuple[int, ...]:
+    if any(length < 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
+        raise FmuInputError(
+            f"{name!r} is an array of {' x '.join(map(str, shape))} elements; {_LARGEST_ARRAY} are the most."
+        )
+    return tuple(shape)
+
+
 def _variable(declared: Any) -> VariableInfo:
     declared_type = declared.declaredType
 
@@ -282,9 +303,6 @@ def _variable(declared: Any) -> VariableInfo:
             getattr(declared_type, attribute, None) if value is None and declared_type is not None else value
         )
 
-    shape = tuple(declared.shape or ())
-    if any(length < 0 for length in shape) or math.prod(shape) > LARGEST_ARRAY:
-        raise ValueError(f"{declared.name!r} is an array of {' x '.join(map(str, shape))} elements")
     return VariableInfo(
         name=str(declared.name),
         reference=int(declared.valueReference),
@@ -297,11 +315,8 @@ def _variable(declared: Any) -> VariableInfo:
         minimum=None if of("min") is None else float(of("min")),
         maximum=None if of("max") is None else float(of("max")),
         start=None if declared.start is None else str(declared.start),
-        shape=shape,
-        dimensions=tuple(
-            length if dimension.variable is None else str(dimension.variable.name)
-            for length, dimension in zip(shape, declared.dimensions or (), strict=True)
-        ),
+        shape=_checked(declared.name, declared.shape or ()),
+        dimensions=tuple(d.variable and str(d.variable.name) for d in declared.dimensions or ()),
         clocked=bool(declared.clocks),
     )
 

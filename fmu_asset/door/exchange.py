@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
-from fmu_asset.errors import BindingError, FmuInputError
+from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
 from .binding import INPUT_ROLES, Binding, Input
@@ -54,14 +54,14 @@ class Exchange:
     """
 
     def __init__(self, description: FmuDescription, binding: Binding) -> None:
-        structural = binding.binding.structural_parameters
-        self.description = self._description = description = configured(description, structural)
         wanted = binding.binding.fmi_version
         if wanted is not None and wanted[0] != description.fmi_version[0]:
             raise BindingError(
                 f"The binding {binding.name} is for FMI {wanted}, but {description.path} is of FMI "
                 f"{description.fmi_version}; correct `fmi_version`, or leave it out."
             )
+        description, configuration = configured(description, binding)
+        self.description = self._description = description
         self.binding = self._binding = binding.with_arrays(self._elements)
         self._reads_ports = self._port_directions()
         self._make_outputs()
@@ -81,11 +81,7 @@ class Exchange:
             states=description.states,
             event_indicators=description.event_indicators,
             completed_step=description.completed_step,
-            configuration=[
-                (v.kind, v.reference, [float(v.start or 0)])
-                for v in description.variables
-                if v.name in structural
-            ],
+            configuration=configuration,
         )
 
     # ------------------------------------------------------------------ resolving
@@ -305,8 +301,13 @@ class Exchange:
 
     # ------------------------------------------------------------------ sending
 
-    def start_values(self) -> list[float]:
+    def start_values(self, *given: Values | None) -> list[float]:
         """Return a request block with the FMU's own start values of the inputs.
+
+        Parameters
+        ----------
+        *given : mapping of str to float, or None
+            What is going to be put in their place, by role: whole arrays of it are left at zero.
 
         Raises
         ------
@@ -314,24 +315,15 @@ class Exchange:
             If a start value is no number.
         """
         values = [0.0, 0.0]
+        slots = [
+            self.slot(role, name)
+            for role, part in zip(self._slots, given, strict=False)
+            for name in part or ()
+        ]
+        whole = {slot.variable.name for slot in slots if len(slot.positions) == slot.variable.size}
         for variable in self._inputs.variables:
-            values += start_values(self._description, variable)
+            values += start_values(self._description, variable, given=variable.name in whole)
         return values + values[2 : 2 + self.plan.linear_count]
-
-    def check_known(self, request: Sequence[float]) -> None:
-        """Refuse a request block in which a value of an array of another size than declared is missing."""
-        for variable in self._inputs.variables:
-            if variable.start != "":
-                continue
-            place = self._inputs.positions(Place(variable, None))
-            self._refuse_unknown(variable.name, request[place.start : place.stop])
-
-    def _refuse_unknown(self, name: str, values: Sequence[float]) -> None:
-        if any(value != value for value in values):
-            raise FmuInputError(
-                f"{name!r} of {self._description.path} has {len(values)} elements with these structural "
-                "parameters, and its start values are of another size; give all of them."
-            )
 
     def settings(self, parameters: Values) -> Settings:
         """Return what is set before initialisation: the values of the binding, then the caller's.
@@ -367,11 +359,10 @@ class Exchange:
             variable = slots[name].variable
             if variable.name not in set_values:
                 kind = self._description.exchange_kind(variable)
-                start = start_values(self._description, variable) if variable.shape else [0.0]
+                whole = len(slots[name].positions) == variable.size
+                start = start_values(self._description, variable, given=whole)
                 set_values[variable.name] = (kind, variable.reference, start)
             put(set_values[variable.name][2], slots[name], value)
-        for name, (_, _, numbers) in set_values.items():
-            self._refuse_unknown(name, numbers)
         return list(set_values.values())
 
     def place(

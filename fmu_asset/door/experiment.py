@@ -11,7 +11,6 @@ from fmu_asset.errors import BindingError, FmuInputError
 from reporting.progress import Progress
 
 from .binding import INPUT_ROLES, Binding
-from .configuration import configured
 from .draft import trial_binding
 from .history_file import InputHistories
 from .observation import Observation
@@ -75,17 +74,14 @@ def default_experiment(
     end = description.stop_time if stop_time is None else stop_time
     size = step_size or description.fixed_step or description.step_size
     _, steps, size = steps_to(description.start_time or 0.0, end, size)
-    kinds = {v.name for v in description.variables if v.causality == "structuralParameter"}
-    structural = {name: value for name, value in (values or {}).items() if name in kinds}
-    binding = trial_binding(configured(description, structural), step_size=size)
-    header = binding.binding.model_copy(update={"structural_parameters": structural})
-    binding = binding.model_copy(update={"binding": header})
-    places: dict[str, tuple[str, str]] = dict.fromkeys(kinds, ("structural", ""))
-    places |= {item.variable: ("parameter", name) for name, item in binding.parameter.items()}
+    binding = trial_binding(description, step_size=size)
+    places = {item.variable: ("parameter", name) for name, item in binding.parameter.items()}
     for role in INPUT_ROLES:
         places |= {item.variable: (role, name) for name, item in binding.inputs(role).items()}
     for name, port in binding.port.items():
         places |= {v.variables[0]: ("port", f"{name}.{key}") for key, v in port.quantities.items()}
+    structural = [v.name for v in description.variables if v.causality == "structuralParameter"]
+    places |= {name: ("structural", name) for name in structural}
     given: dict[str, dict[str, Value]] = {}
     for variable, value in (values or {}).items():
         if variable not in places:
@@ -95,8 +91,9 @@ def default_experiment(
                 f"{', ...' if len(places) > 20 else ''}."
             )
         role, name = places[variable]
-        if variable not in structural:
-            given.setdefault(role, {})[name] = value
+        given.setdefault(role, {})[name] = value
+    header = {"structural_parameters": given.pop("structural", {})}
+    binding = binding.model_copy(update={"binding": binding.binding.model_copy(update=header)})
     return Experiment(binding, steps, given.pop("parameter", {}), given)
 
 
