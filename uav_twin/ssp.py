@@ -1,5 +1,6 @@
 """`uav-twin ssp ...`."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -107,7 +108,7 @@ def simulate(
     from fmu_asset.coupling.asset import CoupledAsset
     from fmu_asset.coupling.experiment import fly_system, system_experiment
     from fmu_asset.door.history_file import write_history
-    from fmu_asset.ssp.check import join_ssp, unused
+    from fmu_asset.ssp.check import join_ssp
     from fmu_asset.ssp.reader import read_ssp
     from reporting.provenance import hash_file
 
@@ -116,7 +117,7 @@ def simulate(
     with tempfile.TemporaryDirectory() as folder:
         system = read_ssp(file, folder)
         wiring = join_ssp(system, delay or ())
-        _say_unused(unused(system, wiring))
+        _say_unused(wiring.left_out)
         span = (system.span[0], system.span[1] if stop_time is None else stop_time)
         planned = system_experiment(wiring, span=span, step_size=step_size, values=given)
         with CoupledAsset(
@@ -135,7 +136,7 @@ def simulate(
     say(asset, history, file, [out, plot])
 
 
-def _say_unused(names: tuple[str, ...]) -> None:
+def _say_unused(names: Sequence[str]) -> None:
     from fmu_asset.coupling.structure import listed
 
     if names:

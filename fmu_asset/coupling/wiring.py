@@ -56,7 +56,9 @@ class Wiring:
     Attributes
     ----------
     structure : SystemStructure
-        As given, with what was left out left out.
+        As given, without what was left out.
+    left_out : list of str
+        The names of these settings.
     declared : dict of str to DeclaredFmu
         The FMUs by component.
     feeds : tuple of Feed
@@ -93,6 +95,7 @@ class Wiring:
         self.declared: dict[str, DeclaredFmu] = {
             c.name: read_declared(c.fmu, c.interface) for c in structure.components
         }
+        self.left_out: list[str] = []
         if leave_out_unknown:
             structure = replace(structure, components=tuple(map(self._known, structure.components)))
         self.structure = structure
@@ -210,7 +213,7 @@ class Wiring:
         if variable.causality not in READABLE or not variable.single:
             raise CouplingError(
                 f"{end} cannot be the source of a connection: it is declared as {variable.causality} of the "
-                f"type {variable.kind}{_array(variable)}, and a numeric output is needed."
+                f"type {variable.kind}, and an output of a single number is needed."
             )
         return variable
 
@@ -219,8 +222,7 @@ class Wiring:
         if variable.causality not in causalities or not variable.single:
             raise CouplingError(
                 f"{end} cannot be the target of this connection: it is declared as {variable.causality} of "
-                f"the type {variable.kind}{_array(variable)}, and a numeric {' or '.join(causalities)} is "
-                "needed."
+                f"the type {variable.kind}, and a single number is needed as {' or '.join(causalities)}."
             )
         return variable
 
@@ -260,6 +262,7 @@ class Wiring:
     def _known(self, component: Component) -> Component:
         variables = self.declared[component.name].variables
         settings = {name: setting for name, setting in component.settings.items() if name in variables}
+        self.left_out += [f"{component.name}.{name}" for name in component.settings if name not in settings]
         return replace(component, settings=settings)
 
     def _settings(self, component: Component) -> dict[str, float]:
@@ -309,15 +312,8 @@ class Wiring:
             or not math.isfinite(number)
         )
         if wrong:
-            raise CouplingError(
-                f"{end} cannot be set to {value!r}: it is of the type {variable.kind}{_array(variable)}."
-            )
+            raise CouplingError(f"{end} cannot be set to {value!r}: it is of the type {variable.kind}.")
         return number
-
-
-def _array(variable: VariableInfo) -> str:
-    """Return what a sentence about a type adds for an array; single numbers are coupled, no arrays."""
-    return f"[{']['.join(map(str, variable.shape))}]" if variable.shape else ""
 
 
 def composed(first: Conversion, second: Conversion) -> Conversion:

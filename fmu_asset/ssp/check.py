@@ -75,6 +75,7 @@ def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
         If the system does not fit its FMUs.
     """
     wiring = Wiring(system.structure.delayed(delayed), leave_out_unknown=True)
+    wiring.left_out += system.unused
     definitions = system.structure.units
     for end, declared in system.declared.items():
         variable = wiring.variable(end)
@@ -97,17 +98,6 @@ def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
     return wiring
 
 
-def unused(system: SspSystem, wiring: Wiring) -> tuple[str, ...]:
-    """Return the names of parameters that a system sets, but neither it nor one of its FMUs has."""
-    taken = {component.name: component.settings for component in wiring.structure.components}
-    return system.unused + tuple(
-        f"{component.name}.{name}"
-        for component in system.structure.components
-        for name in component.settings
-        if name not in taken[component.name]
-    )
-
-
 def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
     """Check an SSP file: archive, schemas, connections against the FMUs, and one step of 1 s in workers.
 
@@ -121,8 +111,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
         raise SspError(f"There is no SSP file {file}.")
     try:
         with scratch_folder() as folder:
-            system = read_ssp(file, folder)
-            wiring = join_ssp(system)
+            wiring = join_ssp(read_ssp(file, folder))
             plan = wiring.schedule
             problems = _trial(wiring)
         return SspCheck(
@@ -132,7 +121,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
             connections=len(wiring.structure.connections),
             parameters=sum(len(component.settings) for component in wiring.structure.components),
             loops=(loop_sentence(plan.loops),) if plan.loops else (),
-            unused=unused(system, wiring),
+            unused=tuple(wiring.left_out),
         )
     except FmuError as error:
         return SspCheck(file, (str(error),))

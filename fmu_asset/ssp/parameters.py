@@ -1,6 +1,6 @@
 """Parameter sets (SSV) and mappings (SSM): read into plain values by target name."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isfinite
 from typing import Any
 
@@ -12,17 +12,8 @@ from .package import NAMESPACES, SspPackage, tag, validate
 
 _SET_TYPE = "application/x-ssp-parameter-set"
 _MAPPING_TYPE = "application/x-ssp-parameter-mapping"
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A mapping entry: target = factor * source + offset."""
-
-    source: str
-    target: str
-    factor: float
-    offset: float
-    convert_units: bool
+VALUE_TYPES = ("Real", "Integer", "Boolean", "Enumeration", "String", "Binary")
+"""What SSP 1.0 knows; a text or a binary value is refused where something would take it."""
 
 
 def read_units(element: Any) -> tuple[UnitInfo, ...]:
@@ -79,11 +70,8 @@ def _read_binding(element: Any, package: SspPackage, where: str) -> dict[str, Se
     if mapping is not None and (mapping.get("source") or len(mapping)):  # an empty one maps nothing
         if mapping.get("type", _MAPPING_TYPE) != _MAPPING_TYPE:
             raise SspError(f"{what} in {package.path} has a mapping of the type {mapping.get('type')!r}.")
-        content = _content(mapping, None, "ssm", "ParameterMapping", package, f"the mapping of {what}")
-        entries = _entries(content, f"{what} in {package.path}")
-        # One mapping may serve several sets.
-        package.unused += [f"{where}.{entry.target}" for entry in entries if entry.source not in values]
-        values = _mapped(values, entries, f"{what} in {package.path}")
+        entries = _content(mapping, None, "ssm", "ParameterMapping", package, f"the mapping of {what}")
+        values = _mapped(values, entries, package, f"{what} in {package.path}")
     return values
 
 
@@ -113,31 +101,15 @@ def _detached(element: Any) -> Any:
 
 def _value(parameter: Any, where: str) -> Setting:
     name = parameter.get("name")
-    for kind in ("Real", "Integer", "Boolean", "Enumeration"):
-        item = parameter.find(tag("ssv", kind))
-        if item is None:
-            continue
-        text = item.get("value")
-        value: SettingValue = text
-        if kind == "Real":
-            value = _finite(text, f"the value of {name!r} of {where}")
-        elif kind == "Integer":
-            value = int(text)
-        elif kind == "Boolean":
-            value = text.strip() in ("true", "1")
-        return Setting(value, item.get("unit"))
-    raise SspError(
-        f"{where} gives {name!r} as a text or binary value; only numbers, Booleans and enumerations are set."
-    )
-
-
-def _entries(root: Any, where: str) -> list[_Entry]:
-    found = []
-    for entry in root.findall(tag("ssm", "MappingEntry")):
-        factor, offset = read_transformation(entry, f"the mapping of {entry.get('source')!r} of {where}")
-        convert = not flag(entry, "suppressUnitConversion")
-        found.append(_Entry(entry.get("source"), entry.get("target"), factor, offset, convert))
-    return found
+    item = next(item for kind in VALUE_TYPES if (item := parameter.find(tag("ssv", kind))) is not None)
+    value: SettingValue = item.get("value")
+    if item.tag == tag("ssv", "Real"):
+        value = _finite(item.get("value"), f"the value of {name!r} of {where}")
+    elif item.tag == tag("ssv", "Integer"):
+        value = int(item.get("value"))
+    elif item.tag == tag("ssv", "Boolean"):
+        value = flag(item, "value")
+    return Setting(value, item.get("unit"))
 
 
 def flag(element: Any, name: str) -> bool:
@@ -177,20 +149,23 @@ def _finite(text: str, what: str) -> float:
     return value
 
 
-def _mapped(values: dict[str, Setting], entries: list[_Entry], where: str) -> dict[str, Setting]:
+def _mapped(values: dict[str, Setting], root: Any, package: SspPackage, where: str) -> dict[str, Setting]:
     """Return the values under the names that a mapping gives them; what it does not name is not used."""
     found: dict[str, Setting] = {}
-    for entry in entries:
-        if entry.source not in values:
+    for entry in root.findall(tag("ssm", "MappingEntry")):
+        source, target = entry.get("source"), entry.get("target")
+        factor, offset = read_transformation(entry, f"the mapping of {source!r} of {where}")
+        if source not in values:  # one mapping may serve several sets
+            package.unused.append(target)
             continue
-        if entry.target in found:
-            raise SspError(f"{where} maps two parameters to {entry.target!r}; keep one of the two.")
-        setting = values[entry.source]
-        if (entry.factor, entry.offset) != (1.0, 0.0):
+        if target in found:
+            raise SspError(f"{where} maps two parameters to {target!r}; keep one of the two.")
+        setting = values[source]
+        if (factor, offset) != (1.0, 0.0):
             if isinstance(setting.value, bool | str):
-                raise SspError(f"{where} scales {entry.source!r}, which is no number.")
-            setting = replace(setting, factor=entry.factor, offset=entry.offset)
-        if not entry.convert_units:
+                raise SspError(f"{where} scales {source!r}, which is no number.")
+            setting = replace(setting, factor=factor, offset=offset)
+        if flag(entry, "suppressUnitConversion"):
             setting = replace(setting, unit=None)
-        found[entry.target] = setting
+        found[target] = setting
     return found

@@ -8,7 +8,7 @@ Of SSP 2.0 the same is read; see `package.in_words_of_1`.
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 from fmu_asset.coupling.structure import (
     Component,
@@ -22,7 +22,7 @@ from reporting.files import atomic_write_bytes
 
 from .flatten import flat_connections, flat_settings
 from .package import NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
-from .parameters import flag, read_bindings, read_transformation, read_units
+from .parameters import VALUE_TYPES, flag, read_bindings, read_transformation, read_units
 from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree
 
 _INTERFACES: dict[str, Interface | None] = {
@@ -122,15 +122,11 @@ def _span(root: Any) -> tuple[float | None, float | None]:
 
 
 def _kind(tree: Tree, node: Node, declared: DeclaredConnector) -> ConnectorKind:
-    if declared.kind == "input":
-        return "input"
-    if declared.kind == "output":
-        return "output"
-    if declared.kind == "parameter":
-        return "parameter"
-    raise tree.error(
-        f"the connector {str(node)!r} of the system is of the kind {declared.kind}, which is not supported."
-    )
+    if declared.kind not in get_args(ConnectorKind):
+        raise tree.error(
+            f"the connector {str(node)!r} of the system is of the kind {declared.kind}, not supported."
+        )
+    return cast("ConnectorKind", declared.kind)
 
 
 # ---------------------------------------------------------------------- the tree
@@ -192,7 +188,7 @@ def _connectors(tree: Tree, element: Any, path: ElementPath) -> None:
         if node in tree.connectors:
             raise tree.error(f"the connector {str(node)!r} is there twice.")
         kind, unit = None, None
-        for name in ("Real", "Integer", "Boolean", "Enumeration", "String", "Binary"):
+        for name in VALUE_TYPES:
             item = connector.find(tag("ssc", name))
             if item is not None:
                 kind, unit = name, item.get("unit") or None

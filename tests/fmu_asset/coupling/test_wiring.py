@@ -49,7 +49,10 @@ def link(source: str, target: str, **options: object) -> Connection:
             "wing.load_factor cannot be the source.*declared as input",
         ),
         ([("damage.z1", "wing.strain[1]")], r"wing.strain\[1\] cannot be the target.*declared as output"),
-        ([("push", "wing.young_modulus_factor")], "declared as parameter.*a numeric input is needed"),
+        (
+            [("push", "wing.young_modulus_factor")],
+            "declared as parameter.*a single number is needed as input",
+        ),
         (
             [("damage.z1", "wing.health.z1"), ("damage.z2", "wing.health.z1")],
             "wing.health.z1 has two sources, damage.z1 and damage.z2",
