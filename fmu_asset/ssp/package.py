@@ -127,7 +127,7 @@ def parse_xml(content: bytes, where: str) -> Any:
     try:
         root = etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
-        raise SspError(f"{where} is not well-formed XML ({error}).") from error
+        raise SspError(f"{where} is not well-formed XML ({error.msg}).") from error
     if root.getroottree().docinfo.doctype:
         raise SspError(
             f"{where} has a document type declaration, which SSP files have no need of; it was refused."
@@ -196,7 +196,7 @@ def validate(root: Any, kind: str, where: str) -> None:
         for uri in NAMESPACES.values():
             text = text.replace(f"{{{uri}}}", "")
         raise SspError(
-            f"{where} is not valid by the schema of SSP 1.0 (line {first.line}): {text.rstrip('.')}."
+            f"{where} is not valid by the schema of SSP 1.0 (line {first.line}): {text[:400].rstrip('.')}."
         )
 
 

@@ -625,7 +625,8 @@ def test_a_mapped_value_is_converted_before_it_is_transformed(theirs: Pack, tmp_
          "two elements named 'structure'"),
         (('name="z1" kind="output"', 'name="z1" kind="output" colour="red"'),
          r"not valid by the schema of SSP 1\.0 \(line \d+\).*colour"),
-        (("</ssd:Units>", "</ssd:Unit>"), "not well-formed XML"),
+        (("</ssd:Units>", "</ssd:Unit>"), r"not well-formed XML \(.*line \d+, column \d+\)\.$"),
+        (('name="z1" kind="output"', f'name="z1" kind="{"o" * 5000}"'), r"^.{,700}$"),
         (('version="1.0" name="theirs"', 'version="3.0" name="theirs"'), "not valid by the schema"),
         (('<ssd:Connector name="health.z1" kind="input"><ssc:Real/>',
           '<ssd:Connector name="health.z1" kind="input"><ssc:Integer/>'),
@@ -706,6 +707,13 @@ def test_archives_that_are_unsafe_or_damaged(theirs: Pack, tmp_path: Path) -> No
     place = len(good) // 2
     kept.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
     with pytest.raises(SspError, match=r"damaged|not a sound"):
+        read_ssp(kept, tmp_path / "fmus")
+    with zipfile.ZipFile(kept, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("SystemStructure.ssd", NESTED * 50)
+    compressed = bytearray(kept.read_bytes())
+    compressed[200:260] = bytes(60)
+    kept.write_bytes(compressed)
+    with pytest.raises(SspError, match="not a sound SSP archive"):
         read_ssp(kept, tmp_path / "fmus")
     assert not (tmp_path / "fmus").exists()
     assert not (tmp_path.parent / "outside.txt").exists()
