@@ -84,8 +84,6 @@ def _locked(path: Path, what: Path) -> Iterator[None]:
     try:
         with suppress(ImportError):  # Windows: several builders then build the same
             _take(handle, what)
-        os.truncate(handle, 0)
-        os.pwrite(handle, str(os.getpid()).encode(), 0)
         yield
     finally:
         os.close(handle)
@@ -98,6 +96,8 @@ def _take(handle: int, what: Path) -> None:
     for look in range(_MOST_LOOKS):
         with suppress(BlockingIOError):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.truncate(handle, 0)
+            os.pwrite(handle, str(os.getpid()).encode(), 0)
             if look > _SILENT_LOOKS and not what.exists():
                 _logger.warning("The other process has ended without leaving %s; it is made here.", what)
             return

@@ -16,10 +16,10 @@ VALUE_TYPES = ("Real", "Integer", "Boolean", "Enumeration", "String", "Binary")
 """What SSP 1.0 knows; a text or a binary value is refused where something would take it."""
 
 
-def read_units(element: Any) -> tuple[UnitInfo, ...]:
-    """Return the unit definitions below an element that holds `ssc:Unit`."""
+def read_units(root: Any, kind: str) -> tuple[UnitInfo, ...]:
+    """Return the unit definitions of a document of a kind: "ssd" or "ssv"."""
     found = []
-    for unit in element.findall(tag("ssc", "Unit")):
+    for unit in root.findall(f"{kind}:Units/ssc:Unit", NAMESPACES):
         base = unit.find(tag("ssc", "BaseUnit"))
         exponents = tuple(
             int(base.get(symbol, "0")) for symbol in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
@@ -58,8 +58,7 @@ def _read_binding(element: Any, package: SspPackage, where: str) -> dict[str, Se
         )
     root = _content(element, "ssd:ParameterValues", "ssv", "ParameterSet", package, what)
     prefix = element.get("prefix", "")
-    defined = root.find(tag("ssv", "Units"))
-    units = () if defined is None else read_units(defined)
+    units = read_units(root, "ssv")
     values: dict[str, Setting] = {}
     for parameter in root.findall("ssv:Parameters/ssv:Parameter", NAMESPACES):
         name = prefix + parameter.get("name")

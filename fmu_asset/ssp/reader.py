@@ -78,9 +78,6 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
     package = SspPackage(path)
     root = package.parse(SSD_NAME, "ssd")
     tree = Tree(package)
-    units = root.find(tag("ssd", "Units"))
-    for unit in () if units is None else read_units(units):
-        tree.units[unit.name] = unit
     system = root.find(tag("ssd", "System"))
     _system(tree, system, ())
     names = _names(tree)
@@ -102,9 +99,8 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
         for node, declared in tree.connectors.items()
         if node.path == ()
     )
-    structure = SystemStructure(
-        str(root.get("name")), components, connectors, connections, tuple(tree.units.values())
-    )
+    units = read_units(root, "ssd")
+    structure = SystemStructure(str(root.get("name")), components, connectors, connections, units)
     inner = {
         Endpoint(names[node.path], node.connector): declared
         for node, declared in tree.connectors.items()
@@ -140,10 +136,7 @@ def _system(tree: Tree, element: Any, path: ElementPath) -> None:
         )
     _connectors(tree, element, path)
     children: set[str] = set()
-    elements = element.find(tag("ssd", "Elements"))
-    for child in () if elements is None else elements:
-        if not isinstance(child.tag, str):
-            continue  # a comment
+    for child in element.iterfind("ssd:Elements/*", NAMESPACES):
         own = str(child.get("name"))
         if own in children:
             raise tree.error(
