@@ -324,7 +324,7 @@ WRONG_TOML = [
     ("held_out = true", 'channels = ["tip"]', r"turn.csv has no column 'w \[mm\]', which the chan"),
     ("held_out = true", "temperature = 21", "gives its temperature twice"),
     ("held_out = true", 'hold = "smooth"', r"and its `hold` is for the force of a forced one: say that"),
-    ("held_out = true", 'hold = "held"', r"hold: input should be 'zero_order', 'linear' or 'smooth', but 'held'"),
+    ("held_out = true", 'hold = "held"', r"hold: input should be 'zero_order', 'linear' or 'smooth', but 'h"),
     ("held_out = true", "health = { z1 = 0.1 }", "gives z1 twice"),
     ("load_place = [1.0, 0.35]", "load_place = [1.0]", r"must be a name or \[y, x\]"),
     ("release = {", "releases = {", r"'trial\[2\].releases' is not a key of a campaign"),
