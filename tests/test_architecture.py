@@ -53,7 +53,7 @@ ROOMS = {
     ),
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",
-        "search_settings", "fits", "search", "judgement", "checks", "sources", "model_choice", "workflow",
+        "search_settings", "fits", "missing_force", "search", "judgement", "checks", "sources", "model_choice", "workflow",
         "parameters", "files", "self_calibration", "report", "verdict_folder",
     ),
 }  # fmt: skip

@@ -97,8 +97,8 @@ class RecordedInput:
         What it is.
     values : (N,) ndarray
         At the samples [SI].
-    hold : Hold
-        Between them.
+    hold : Hold or None
+        Between them; None: nobody said it, and it is taken as linear.
     offset_deviation : float
         Prior standard deviation of a constant that the record lacks in this trial [SI]; zero: none.
     """
@@ -106,7 +106,7 @@ class RecordedInput:
     name: str
     quantity: Quantity
     values: FloatArray
-    hold: Hold = Hold.LINEAR
+    hold: Hold | None = None
     offset_deviation: float = 0.0
 
 
@@ -268,6 +268,8 @@ class Trial:
     inputs : tuple of RecordedInput
         Driven trials: what acted. `force` is then the first force or torque among them, or zero. Static
         trials: what was held in each row beside the force.
+    hold : Hold or None
+        Forced trials: as that of an input, for the force.
     """
 
     name: str
@@ -289,6 +291,7 @@ class Trial:
     noise_factor: float = 1.0
     begins: Start = Start.SETTLED
     inputs: tuple[RecordedInput, ...] = ()
+    hold: Hold | None = None
 
     @property
     def input_names(self) -> tuple[str, ...]:

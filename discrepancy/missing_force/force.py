@@ -1,12 +1,12 @@
 """The force that a verdict is about: where it is, how large, what a named law is of it, what is left."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
@@ -15,7 +15,8 @@ from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
 from .columns import Columns
-from .naming import ForceSearch, Seen
+from .naming import ForceSearch, Seen, seen
+from .view import Column
 
 FloatArray = NDArray[np.float64]
 
@@ -111,91 +112,99 @@ class MissingForce:
         return float(np.sqrt(np.mean(np.concatenate([item.force for item in self.courses]) ** 2)))
 
 
-def missing_force(problem: Problem, fit: CandidateFit) -> MissingForce | None:
+def missing_force(problem: Problem, fit: CandidateFit, effects: Sequence[Effect] = ()) -> MissingForce | None:
     """Return the missing force beside a verdict's fit.
+
+    It is that beside parameters within their priors, at the port of the verdict's effect or else at the one
+    with the most evidence. Where the verdict has no law at a port, that of `effects` is drawn which follows
+    the force best, if one follows it at all.
 
     None where a model does not tell how its ports move, where laws of the verdict act at several ports, and
     where nothing is missing.
-
-    It is that beside parameters within their priors, of the port at which the verdict's effect acts, or else
-    of the one with the most evidence.
     """
     model = problem.model.inner
     dynamic = [data for data in problem.trials if data.trial.is_dynamic]
     if not dynamic or not shows_ports(model):
         return None
     try:
-        return _missing(problem, fit)
+        return _missing(problem, fit, effects)
     except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # it is shown, and no verdict rests on it
         return None
 
 
-def _missing(problem: Problem, fit: CandidateFit) -> MissingForce | None:
+def _missing(problem: Problem, fit: CandidateFit, effects: Sequence[Effect]) -> MissingForce | None:
     search = ForceSearch(problem)
     strained = np.abs(fit.point.shared[problem.shared.precision > 0.0]).max(initial=0.0) > FAR
-    told = bool(fit.candidate.terms) and not strained
-    at = search.locate(fit.point if told else None)
-    nothing = {
-        name: one.view.solve(replace(one.process, size=1e-9 * one.process.size)).evidence
-        for name, one in at.items()
-    }
-    evidence = {name: one.evidence - nothing[name] for name, one in at.items()}
+    believed = bool(fit.candidate.terms) and not strained
+    at = search.locate(fit.point if believed else None)
+    evidence = {name: one.evidence - _of_nothing(one) for name, one in at.items()}
     port = max(at, key=lambda name: at[name].evidence)
-    found, named = at[port], ""
-    if told:
-        patch = fit.candidate.patch(problem.setting, fit.point.effect)
-        columns = Columns(search.problem, search.numbers, search.point)
-        beside = [
-            seen for name in at if (seen := _with_laws(columns, at[name], name, patch, fit)) is not None
-        ]
-        if len(beside) > 1:  # each hides the motion that the others make
+    if evidence[port] < GROUND:
+        return None
+    drawn = _Drawn(at[port])
+    if believed:
+        laws = _of_verdict(search, fit)
+        if len(laws) > 1:  # each hides the motion that the others make
             return None
-        if beside and beside[0].gap > GROUND:
-            found = beside[0].seen
-            port = list(at)[found.view.port]
-            named = " and ".join(term.effect.name for term in fit.candidate.terms)
-    return None if evidence[port] < GROUND else _told(search, port, found, evidence, named)
+        drawn = next((law for law in laws if law.seen.evidence > at[law.port(at)].evidence + GROUND), drawn)
+    elif effects:
+        first = next(iter(search.name(effects)), None)
+        acts = first is not None and any(part.forces for part in first.seen.view.effects[-1].parts)
+        if first is not None and acts and first.evidence > at[port].evidence + GROUND:
+            column = first.seen.view.effects[-1]
+            drawn = _Drawn(first.seen, column, first.size, first.term.effect.name)
+    return _told(search, drawn.port(at), drawn, evidence)
 
 
-class _Beside(NamedTuple):
-    """What is left beside laws, and how much more evidence that has than the missing force alone [nat]."""
+def _of_nothing(found: Seen) -> float:
+    """Return the evidence [nat] without any missing force."""
+    return found.view.solve(replace(found.process, size=1e-9 * found.process.size)).evidence
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """What is left of the missing force beside a law, which is a factor times a column."""
 
     seen: Seen
-    gap: float
+    law: Column | None = None
+    factor: float = 1.0
+    name: str = ""
+
+    def port(self, ports: Iterable[str]) -> str:
+        return list(ports)[self.seen.view.port]
 
 
-def _with_laws(
-    columns: Columns, found: Seen, port: str, patch: ModelPatch, fit: CandidateFit
-) -> _Beside | None:
-    """Return what is left at a port beside the laws there; None where none acts there."""
-    forces = (item for item in patch if isinstance(item, PortForce))
-    own = ModelPatch(tuple(item for item in forces if item.port == port))
-    column = columns.of_patch(found.view, found.motions, own, fit.candidate.acts_on) if len(own) else None
-    if column is None:
-        return None
-    view = replace(found.view, motions=found.motions, certain=(*found.view.certain, column))
-    process, evidence = view.most_probable(found.process)
-    return _Beside(Seen(view, process, evidence, *view.smoothed(process)), evidence - found.evidence)
+def _of_verdict(search: ForceSearch, fit: CandidateFit) -> list[_Drawn]:
+    """Return what is left at each port at which a verdict has laws, beside these."""
+    patch = fit.candidate.patch(search.problem.setting, fit.point.effect)
+    columns = Columns(search.problem, search.numbers, search.point)
+    named, found = " and ".join(term.effect.name for term in fit.candidate.terms), []
+    for port, one in search.at.items():
+        forces = (item for item in patch if isinstance(item, PortForce))
+        own = ModelPatch(tuple(item for item in forces if item.port == port))
+        column = columns.of_patch(one.view, one.motions, own, fit.candidate.acts_on) if len(own) else None
+        if column is not None:
+            view = replace(one.view, motions=one.motions, certain=(*one.view.certain, column))
+            found.append(_Drawn(seen(view, one.process), column, 1.0, named))
+    return found
 
 
-def _told(
-    search: ForceSearch, port: str, found: Seen, evidence: Mapping[str, float], named: str
-) -> MissingForce:
-    view = found.view
-    law = view.certain[-1] if named else None
+def _told(search: ForceSearch, port: str, drawn: _Drawn, evidence: Mapping[str, float]) -> MissingForce:
+    found, view = drawn.seen, drawn.seen.view
     courses = []
     for number, (trial, motion) in enumerate(zip(view.trials, found.motions, strict=True)):
         at = slice(None, None, trial.parts)
         position, speed = trial.port_motion(view.port, motion.added)
-        given = None if law is None else law.parts[number].forces.get(view.port, np.zeros(len(speed)))[at]
-        force = motion.force[at] if given is None else motion.force[at] + given
+        force, law = found.left[number][at], None
+        if drawn.law is not None:
+            law = drawn.factor * drawn.law.parts[number].forces.get(view.port, np.zeros(len(speed)))[at]
+            force = force + law
         deviation = view.filtered(found.process)[number].deviation()
-        courses.append(ForceCourse(trial.name, trial.time, position[at], speed[at], force, deviation, given))
+        courses.append(ForceCourse(trial.name, trial.time, position[at], speed[at], force, deviation, law))
     share = None
-    if law is not None:
-        left = np.concatenate([item.left for item in courses])
-        share = 1.0 - float(np.mean(left**2) / np.mean(np.concatenate([c.force for c in courses]) ** 2))
+    if drawn.law is not None:
+        left, whole = (np.concatenate([getattr(c, name) for c in courses]) for name in ("left", "force"))
+        share = 1.0 - float(np.mean(left**2) / np.mean(whole**2))
     scale = search.problem.setting.scales.ports.get(port)
-    return MissingForce(
-        port, bool(scale and scale.of_state), dict(evidence), found.process.time, courses, named, share
-    )
+    of_state = bool(scale and scale.of_state)
+    return MissingForce(port, of_state, dict(evidence), found.process.time, courses, drawn.name, share)

@@ -125,14 +125,15 @@ def refined(trial: Trial, parts: int) -> Trial:
         share = (at - row).reshape((-1, *(1,) * (values.ndim - 1)))
         return np.asarray((1.0 - share) * values[row] + share * values[row + 1])
 
-    def held(values: FloatArray, hold: Hold) -> FloatArray:
+    def held(values: FloatArray, hold: Hold | None) -> FloatArray:
         if hold is Hold.ZERO_ORDER:
             return np.asarray(values[np.minimum((at + 1e-9).astype(np.int64), count - 1)])
         return Course.of(trial.time, values, hold).at(time)
 
     return replace(
         trial, time=time, values=dense(trial.values), used=np.ones((len(time), trial.used.shape[1]), bool),
-        force=dense(trial.force), load_factor=dense(trial.load_factor), temperature=dense(trial.temperature),
+        force=held(trial.force, trial.hold), load_factor=dense(trial.load_factor),
+        temperature=dense(trial.temperature),
         health=dense(trial.health), health_deviation=dense(trial.health_deviation),
         inputs=tuple(replace(item, values=held(item.values, item.hold)) for item in trial.inputs),
     )  # fmt: skip

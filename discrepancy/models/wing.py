@@ -12,6 +12,7 @@ from calibration.wing.result_file import load_calibration
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
+from discrepancy.models.input_course import Course
 from discrepancy.models.interface import (
     Conditions,
     ModelParameter,
@@ -372,8 +373,9 @@ class WingModel:
             )  # fmt: skip
         else:
             motion = system.forced(
-                self.wing.force_row(trial.load_place, loads) @ basis, _amounts(trial, loads)[:, 0],
-                trial.time, laws, clock=conditions.clock, refinement=refinement,
+                self.wing.force_row(trial.load_place, loads) @ basis,
+                Course.of(trial.time, _amounts(trial, loads)[:, 0], trial.hold), trial.time, laws,
+                clock=conditions.clock, refinement=refinement,
             )  # fmt: skip
         response = motion.response(rows @ basis, quantities)
         if not components:
@@ -391,8 +393,7 @@ class WingModel:
         rows = self._structure.output_rows(outputs, 0, ModelPatch())
         # both bases hold nearly the same shapes of the whole wing
         shapes = np.linalg.lstsq(moved.basis, base.basis @ base.system.shapes, rcond=None)[0]
-        quantities = [quantity for _, quantity in outputs]
-        return moved.system.ported(rows @ moved.basis, quantities, np.asarray(shapes, dtype=np.float64))
+        return moved.system.ported(rows @ moved.basis, [item for _, item in outputs], np.asarray(shapes))
 
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial."""
@@ -403,16 +404,16 @@ class WingModel:
                 row, trial.release, conditions.initial, trial.time, NO_LAWS, clock=conditions.clock
             )
         else:
-            motion = moved.system.forced(row, trial.force, trial.time, NO_LAWS, clock=conditions.clock)
+            motion = moved.system.forced(
+                row, Course.of_force(trial), trial.time, NO_LAWS, clock=conditions.clock
+            )
         rows = np.array(list(moved.system.ports.values()))
         return motion.values(rows), motion.velocity @ (rows @ moved.system.shapes).T
 
     def _moved(self, trial: Trial, parameters: FloatArray, health: FloatArray | None = None) -> MovingWing:
-        losses = self._losses(trial.health[:1] if health is None else health)[0]
-        warm = float(trial.temperature[0])
-        return self._structure.moving(
-            parameters, tuple(losses), ModelPatch(), warm, trial.load_place, STATION_PORTS
-        )
+        losses = tuple(self._losses(trial.health[:1] if health is None else health)[0])
+        warm, place = float(trial.temperature[0]), trial.load_place
+        return self._structure.moving(parameters, losses, ModelPatch(), warm, place, STATION_PORTS)
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at the ports of `ported`."""
@@ -430,7 +431,7 @@ class WingModel:
             return np.asarray(_amounts(trial, empty) @ units)
         row = self.wing.force_row(trial.load_place)
         if trial.kind is TrialKind.FORCED:
-            motion = moved.system.forced(row @ moved.basis, trial.force, trial.time, NO_LAWS)
+            motion = moved.system.forced(row @ moved.basis, Course.of_force(trial), trial.time, NO_LAWS)
             return motion.values(self._structure.point_rows @ moved.basis)
         shape = static.solve(row)
         size = trial.release.displacement if trial.release is not None else 0.0

@@ -68,7 +68,7 @@ def test_inputs_come_out_in_si(tmp_path: Path) -> None:
     heater, table, fan = first.inputs
     assert (heater.quantity, heater.hold, heater.offset_deviation) == (Quantity.HEAT, Hold.ZERO_ORDER, 10.0)
     assert heater.values[:2].tolist() == [1000.0, 2000.0]
-    assert (table.hold, fan.hold) == (Hold.SMOOTH, Hold.LINEAR)
+    assert (table.hold, fan.hold) == (Hold.SMOOTH, None)
     assert table.values[3] == 3e-3
     assert first.force.tolist() == fan.values.tolist()
     assert fan.values[3] == 6e-3
@@ -107,7 +107,11 @@ def test_a_forced_trial_says_what_it_assumes_of_its_begin(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ('unit = "kW"', 'unit = "kN"', "the input 'heater' is heat and must have one of the units W, mW, kW"),
+        (
+            'unit = "kW"',
+            'unit = "kN"',
+            "the unit of 'heater': heat must have a unit such as W, mW or kW, and 'kN'",
+        ),
         ('column = "x"', 'column = "x"\nhold = "linear"', "'table' is a motion, which no drive makes"),
         ('column = "x"', 'column = "plate"', "more than one channel or input reads the column 'plate'"),
         ('column = "x"', 'column = "z1"', "the column 'z1' is reserved"),
