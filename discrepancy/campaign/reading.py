@@ -201,6 +201,7 @@ def _trial(
         noise_factor=section.noise_factor,
         begins=section.begins or Start.SETTLED,
         inputs=inputs,
+        file=section.file,
     )
 
 
@@ -229,7 +230,7 @@ def _inputs(
             lambda text, item=item: si_value(text, item.quantity, item.unit),  # type: ignore[misc]
         )
         offset = si_value(repr(item.offset_deviation), item.quantity, item.unit)
-        found.append(RecordedInput(item.name, item.quantity, values, item.holds, offset))
+        found.append(RecordedInput(item.name, item.quantity, values, item.holds, offset, item.unit))
     return tuple(found)
 
 
@@ -390,6 +391,8 @@ def _channels(
             else si_value(str(raw.get("offset_deviation", 0.0)), item.quantity, item.unit),
             station=item.station,
             chord=item.chord,
+            column=item.table_column,
+            unit=item.unit,
         )
         stated = None
         if item.noise is not None:

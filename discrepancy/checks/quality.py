@@ -1,4 +1,4 @@
-"""Faults that a campaign shows without a model: no noise record, clipping, dead channels, too many outliers.
+"""Faults that a campaign shows without a model: noise records, clipped, dead, frozen and copied channels.
 
 What makes a campaign unreadable (missing columns, uneven sampling, gaps, NaN) is refused by the reader at
 once; what only a model can tell (units, signs, swapped channels, length) is in
@@ -16,8 +16,10 @@ from scipy.stats import f as fisher
 from discrepancy.campaign.noise_records import repeat_record
 from discrepancy.campaign.records import Campaign, Channel, Trial
 from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.held_and_copied import copy_faults, held_faults, roughness
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers, mark_outliers
+from discrepancy.checks.rest import rest_faults
 from discrepancy.errors import CampaignDataError
 
 FloatArray = NDArray[np.float64]
@@ -35,8 +37,8 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     """Return the faults that a campaign shows by itself, by channel and trial.
 
     A channel without a noise record, or whose noise record contradicts repeats (F test at 0.1 %) or the
-    record itself (by a factor of two), is reported as a limit; a dead or clipped channel, or more than 3 %
-    of outliers in a record in time, as a fault of the data (`DataFault.fatal`).
+    record itself (by a factor of two) or moves, is reported as a limit; a dead, clipped, frozen or copied
+    channel, or more than 3 % of outliers in a record in time, as a fault of the data (`DataFault.fatal`).
     """
     faults: list[DataFault] = []
     for name, channel in campaign.channels.items():
@@ -55,6 +57,10 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):
             faults += _record_faults(trial, name, trial.values[:, column], trial.used[:, column])
+        if trial.is_dynamic:
+            faults += held_faults(campaign, trial)
+    faults += copy_faults(campaign)
+    faults += rest_faults(campaign)
     for trial_name, name, found in find_outliers(campaign):
         trial = next(item for item in campaign.trials if item.name == trial_name)
         if trial.is_dynamic and found.sum() > LARGEST_SHARE * len(found):
@@ -120,16 +126,6 @@ def _noise_fault(channel: Channel, stated: float, found: float, what: str) -> Da
         f"{what} by {found:.3g}: check the record and its unit, and whether the noise is coloured.",
         channel.name,
     )
-
-
-def roughness(values: FloatArray) -> float:
-    """Return the standard deviation of white noise that the sixth differences of a record would show.
-
-    Robust (median absolute deviation); differences of the sixth order take out motions of more than some
-    eight samples per period.
-    """
-    differences = np.diff(values, 6)
-    return float(1.4826 * np.median(np.abs(differences)) / np.sqrt(924.0))  # sum of squared binomials
 
 
 # ---------------------------------------------------------------- records
