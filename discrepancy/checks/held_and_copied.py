@@ -21,6 +21,7 @@ _ALIKE = 0.25  # runs of at least this share of its length are its like: pauses,
 _MOST_ALIKE = 1.0 / 3.0  # share of the surroundings that its like may hold
 _JUMP = 3.0  # digits in one sample that no turning point makes
 _PACE = 0.25  # share of the mean step beside a run that is no standstill either
+_MOVING, _RESTING = 0.5, 0.25  # range of another record meanwhile, over its usual one in such a time
 _NOISE_DIGITS = 2.0  # noise of so many digits does not let a reading come twice
 COPIED = 0.01
 """A channel is a copy if another leaves less than this share of its own noise."""
@@ -67,10 +68,12 @@ def held_spans(
 ) -> list[tuple[int, int]]:
     """Return the runs of equal readings, first sample and the one after the last, that are no rest.
 
-    What stands still comes to rest before it and starts from rest: its readings go into the run and out of it
-    by a digit at a time. A run counts where the record goes in and out at speed; where it does so on one side
-    only, other records must go on moving meanwhile, and the run be alone of its kind. Other records that come
-    to rest with it acquit it, and so does a third of the surroundings in runs alike.
+    Noise of more than two digits shows at rest too: any run is at fault. Else, what stands still comes to
+    rest before it and starts from rest: its readings go into the run and out of it by a digit at a time. A
+    run counts where the record goes in and out at speed; where it does so on one side only, another record
+    must go on moving meanwhile, and the run be alone of its kind. Other records that come to rest with it
+    acquit it, and so do a second run at the same value (a dead zone) and a third of the surroundings in runs
+    alike (a square wave, pauses).
 
     Parameters
     ----------
@@ -81,7 +84,7 @@ def held_spans(
     others : (N, K) ndarray
         What else was recorded.
     noise : float
-        Standard deviation; where it is more than two digits, no sensor at rest shows equal readings.
+        Standard deviation of the channel's noise; 0: not known.
     """
     same = np.concatenate(([False], (np.diff(values) == 0.0) & used[1:] & used[:-1], [False]))
     edges = np.flatnonzero(np.diff(same.astype(np.int8)))
@@ -92,26 +95,28 @@ def held_spans(
     if len(distinct) < 3 or not long:
         return []
     digit = float(np.diff(distinct).min())
-    noisy = min(noise, roughness(values)) > _NOISE_DIGITS * digit
+    inner = [run for run in long if values[run[0]] not in (distinct[0], distinct[-1])]  # else told as clipped
+    if min(noise, roughness(values)) > _NOISE_DIGITS * digit:
+        return [(start, stop) for start, stop in inner]
     steps = np.abs(np.diff(values))
     found = []
-    for start, stop in long:
+    for start, stop in inner:
         length = stop - start
         low, high = max(start - _BESIDE * length, 0), min(stop + _BESIDE * length, len(values))
-        inside = (runs[:, 0] >= low) & (runs[:, 1] <= high) & (lengths >= _ALIKE * length)
-        if high - low < 3 * length or lengths[inside].sum() > _MOST_ALIKE * (high - low):
+        like = lengths >= _ALIKE * length
+        inside = like & (runs[:, 0] >= low) & (runs[:, 1] <= high)
+        dead_zone = np.count_nonzero(values[runs[like, 0]] == values[start]) > 1
+        windows = [*range(start - length, low - 1, -length), *range(stop, high - length + 1, length)]
+        if len(windows) < 2 or dead_zone or lengths[inside].sum() > _MOST_ALIKE * (high - low):
             continue
-        beside = np.r_[low:start, stop:high]
-        pace = float(np.mean(steps[np.minimum(beside, len(steps) - 1)]))
+        pace = float(np.mean(np.r_[steps[low:start], steps[stop - 1 : high]]))
         ends = [steps[at] for at in (start - 1, stop - 1) if 0 <= at < len(steps)]
         fast = sum(step >= max(_JUMP * digit, _PACE * pace) for step in ends)
-        before, during = np.std(others[beside], axis=0), np.std(others[start:stop], axis=0)
-        moving = bool(np.any((during > 0.5 * before) & (before > 0.0)))
-        resting = bool(np.any((during <= 0.5 * before) & (during > 0.0))) and not moving
-        alone = np.count_nonzero(lengths >= _ALIKE * length) == 1
-        railed = values[start] in (distinct[0], distinct[-1])  # told as clipped
-        within = fast == 2 or (noisy and len(ends) == 2)
-        if not (resting or railed) and (within or (moving and alone and (fast or noisy))):
+        usual = np.median([np.ptp(others[at : at + length], axis=0) for at in windows], axis=0)
+        meanwhile = np.ptp(others[start:stop], axis=0)
+        moving = bool(np.any((meanwhile > _MOVING * usual) & (usual > 0.0)))
+        resting = not moving and bool(np.any(meanwhile < _RESTING * usual))
+        if (fast == 2 and not resting) or (fast and moving and np.count_nonzero(like) == 1):
             found.append((start, stop))
     return found
 
