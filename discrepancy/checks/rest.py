@@ -14,17 +14,19 @@ from discrepancy.checks.fault import DataFault, FaultKind
 
 FloatArray = NDArray[np.float64]
 
-SHORTEST = 64
+SHORTEST = 128
 """Fewest samples of a noise record that is judged."""
 LARGEST_RATIO = 2.0
 """Scatter of the loudest quarter of a noise record over that of the quietest."""
-LARGEST_DRIFT = 0.5
+LARGEST_DRIFT = 0.6
 """Share of the variance of a noise record that a cubic in time may take."""
 LARGEST_LINE = 0.05
 """Share of the variance that a line at the model's frequency may take."""
+LEAST_PERIODS = 8.0
+"""Fewest periods in a noise record in which a line is looked for."""
 NEAR = 0.1
 """Share of the model's frequency by which it may be off."""
-_LEVEL = 1e-6
+_LEVEL = 1e-5
 
 
 def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[DataFault]:
@@ -46,8 +48,8 @@ def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[
 def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
     """Return what a noise record holds beside noise of one size; None if nothing.
 
-    Without a frequency: a cubic in time that is more than half of it, or quarters that scatter unlike (F test
-    at 1e-6, with the degrees of freedom that correlation leaves, and a factor of two). With the frequency of
+    Without a frequency: a cubic in time that is most of it, or quarters that scatter unlike (F test
+    at 1e-5, with the degrees of freedom that correlation leaves, and a factor of two). With the frequency of
     a mode [Hz]: a line within 10 % of it that holds more than 5 % of the variance. Mains are no motion.
     """
     if record.samples is None or record.interval is None or len(record.samples) < SHORTEST:
@@ -55,9 +57,12 @@ def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
     rest, _ = without_lines(record.samples - record.samples.mean(), record.interval)
     power, interval = float(rest @ rest), record.interval
     if frequency is not None:
+        short = frequency * interval * len(rest) < LEAST_PERIODS
+        if short or any(abs(frequency / mains - 1.0) < NEAR for mains in MAINS):
+            return None
         line = line_near(rest, interval, frequency, NEAR * frequency)
         share = 0.0 if line is None else float(line @ line) / power
-        if share <= LARGEST_LINE or any(abs(frequency / mains - 1.0) < NEAR for mains in MAINS):
+        if share <= LARGEST_LINE:
             return None
         return f"holds a line near the model's {frequency:.3g} Hz with {share:.0%} of its variance"
     time = np.linspace(-1.0, 1.0, len(rest))
@@ -65,7 +70,7 @@ def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
     if (share := float(trend @ trend) / power) > LARGEST_DRIFT:
         return f"drifts by {np.ptp(trend):.3g} (SI) over its length, {share:.0%} of its variance"
     quarters = np.array_split(rest - trend, 4)
-    sizes = np.array([np.std(quarter) for quarter in quarters])
+    sizes = np.array([np.mean(np.abs(quarter)) for quarter in quarters])  # single spikes weigh little
     one, two = int(sizes.argmax()), int(sizes.argmin())
     freedom = _freedom(quarters[two]), _freedom(quarters[one])
     ratio = float(sizes[one] / sizes[two]) if sizes[two] > 0.0 else np.inf
