@@ -94,7 +94,8 @@ def held_spans(
     distinct = np.unique(values)
     if len(distinct) < 3 or not long:
         return []
-    digit = float(np.diff(distinct).min())
+    bends = np.abs(np.diff(values, 2))  # a record that rises all the way passes over digits, its bends do not
+    digit = min(np.diff(distinct).min(), bends[bends > 1e-9 * np.ptp(values)].min(initial=np.inf))
     inner = [run for run in long if values[run[0]] not in (distinct[0], distinct[-1])]  # else told as clipped
     if min(noise, roughness(values)) > _NOISE_DIGITS * digit:
         return [(start, stop) for start, stop in inner]
@@ -149,6 +150,8 @@ def _copies(trial: Trial) -> Iterator[tuple[str, str, str]]:
     if len(trial.time) < LEAST_COPIED:
         return
     rough = np.diff(trial.values[:_LAGS], 6, axis=0)
+    limit = 15.0 * np.median(np.abs(rough), axis=0)  # a jump or a wrong reading would outweigh all noise
+    rough = np.where((np.abs(rough) > limit) & (limit > 0.0), 0.0, rough)
     size = np.sum(rough**2, axis=0)
     # Sixth differences of noise turn at each sample; those of a motion without noise do not.
     noisy = np.sum(rough[1:] * rough[:-1], axis=0) < -0.5 * size
