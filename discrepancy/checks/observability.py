@@ -19,9 +19,9 @@ LEFT = 0.9
 def prior_left(campaign: Campaign, model: Model) -> dict[str, float]:
     """Return the share of its prior deviation that the fitted records leave to each calibrated parameter.
 
-    From the information matrix at the prior mean, along the motion that begins as the records say where the
-    begin is unknown: at rest a parameter of a motion tells nothing. Gains, zeros, initial states, constants of
-    inputs and the other parameters follow within their priors (what they can do as well is projected out).
+    From the information matrix at the prior mean. What begins in an unknown state begins as the records say:
+    of a model at rest no parameter shows. Gains, zeros, initial states, constants of inputs and the other
+    parameters follow within their priors (what they can do as well is projected out).
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     point = begun(problem)

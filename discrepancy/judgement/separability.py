@@ -125,7 +125,7 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
 
 
 def begun(problem: Problem) -> Point:
-    """Return the prior means, with the initial states that only the data tell, fitted with the model as it is.
+    """Return the prior means, with the initial states that only the data tell, fitted with the model.
 
     Raises
     ------
