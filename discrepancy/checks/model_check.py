@@ -89,9 +89,8 @@ def _missing_outputs(campaign: Campaign, model: Model) -> Iterator[DataFault]:
         if quantity is None:
             yield DataFault(
                 FaultKind.MISSING_OUTPUT,
-                f"The channel {name!r} is compared with the output {channel.output!r}, which "
-                f"{model.name} does not "
-                "have: correct `output`, or leave the channel out.",
+                f"The channel {name!r} is compared with the output {channel.output!r}, which {model.name} "
+                "does not have: correct `output`, or leave the channel out.",
                 name,
             )
         elif channel.quantity is not Quantity.SIGNAL and not (
@@ -99,9 +98,8 @@ def _missing_outputs(campaign: Campaign, model: Model) -> Iterator[DataFault]:
         ):
             yield DataFault(
                 FaultKind.WRONG_QUANTITY,
-                f"The channel {name!r} measures {channel.quantity.value}, but the output "
-                f"{channel.output!r} of "
-                f"{model.name} is {quantity.value}: correct `quantity` or `output`.",
+                f"The channel {name!r} measures {channel.quantity.value}, but the output {channel.output!r} "
+                f"of {model.name} is {quantity.value}: correct `quantity` or `output`.",
                 name,
             )
 
@@ -117,9 +115,8 @@ def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
         if periods < LEAST_PERIODS:
             yield DataFault(
                 FaultKind.TOO_SHORT,
-                f"The trial {trial.name!r} holds {periods:.2g} periods of the first mode "
-                f"({frequency:.3g} Hz), and "
-                f"at least {LEAST_PERIODS:.0f} are needed: record longer.",
+                f"The trial {trial.name!r} holds {periods:.2g} periods of the first mode ({frequency:.3g} "
+                f"Hz), and at least {LEAST_PERIODS:.0f} are needed: record longer.",
                 trial=trial.name,
             )
         samples = 1.0 / (trial.interval * frequency)
@@ -268,8 +265,7 @@ def _swaps_of(
                 fault = DataFault(
                     FaultKind.SWAPPED,
                     f"The channels {names[row]!r} and {names[place]!r} fit the model clearly better "
-                    "exchanged: check "
-                    "which wire or column is which, and exchange their `column` or `output`.",
+                    "exchanged: see which wire or column is which, and exchange their `column` or `output`.",
                     names[row],
                 )
                 yield (names[row], names[place]), fault

@@ -47,8 +47,7 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
                 DataFault(
                     FaultKind.NO_NOISE_RECORD,
                     f"The channel {name!r} has no noise record, so whether a model explains it cannot be "
-                    "said: add "
-                    "samples at rest, repeats, or a standard deviation with its degrees of freedom.",
+                    "said: add samples at rest, repeats, or a standard deviation and its degrees of freedom.",
                     name,
                 )
             )
@@ -68,10 +67,8 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
                 DataFault(
                     FaultKind.OUTLIERS,
                     f"{found.mean():.1%} of the readings of {name!r} in the trial {trial_name!r} are "
-                    "outliers, and "
-                    f"at most {LARGEST_SHARE:.0%} may be left out: mend the cause (loose wire, radio "
-                    "link) and "
-                    "repeat the trial, or leave the channel out of it.",
+                    f"outliers, and at most {LARGEST_SHARE:.0%} may be left out: mend the cause (loose wire, "
+                    "radio link) and repeat the trial, or leave the channel out of it.",
                     name,
                     trial_name,
                 )
@@ -141,8 +138,7 @@ def _record_faults(trial: Trial, name: str, values: FloatArray, used: BoolArray)
         yield DataFault(
             FaultKind.DEAD,
             f"The channel {name!r} shows the same value throughout the trial {trial.name!r}: check its "
-            "wiring, or "
-            "leave it out of the trial.",
+            "wiring, or leave it out of the trial.",
             name,
             trial.name,
         )
@@ -154,11 +150,9 @@ def _record_faults(trial: Trial, name: str, values: FloatArray, used: BoolArray)
         if run:
             yield DataFault(
                 FaultKind.CLIPPED,
-                f"The channel {name!r} is clipped in the trial {trial.name!r}: {run} readings in a row "
-                "are at its "
-                f"{side} value {extreme:.6g} (SI), reached in a jump; widen the range of the amplifier "
-                "and repeat "
-                "the trial, or leave the channel out of it.",
+                f"The channel {name!r} is clipped in the trial {trial.name!r}: {run} readings in a row are "
+                f"at its {side} value {extreme:.6g} (SI), reached in a jump; widen the range of the "
+                "amplifier and repeat the trial, or leave the channel out of it.",
                 name,
                 trial.name,
             )
