@@ -99,10 +99,12 @@ def held_spans(
     inner = [run for run in long if values[run[0]] not in (distinct[0], distinct[-1])]  # else told as clipped
     if min(noise, roughness(values)) > _NOISE_DIGITS * digit:
         return [(start, stop) for start, stop in inner]
-    steps = np.abs(np.diff(values))
+    steps = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))  # into each sample, and the last
     found = []
     for start, stop in inner:
         length = stop - start
+        if max(steps[start], steps[stop]) < _JUMP * digit:
+            continue
         low, high = max(start - _BESIDE * length, 0), min(stop + _BESIDE * length, len(values))
         like = lengths >= _ALIKE * length
         inside = like & (runs[:, 0] >= low) & (runs[:, 1] <= high)
@@ -110,9 +112,8 @@ def held_spans(
         windows = [*range(start - length, low - 1, -length), *range(stop, high - length + 1, length)]
         if len(windows) < 2 or dead_zone or lengths[inside].sum() > _MOST_ALIKE * (high - low):
             continue
-        pace = float(np.mean(np.r_[steps[low:start], steps[stop - 1 : high]]))
-        ends = [steps[at] for at in (start - 1, stop - 1) if 0 <= at < len(steps)]
-        fast = sum(step >= max(_JUMP * digit, _PACE * pace) for step in ends)
+        speed = max(_JUMP * digit, _PACE * float(np.mean(np.r_[steps[low : start + 1], steps[stop:high]])))
+        fast = int(steps[start] >= speed) + int(steps[stop] >= speed)
         usual = np.median([np.ptp(others[at : at + length], axis=0) for at in windows], axis=0)
         meanwhile = np.ptp(others[start:stop], axis=0)
         moving = bool(np.any((meanwhile > _MOVING * usual) & (usual > 0.0)))
