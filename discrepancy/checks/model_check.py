@@ -37,8 +37,8 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
 
     For each channel and trial the data's scale is the robust slope of data over prediction where that is
     steady (static, flight), and the ratio of amplitudes in records in time, whose phase the model need not
-    know. A scale is a slip if two units of the channel differ by it (within a factor of 3 from 200 on, of 1.7
-    from 50 on, of 1.35 from 7 on, of 1.1 below) in all its trials; where all channels of some trials slip
+    know. A scale is a slip if two units of the channel differ by it (within a factor of 3 from 200 on, of 2
+    from 20 on, of 1.35 from 7 on, of 1.1 below) in all its trials; where all channels of some trials slip
     alike, the input of those trials does. A noise record with a line at the first mode is a limit. Negative
     slopes are reversed signs (of trials at rest, if the channel is in any). Channels of one quantity are
     swapped if exchanging them leaves each less than half of its misfit and explains 30 units of chi-square

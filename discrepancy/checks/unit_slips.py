@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from math import log, pi
+from statistics import median
 from typing import NamedTuple
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
@@ -51,7 +52,7 @@ class Slip(NamedTuple):
     @property
     def width(self) -> float:
         """The factor by which physics may be off besides."""
-        for least, width in ((200.0, 3.0), (50.0, 1.7), (DOUBT, 1.35)):
+        for least, width in ((200.0, 3.0), (20.0, 2.0), (DOUBT, 1.35)):
             if self.size >= least:
                 return width
         return 1.1
@@ -134,10 +135,12 @@ def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> I
 
 
 def _own(campaign: Campaign, name: str, scales: list[float]) -> Slip | None:
-    """Return the one slip between a channel's units that all its scales say."""
+    """Return the slip between a channel's units that the median of its scales says, and none contradicts."""
     channel = campaign.channels[name]
-    found = {slip_between(scale, channel.quantity, channel.unit) for scale in scales}
-    return found.pop() if len(found) == 1 else None
+    slip = slip_between(median(map(abs, scales)), channel.quantity, channel.unit)
+    if slip is None or any(abs(log(abs(scale) / slip.factor)) > 2.0 * log(slip.width) for scale in scales):
+        return None
+    return slip
 
 
 def _of_drive(trial: Trial, scale: float) -> Slip | None:
