@@ -5,6 +5,8 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from reporting.words import listing
+
 _SHOWN_LENGTH = 60
 _EXPECTED = {
     "tuple_type": "a list",
@@ -82,13 +84,16 @@ def shown(value: object) -> str:
 def _sentence(error: ValidationError, what: str, first_index: int) -> str:
     found = error.errors(include_url=False)
     # A misspelt key shows up twice, as unknown and as missing: the unknown one tells more.
-    first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
+    for kind, one, several in (
+        ("extra_forbidden", f"is not a key of {what}; remove it or correct its spelling",
+         f"are not keys of {what}; remove them or correct their spelling"),
+        ("missing", "is missing", "are missing"),
+    ):  # fmt: skip
+        if places := [repr(_written(item["loc"], first_index)) for item in found if item["type"] == kind]:
+            return f"{listing(places)} {several if places[1:] else one}"
+    first = found[0]
     place = _written(first["loc"], first_index)
     before = f"{place}: " if place else ""
-    if first["type"] == "extra_forbidden":
-        return f"{place!r} is not a key of {what}; remove it or correct its spelling"
-    if first["type"] == "missing":
-        return f"{place!r} is missing"
     if first["type"] == "value_error":
         return f"{before}{first['ctx']['error']}"
     if first["type"] == "tuple_type" and isinstance(first["input"], dict):

@@ -24,12 +24,12 @@ def be(count: int) -> str:
     return "is" if count == 1 else "are"
 
 
-def listing(words: Iterable[str]) -> str:
-    """Return words as "a, b and c"."""
+def listing(words: Iterable[str], joint: str = "and") -> str:
+    """Return words as "a, b and c", or with another `joint`."""
     found = list(words)
     if len(found) < 2:
         return "".join(found)
-    return f"{', '.join(found[:-1])} and {found[-1]}"
+    return f"{', '.join(found[:-1])} {joint} {found[-1]}"
 
 
 def one_line(reason: object) -> str:

@@ -4,6 +4,7 @@ import typer
 
 from uav_twin.discrepancy_catalogue import convert, effects, example
 from uav_twin.discrepancy_check import check
+from uav_twin.discrepancy_import import import_files
 from uav_twin.discrepancy_run import run
 
 discrepancy_app = typer.Typer(
@@ -13,4 +14,5 @@ discrepancy_app.command("run")(run)
 discrepancy_app.command("check")(check)
 discrepancy_app.command("effects")(effects)
 discrepancy_app.command("example")(example)
+discrepancy_app.command("import")(import_files)
 discrepancy_app.command("convert")(convert)

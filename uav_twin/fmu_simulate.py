@@ -40,7 +40,7 @@ def simulate(
     ] = None,
     values: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A parameter or input by its name in the FMU."),
+        typer.Option("--set", metavar="NAME=VALUE", help="A parameter (of any kind) or input of the FMU."),
     ] = None,
     plot: PlotFile = None,
     interpolation: InterpolationName = None,

@@ -1,5 +1,6 @@
 """`uav-twin ssp ...`."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -116,6 +117,7 @@ def simulate(
     with tempfile.TemporaryDirectory() as folder:
         system = read_ssp(file, folder)
         wiring = join_ssp(system, delay or ())
+        _say_unused(wiring.left_out)
         span = (system.span[0], system.span[1] if stop_time is None else stop_time)
         planned = system_experiment(wiring, span=span, step_size=step_size, values=given)
         with CoupledAsset(
@@ -132,6 +134,13 @@ def simulate(
             if plot is not None:
                 draw(plot, asset, history)
     say(asset, history, file, [out, plot])
+
+
+def _say_unused(names: Sequence[str]) -> None:
+    from fmu_asset.coupling.structure import listed
+
+    if names:
+        terminal.say(f"warning: nothing in the system has these parameters, not used: {listed(names)}.")
 
 
 def _single_numbers(texts: list[str]) -> dict[str, float]:
@@ -160,6 +169,8 @@ def check(
         terminal.print_json({"passed": result.passed} | asdict(result))
     for problem in result.problems:
         typer.secho(f"problem: {problem}", fg="red", err=True)
+    if not json:
+        _say_unused(result.unused)
     for loop in () if json else result.loops:
         terminal.say(
             f"warning: {loop} `uav-twin ssp simulate` does so by --delay, --iterations, --algorithm jacobi."

@@ -30,12 +30,13 @@ from discrepancy.campaign.schema import (
     INPUT_COLUMNS,
     CampaignSection,
     ChannelSection,
+    ColumnSection,
     ReleaseSection,
     TrialSection,
     parse_campaign,
 )
 from discrepancy.campaign.table import read_table
-from discrepancy.campaign.units import difference, si_value
+from discrepancy.campaign.units import conversion_of, difference, si_value
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.provenance import hash_file, hash_record
 from reporting.table_file import TextTable
@@ -79,6 +80,26 @@ def read_campaign(folder: str | Path) -> Campaign:
     for name in sorted(names):
         _check_inside(name)
     tables = {name: read_table(folder, name) for name in sorted(names - {CAMPAIGN_FILE})}
+    data_hash = hash_record({name: hash_file(folder / name) for name in sorted(names)})
+    return assemble(section, printed, tables, data_hash)
+
+
+def assemble(
+    section: CampaignSection, printed: Mapping[str, Any], tables: Mapping[str, TextTable], data_hash: str
+) -> Campaign:
+    """Return the campaign that a description and its tables make; errors as `read_campaign`.
+
+    Parameters
+    ----------
+    section : CampaignSection
+        What `campaign.toml` says.
+    printed : mapping
+        The same as a plain table, its decimal numbers as printed.
+    tables : mapping of str to TextTable
+        By the names that the description has for them.
+    data_hash : str
+        SHA-256 of all that was read.
+    """
     remarks: list[str] = []
     trials = tuple(
         _trial(trial, raw, tables[trial.file], section, remarks)
@@ -93,7 +114,7 @@ def read_campaign(folder: str | Path) -> Campaign:
         trials=trials,
         reference_temperature=section.reference_temperature,
         parameters={name: (item.mean, item.deviation) for name, item in section.parameters.items()},
-        data_hash=hash_record({name: hash_file(folder / name) for name in sorted(names)}),
+        data_hash=data_hash,
         loggers=section.loggers,
         events=_events(section, trials),
         remarks=(*section.remarks, *(remark for remark in remarks if remark not in section.remarks)),
@@ -179,6 +200,7 @@ def _trial(
     # at rest under other inputs no force need act
     held = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not held
+    pushing = (item.values for item in inputs if item.quantity in (Quantity.FORCE, Quantity.TORQUE))
     return Trial(
         name=section.name,
         kind=section.kind,
@@ -186,7 +208,7 @@ def _trial(
         values=np.stack(columns, axis=1),
         used=np.stack(used, axis=1),
         time=time,
-        force=table.numbers("force", user) if forced else _first_force(inputs, zeros),
+        force=table.numbers("force", user) if forced else next(pushing, zeros),
         load_factor=table.numbers("load_factor", user) if section.kind is TrialKind.FLIGHT else zeros,
         load_place=section.load_place,
         temperature=_temperature(section, table, campaign, user),
@@ -205,12 +227,6 @@ def _trial(
     )
 
 
-def _first_force(inputs: tuple[RecordedInput, ...], nothing: FloatArray) -> FloatArray:
-    """Return the first force or torque among recorded inputs."""
-    pushing = (item.values for item in inputs if item.quantity in (Quantity.FORCE, Quantity.TORQUE))
-    return next(pushing, nothing)
-
-
 def _inputs(
     section: TrialSection,
     table: TextTable,
@@ -224,14 +240,17 @@ def _inputs(
     for item in campaign.input:
         if item.table_column not in table.columns:
             continue
-        values = table.numbers(
-            item.table_column,
-            user,
-            lambda text, item=item: si_value(text, item.quantity, item.unit),  # type: ignore[misc]
-        )
+        values = _numbers(table, item, user)
         offset = si_value(repr(item.offset_deviation), item.quantity, item.unit)
         found.append(RecordedInput(item.name, item.quantity, values, item.holds, offset, item.unit))
     return tuple(found)
+
+
+def _numbers(table: TextTable, item: ColumnSection, user: str, *, empty_allowed: bool = False) -> FloatArray:
+    to_si = conversion_of(item.quantity, item.unit)
+    return table.numbers(
+        item.table_column, user, lambda text: float(to_si.text(text)), empty_allowed=empty_allowed
+    )
 
 
 def _times(section: TrialSection, table: TextTable, user: str) -> tuple[FloatArray, float]:
@@ -273,12 +292,7 @@ def _readings(
     channel: ChannelSection, section: TrialSection, table: TextTable, remarks: list[str]
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return a channel's readings and which of them are used; an empty cell is bridged and left out."""
-    values = table.numbers(
-        channel.table_column,
-        f"the channel {channel.name!r}",
-        lambda text: si_value(text, channel.quantity, channel.unit),
-        empty_allowed=True,
-    )
+    values = _numbers(table, channel, f"the channel {channel.name!r}", empty_allowed=True)
     used = np.isfinite(values)
     if not used.any():
         raise CampaignDataError(
@@ -422,12 +436,7 @@ def _recorded_noise(section: CampaignSection, tables: Mapping[str, TextTable]) -
     for item in section.channel:
         if item.table_column not in table.columns:
             continue
-        values = table.numbers(
-            item.table_column,
-            user,
-            lambda text, item=item: si_value(text, item.quantity, item.unit),  # type: ignore[misc]
-            empty_allowed=True,
-        )
+        values = _numbers(table, item, user, empty_allowed=True)
         there = np.isfinite(values)
         count = int(there.sum())
         if not there[:count].all():

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from keyword import iskeyword
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
-from discrepancy.campaign.units import units_of
+from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignFileError
 from fe.runtime.expression import RESERVED
 from fe.runtime.patch import EVERY_CHANNEL
-from reporting.section import Section, shown
+from reporting.section import Section, checked
 
 FORMAT = 1
 """Version of the format."""
@@ -75,6 +75,14 @@ class ColumnSection(Section):
         """Column of the tables."""
         return self.column or self.name
 
+    @model_validator(mode="after")
+    def _check_unit(self) -> Self:
+        try:
+            conversion_of(self.quantity, self.unit)
+        except ValueError as cause:
+            raise ValueError(f"the unit of {self.name!r}: {cause}") from None
+        return self
+
 
 class ChannelSection(ColumnSection):
     """`[[channel]]`."""
@@ -88,11 +96,6 @@ class ChannelSection(ColumnSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.unit not in units_of(self.quantity):
-            raise ValueError(
-                f"the channel {self.name!r} measures {self.quantity.value} and must have one of the units "
-                f"{', '.join(units_of(self.quantity))}, and {self.unit!r} came"
-            )
         if self.name == EVERY_CHANNEL or self.name.startswith("#"):
             raise ValueError(f"a channel cannot be called {self.name!r}")
         return self
@@ -107,11 +110,6 @@ class InputSection(ColumnSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.unit not in units_of(self.quantity):
-            raise ValueError(
-                f"the input {self.name!r} is {self.quantity.value} and must have one of the units "
-                f"{', '.join(units_of(self.quantity))}, and {self.unit!r} came"
-            )
         if self.table_column in INPUT_COLUMNS and self.table_column != "force":
             raise ValueError(
                 f"the column {self.table_column!r} is reserved: give the input {self.name!r} another column"
@@ -174,6 +172,14 @@ class TrialSection(Section):
     left_out: dict[str, tuple[Annotated[int, Field(ge=1)], ...]] = Field(default_factory=dict)
     begins: Start | None = Field(default=None, strict=False)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _ringdowns_have_releases(cls, content: object) -> object:
+        """Let a ring-down's release be among all that is missing."""
+        if isinstance(content, dict) and content.get("kind") == TrialKind.RINGDOWN:
+            return {"release": {}, **content}
+        return content
+
     @field_validator("load_place", mode="before")
     @classmethod
     def _place(cls, value: object) -> object:
@@ -201,8 +207,6 @@ class TrialSection(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.kind is TrialKind.RINGDOWN and self.release is None:
-            raise ValueError(f"the ring-down {self.name!r} needs `release` with its displacement")
         if self.kind is not TrialKind.RINGDOWN and self.release is not None:
             raise ValueError(f"the trial {self.name!r} is no ring-down and cannot have a `release`")
         if self.begins is not None and self.kind not in (TrialKind.FORCED, TrialKind.DRIVEN):
@@ -311,7 +315,7 @@ class CampaignSection(Section):
                     f"the column {channel.table_column!r} holds an input of the trial: give the channel "
                     f"{channel.name!r} another column"
                 )
-        scales = {item.unit for item in every if item.quantity is Quantity.TEMPERATURE}
+        scales = {item.unit == "K" for item in every if item.quantity is Quantity.TEMPERATURE}
         if len(scales) > 1:
             raise ValueError("temperatures are given in degC and in K: give all of them in one of the two")
         self._check_loggers()
@@ -380,44 +384,9 @@ def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:
     CampaignFileError
         The table breaks the schema; one sentence with file and key.
     """
-    if table.get("format") != FORMAT or isinstance(table.get("format"), bool):
-        came = f"`format` is {table['format']!r}" if "format" in table else "`format` is missing"
-        raise CampaignFileError(f"{source}: {came}; this version reads campaigns with `format = {FORMAT}`.")
-    try:
-        return CampaignSection.model_validate(dict(table))
-    except ValidationError as error:
-        errors = error.errors(include_url=False, include_context=True)
-        # A misspelt key shows up twice, as unknown and as missing: the unknown one tells more.
-        first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
-        raise CampaignFileError(f"{source}: {_sentence(first, table)}") from None
-
-
-def _sentence(error: Mapping[str, Any], table: Mapping[str, Any]) -> str:
-    where = _written(error["loc"], table)
-    if error["type"] == "extra_forbidden":
-        return f"unknown key `{where}`; check its spelling and the table that it stands in."
-    if error["type"] == "missing":
-        return f"`{where}` is missing."
-    if error["type"] == "value_error":
-        return f"{error['ctx']['error']}."
-    if error["type"] == "tuple_type" and isinstance(error["input"], Mapping):
-        return f"there can be several of `{where}`, so write [[{where}]] for each, not [{where}]."
-    if error["type"] == "too_short":
-        return f"`{where}` must have at least one entry."
-    expected = str(error["msg"]).replace("Input should", "should", 1)
-    return f"`{where}` {expected}, and {shown(error['input'])} came."
-
-
-def _written(location: tuple[int | str, ...], table: Mapping[str, Any]) -> str:
-    """Return a place as the file has it: entries of arrays counted from one, branches of unions left out."""
-    node: Any = table
-    text = ""
-    for number, part in enumerate(location):
-        last = number == len(location) - 1
-        if isinstance(part, int):
-            text += f"[{part + 1}]"
-            node = node[part] if isinstance(node, list | tuple) and part < len(node) else None
-        elif isinstance(node, Mapping) and (part in node or last):
-            text += f".{part}" if text else part
-            node = node.get(part)
-    return text
+    came = table.get("format", FORMAT)
+    if came != FORMAT or isinstance(came, bool):
+        raise CampaignFileError(
+            f"{source}: `format` is {came!r}; this version reads campaigns with `format = {FORMAT}`."
+        )
+    return checked(CampaignSection, dict(table), source, CampaignFileError, what="a campaign")

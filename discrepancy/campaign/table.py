@@ -8,7 +8,8 @@ from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting import table_file
 from reporting.table_file import TableErrors, TextTable
 
-_ERRORS = TableErrors(layout=CampaignFileError, value=CampaignDataError)
+TABLE_ERRORS = TableErrors(layout=CampaignFileError, value=CampaignDataError)
+"""What a table of a campaign raises."""
 
 
 def read_table(folder: Path, name: str) -> TextTable:
@@ -26,4 +27,4 @@ def read_table(folder: Path, name: str) -> TextTable:
         raise CampaignFileError(
             f"There is no file {name} in {folder}; the tables there are {', '.join(there) or 'none'}."
         )
-    return table_file.read_table(path, _ERRORS, name=name)
+    return table_file.read_table(path, TABLE_ERRORS, name=name)

@@ -1,21 +1,53 @@
-"""Units of a campaign's files, and their conversion to SI without a rounding of its own.
+"""Units of a campaign's files as pint knows them, and their conversion to SI without a rounding of its own.
 
 A power of ten is applied to the decimal text of a number before it becomes binary, so a value that is written
-in microstrain comes back to the last bit.
+in microstrain comes back to the last bit; any other factor is a fraction of integers, rounded once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+import unicodedata
+from contextlib import suppress
 from decimal import Decimal, localcontext
-from math import isfinite, pi
-from types import MappingProxyType
-from typing import NamedTuple
+from fractions import Fraction
+from functools import cache
+from math import isfinite, log10, pi
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from discrepancy.campaign.records import Quantity
+from reporting.words import listing
+
+if TYPE_CHECKING:
+    from pint import UnitRegistry
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2 in one g, exact by definition."""
+_ALIASES = {"kp": "kgf", "rev": "turn", "U": "turn", "%": "percent", "‰": "permille", "°": "degree"}
+"""Names of units that pint does not know, or reads as something else."""
+_LONGEST = 40
+"""Letters of a unit: pint takes long over more."""
+_PART = re.compile(r"([^\W\d_]+|[%‰°]|1)(?:\^?([+-]?\d))?")
+"""One factor of a unit: a name and its power."""
+_WORDS = {
+    "chain",
+    "chains",
+    "dB",
+    "decade",
+    "hand",
+    "hands",
+    "link",
+    "links",
+    "octave",
+    "point",
+    "points",
+    "rod",
+    "rods",
+}
+"""What pint takes for lengths and ratios, and measuring programmes do not."""
+_NEVER_CONVERTED = {"degC", "°C", "K"}
+"""Temperatures: a campaign has one of the two for all."""
 
 
 class Units(NamedTuple):
@@ -23,69 +55,150 @@ class Units(NamedTuple):
 
     Attributes
     ----------
-    powers : mapping of str to int
-        Those of files, and their powers of ten over SI.
+    usual : tuple of str
+        Those of files that a user is told of; pint knows more.
     written : str
         The one in which a campaign is written.
     si : str
         That of values in memory; of a signal it is nominal.
     drawn : tuple of float and str
         Factor from SI, and unit, in figures.
-    factors : mapping of str to float
-        Those of files that are no powers of ten, and what one of them is in SI.
     """
 
-    powers: dict[str, int]
+    usual: tuple[str, ...]
     written: str
     si: str
     drawn: tuple[float, str]
-    factors: Mapping[str, float] = MappingProxyType({})
 
 
-_DEGREE = pi / 180.0
-_TURN = 2.0 * pi / 60.0
 UNITS = {
-    Quantity.STRAIN: Units({"1": 0, "microstrain": -6, "percent": -2}, "microstrain", "1", (1e6, "µε")),
-    Quantity.DISPLACEMENT: Units({"m": 0, "mm": -3, "um": -6}, "mm", "m", (1e3, "mm")),
-    Quantity.VELOCITY: Units({"m/s": 0, "mm/s": -3}, "m/s", "m/s", (1.0, "m/s"), {"km/h": 1.0 / 3.6}),
-    Quantity.ACCELERATION: Units(
-        {"m/s2": 0, "mm/s2": -3}, "m/s2", "m/s2", (1.0, "m/s²"), {"g": STANDARD_GRAVITY}
-    ),
-    Quantity.SIGNAL: Units({"V": 0, "mV": -3, "1": 0}, "V", "V", (1.0, "signal")),
-    Quantity.ANGLE: Units({"rad": 0, "mrad": -3}, "rad", "rad", (1.0, "rad"), {"deg": _DEGREE}),
-    Quantity.ANGULAR_VELOCITY: Units(
-        {"rad/s": 0}, "rad/s", "rad/s", (1.0, "rad/s"), {"deg/s": _DEGREE, "rpm": _TURN}
-    ),
-    Quantity.ANGULAR_ACCELERATION: Units(
-        {"rad/s2": 0}, "rad/s2", "rad/s2", (1.0, "rad/s²"), {"deg/s2": _DEGREE}
-    ),
-    Quantity.FORCE: Units({"N": 0, "mN": -3, "kN": 3}, "N", "N", (1.0, "N")),
-    Quantity.TORQUE: Units({"N m": 0, "mN m": -3, "kN m": 3}, "N m", "N m", (1.0, "N m")),
-    Quantity.PRESSURE: Units(
-        {"Pa": 0, "hPa": 2, "kPa": 3, "bar": 5, "mbar": 2, "MPa": 6}, "Pa", "Pa", (1e-3, "kPa")
-    ),
-    Quantity.LEVEL: Units({"m": 0, "cm": -2, "mm": -3}, "m", "m", (1.0, "m")),
-    Quantity.FLOW: Units(
-        {"m3/s": 0, "l/s": -3}, "m3/s", "m3/s", (1.0, "m³/s"),
-        {"l/min": 1e-3 / 60.0, "m3/h": 1.0 / 3600.0},
-    ),
-    Quantity.TEMPERATURE: Units({"degC": 0, "K": 0}, "degC", "degC", (1.0, "°C")),
-    Quantity.HEAT: Units({"W": 0, "mW": -3, "kW": 3}, "W", "W", (1.0, "W")),
-    Quantity.VOLTAGE: Units({"V": 0, "mV": -3, "kV": 3}, "V", "V", (1.0, "V")),
-    Quantity.CURRENT: Units({"A": 0, "mA": -3}, "A", "A", (1.0, "A")),
-    Quantity.CHARGE: Units({"C": 0, "mC": -3}, "C", "C", (1.0, "C"), {"A h": 3600.0}),
-}  # fmt: skip
+    Quantity.STRAIN: Units(("1", "microstrain", "percent"), "microstrain", "1", (1e6, "µε")),
+    Quantity.DISPLACEMENT: Units(("m", "mm", "um"), "mm", "m", (1e3, "mm")),
+    Quantity.VELOCITY: Units(("m/s", "mm/s", "km/h"), "m/s", "m/s", (1.0, "m/s")),
+    Quantity.ACCELERATION: Units(("m/s2", "mm/s2", "g"), "m/s2", "m/s2", (1.0, "m/s²")),
+    Quantity.SIGNAL: Units(("V", "mV", "1"), "V", "V", (1.0, "signal")),
+    Quantity.ANGLE: Units(("rad", "mrad", "deg"), "rad", "rad", (1.0, "rad")),
+    Quantity.ANGULAR_VELOCITY: Units(("rad/s", "deg/s", "rpm"), "rad/s", "rad/s", (1.0, "rad/s")),
+    Quantity.ANGULAR_ACCELERATION: Units(("rad/s2", "deg/s2"), "rad/s2", "rad/s2", (1.0, "rad/s²")),
+    Quantity.FORCE: Units(("N", "mN", "kN"), "N", "N", (1.0, "N")),
+    Quantity.TORQUE: Units(("N m", "mN m", "kN m"), "N m", "N m", (1.0, "N m")),
+    Quantity.PRESSURE: Units(("Pa", "hPa", "kPa", "bar", "mbar", "MPa"), "Pa", "Pa", (1e-3, "kPa")),
+    Quantity.LEVEL: Units(("m", "cm", "mm"), "m", "m", (1.0, "m")),
+    Quantity.FLOW: Units(("m3/s", "l/s", "l/min", "m3/h"), "m3/s", "m3/s", (1.0, "m³/s")),
+    Quantity.TEMPERATURE: Units(("degC", "K"), "degC", "degC", (1.0, "°C")),
+    Quantity.HEAT: Units(("W", "mW", "kW"), "W", "W", (1.0, "W")),
+    Quantity.VOLTAGE: Units(("V", "mV", "kV"), "V", "V", (1.0, "V")),
+    Quantity.CURRENT: Units(("A", "mA"), "A", "A", (1.0, "A")),
+    Quantity.CHARGE: Units(("C", "mC", "A h"), "C", "C", (1.0, "C")),
+}
 """All that files, tables and figures know of a quantity: a new kind of sensor is one more row."""
 
 
+class Conversion(NamedTuple):
+    """What makes SI of a unit: a factor, and the power of ten that it is (None: it is none)."""
+
+    factor: float
+    power: int | None
+
+    def text(self, number: str) -> str:
+        """Return the text of a number in SI; raises ValueError if it is no number."""
+        if self.power is None:
+            return repr(float(number) * self.factor)
+        if self.power == 0:
+            return number
+        mantissa, letter, exponent = number.lower().partition("e")
+        return f"{mantissa}e{(int(exponent) if letter else 0) + self.power}"
+
+
+@cache
+def _registry() -> UnitRegistry[Any]:
+    """Return the units of pint in fractions of integers; pi is that of floats, and so are its multiples."""
+    import pint
+
+    registry: UnitRegistry[Any] = pint.UnitRegistry(None, non_int_type=Fraction, on_redefinition="ignore")
+    registry.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
+    registry.define(f"pi = {Decimal(pi)} = π")
+    return registry
+
+
+def _expression(unit: str, *, acceleration: bool) -> str:
+    """Return a unit as pint reads it; raises ValueError if it is not made of names and powers."""
+    text = unicodedata.normalize("NFKC", unit.strip()[:_LONGEST]).replace("**", "^")
+    parts = re.split(r"\s*([*/.·⋅]|\s)\s*", text)
+    for at in range(0, len(parts), 2):
+        found = _PART.fullmatch(parts[at])
+        if found is None or found[1] in _WORDS or len(unit) > _LONGEST:
+            raise ValueError(f"{unit!r} is no unit")
+        name = re.sub(r"^([kMm]?N)([cm]?m)$", r"\1*\2", _ALIASES.get(found[1], found[1]))
+        name = re.sub(r"^([mμ]?)g$", r"\1g_0", name) if acceleration else name
+        parts[at] = name if found[2] is None else f"({name})**{found[2]}"
+        if at:
+            parts[at - 1] = "/" if parts[at - 1] == "/" else "*"
+    return "".join(parts)
+
+
+@cache
+def conversion(unit: str, si: str) -> Conversion:
+    """Return what makes a unit of SI of another; an angle is no number here, and a hertz no rad/s.
+
+    Raises
+    ------
+    ValueError
+        pint does not know the unit, or it is of another quantity.
+    """
+    if unit == si:
+        return Conversion(1.0, 0)  # pint takes a third of a second to load
+    from pint.errors import PintError
+
+    registry = _registry()
+    factors, roots = [], []
+    for text in (unit, si):
+        try:
+            expression = _expression(text, acceleration=si == UNITS[Quantity.ACCELERATION].si)
+            factor, root = registry.get_root_units(registry.parse_units(expression))
+        except (PintError, AttributeError, TypeError, ArithmeticError) as cause:
+            raise ValueError(f"{text!r} is no unit") from cause
+        factors.append(Fraction(str(factor)))
+        roots.append(root)
+    if roots[0] != roots[1]:
+        raise ValueError(f"{unit!r} cannot become {si}")
+    factor = factors[0] / factors[1]
+    power = round(log10(factor))
+    return Conversion(float(factor), power if factor == Fraction(10) ** power else None)
+
+
+@cache
+def conversion_of(quantity: Quantity, unit: str) -> Conversion:
+    """Return what makes SI of a quantity's unit; raises ValueError with what is expected."""
+    try:
+        if quantity is Quantity.TEMPERATURE and unit in _NEVER_CONVERTED:
+            return Conversion(1.0, 0)
+        if quantity is Quantity.TEMPERATURE:
+            raise ValueError
+        if quantity is Quantity.SIGNAL:
+            with suppress(ValueError):
+                return conversion(unit, "1")
+        return conversion(unit, UNITS[quantity].si)
+    except ValueError:
+        usual = listing(UNITS[quantity].usual, "or")
+        what = quantity.value.replace("_", " ")
+        raise ValueError(f"{what} must have a unit such as {usual}, and {unit!r} came") from None
+
+
+@cache
+def quantities_of(unit: str) -> tuple[Quantity, ...]:
+    """Return the quantities that a unit can be of; none where pint does not know it."""
+    found = []
+    for quantity in Quantity:
+        with suppress(ValueError):
+            conversion_of(quantity, unit)
+            found.append(quantity)
+    return tuple(found)
+
+
 def units_of(quantity: Quantity) -> tuple[str, ...]:
-    """Return the units that a quantity may be given in."""
-    return (*UNITS[quantity].powers, *UNITS[quantity].factors)
-
-
-def power_of_ten(quantity: Quantity, unit: str) -> int | None:
-    """Return the power of ten from a unit to SI; None for those that are no power of ten, such as g."""
-    return UNITS[quantity].powers.get(unit)
+    """Return the usual units of a quantity."""
+    return UNITS[quantity].usual
 
 
 def si_value(text: str, quantity: Quantity, unit: str) -> float:
@@ -94,29 +207,16 @@ def si_value(text: str, quantity: Quantity, unit: str) -> float:
     Raises
     ------
     ValueError
-        The text is no number.
+        The text is no number, or the unit none of the quantity.
     """
-    power = power_of_ten(quantity, unit)
-    if power is None:
-        return float(text) * UNITS[quantity].factors[unit]
-    return shifted(text, power)
-
-
-def shifted(text: str, power: int) -> float:
-    """Return the float nearest to text times ten to a power; raises ValueError if it is no number."""
-    if power == 0:
-        return float(text)
-    mantissa, letter, exponent = text.lower().partition("e")
-    if not letter:
-        return float(f"{text}e{power}")
-    return float(f"{mantissa}e{int(exponent) + power}")
+    return float(conversion_of(quantity, unit).text(text))
 
 
 def in_unit(value: float, quantity: Quantity, unit: str) -> str:
     """Return the text of an SI value in a unit; `si_value` gives it back, exactly for a power of ten."""
-    power = power_of_ten(quantity, unit)
+    factor, power = conversion_of(quantity, unit)
     if power is None:
-        return repr(value / UNITS[quantity].factors[unit])
+        return repr(value / factor)
     if not isfinite(value) or power == 0:
         return repr(float(value))
     return _text(Decimal(repr(float(value))).scaleb(-power))

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
+from dataclasses import asdict
 from math import isinf
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +19,6 @@ from discrepancy.campaign.records import (
     Channel,
     Hold,
     RecordedInput,
-    Release,
     Start,
     Trial,
     TrialKind,
@@ -32,11 +34,11 @@ NOISE_FILE = "noise.csv"
 """Name of the table of samples at rest."""
 
 
-def write_campaign(campaign: Campaign, folder: str | Path) -> Path:
+def write_campaign(campaign: Campaign, folder: str | Path, *, si: bool = False) -> Path:
     """Write a campaign; `read_campaign` gives it back, equal to the last bit but for its hash.
 
-    Strain is written in microstrain, displacement in mm, the rest in SI. `campaign.toml` comes last, so that
-    a folder that was not finished is no campaign.
+    Strain is written in microstrain, displacement in mm, the rest in SI (all, if asked for). `campaign.toml`
+    comes last, so that a folder that was not finished is no campaign.
 
     Parameters
     ----------
@@ -44,6 +46,8 @@ def write_campaign(campaign: Campaign, folder: str | Path) -> Path:
         With remarks and readings left out.
     folder : path
         Made if it is missing; files of the same names are replaced.
+    si : bool
+        Write strain and displacement in SI, too.
 
     Returns
     -------
@@ -65,11 +69,13 @@ def write_campaign(campaign: Campaign, folder: str | Path) -> Path:
                 f"A channel cannot be called {name!r} in a file, which is an input: rename it."
             )
     files = [f"{number:02d}_{_slug(trial.name)}.csv" for number, trial in enumerate(campaign.trials, start=1)]
-    texts = {file: _trial_table(campaign, trial) for file, trial in zip(files, campaign.trials, strict=True)}
-    noise = _noise_table(campaign)
+    texts = {
+        file: _trial_table(campaign, trial, si) for file, trial in zip(files, campaign.trials, strict=True)
+    }
+    noise = _noise_table(campaign, si)
     if noise:
         texts[NOISE_FILE] = noise[0]
-    texts[CAMPAIGN_FILE] = _campaign_text(campaign, files, noise[1] if noise else None)
+    texts[CAMPAIGN_FILE] = _campaign_text(campaign, files, noise[1] if noise else None, si)
     for name, text in texts.items():
         atomic_write_text(folder / name, text)
     return folder
@@ -82,7 +88,7 @@ def _slug(name: str) -> str:
 # ---------------------------------------------------------------- tables
 
 
-def _trial_table(campaign: Campaign, trial: Trial) -> str:
+def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
     columns: dict[str, list[str]] = {}
     if trial.is_dynamic or np.any(trial.time != trial.start):
         columns["time"] = _plain(trial.time)
@@ -107,7 +113,7 @@ def _trial_table(campaign: Campaign, trial: Trial) -> str:
     for item in trial.inputs:
         columns[item.name] = _plain(item.values)
     for index, name in enumerate(trial.channels):
-        columns[name] = _in_unit(trial.values[:, index], campaign.channels[name])
+        columns[name] = _in_unit(trial.values[:, index], campaign.channels[name], si)
     return table_text(list(columns), list(columns.values()))
 
 
@@ -115,12 +121,16 @@ def _plain(values: FloatArray) -> list[str]:
     return [repr(value) for value in values.tolist()]
 
 
-def _in_unit(values: FloatArray, channel: Channel) -> list[str]:
-    unit = UNITS[channel.quantity].written
+def _unit(channel: Channel, si: bool) -> str:
+    return UNITS[channel.quantity].si if si else UNITS[channel.quantity].written
+
+
+def _in_unit(values: FloatArray, channel: Channel, si: bool) -> list[str]:
+    unit = _unit(channel, si)
     return [in_unit(value, channel.quantity, unit) for value in values.tolist()]
 
 
-def _noise_table(campaign: Campaign) -> tuple[str, float] | None:
+def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
     """Return the table of samples at rest and their interval, None without any."""
     recorded = {
         name: (channel.noise.samples, channel.noise.interval)
@@ -140,7 +150,7 @@ def _noise_table(campaign: Campaign) -> tuple[str, float] | None:
     longest = max(len(samples) for samples, _ in recorded.values())
     columns = {"time": [repr(interval * number) for number in range(longest)]}
     for name, (samples, _) in recorded.items():
-        cells = _in_unit(samples, campaign.channels[name])
+        cells = _in_unit(samples, campaign.channels[name], si)
         columns[name] = cells + [""] * (longest - len(cells))
     return table_text(list(columns), list(columns.values())), interval
 
@@ -148,155 +158,105 @@ def _noise_table(campaign: Campaign) -> tuple[str, float] | None:
 # ---------------------------------------------------------------- TOML
 
 
-def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float | None) -> str:
-    lines = [f"format = {FORMAT}", f"name = {_quoted(campaign.name)}"]
+def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float | None, si: bool) -> str:
+    lines = [f"format = {FORMAT}", f"name = {_toml(campaign.name)}"]
     if campaign.reference_temperature is not None:
-        lines.append(f"reference_temperature = {_number(campaign.reference_temperature)}  # degC")
+        lines.append(f"reference_temperature = {_toml(campaign.reference_temperature)}  # degC")
     if campaign.remarks:
-        lines += ["remarks = [", *(f"    {_quoted(remark)}," for remark in campaign.remarks), "]"]
+        lines += ["remarks = [", *(f"    {_toml(remark)}," for remark in campaign.remarks), "]"]
     for name, (mean, deviation) in campaign.parameters.items():
-        lines += ["", f"[parameters.{_quoted(name)}]"]
-        lines += [f"mean = {_number(mean)}", f"deviation = {_number(deviation)}"]
+        lines += _section(f"[parameters.{_toml(name)}]", {"mean": mean, "deviation": deviation})
     if noise_interval is not None:
-        lines += [
-            "",
-            "[noise]",
-            f"file = {_quoted(NOISE_FILE)}",
-            f"interval = {_number(noise_interval)}  # s",
-        ]
+        lines += [*_section("[noise]", {"file": NOISE_FILE, "interval": noise_interval})]
+        lines[-1] += "  # s"
     if campaign.loggers:
-        lines += ["", "[loggers]"]
-        for name, members in campaign.loggers.items():
-            lines.append(f"{_quoted(name)} = {_list([_quoted(member) for member in members])}")
+        lines += _section("[loggers]", {_toml(name): names for name, names in campaign.loggers.items()})
     for channel in campaign.channels.values():
-        lines += ["", "[[channel]]", *_channel_lines(channel)]
-    inputs = {item.name: item for trial in campaign.trials for item in trial.inputs}
-    for item in inputs.values():
-        lines += ["", "[[input]]", *_input_lines(item)]
-    order = list(campaign.channels)
+        lines += _section("[[channel]]", _channel(channel, si))
+    for item in {item.name: item for trial in campaign.trials for item in trial.inputs}.values():
+        lines += _section("[[input]]", _input(item))
     for trial, file in zip(campaign.trials, files, strict=True):
-        lines += ["", "[[trial]]", *_trial_lines(trial, file, order)]
+        lines += _section("[[trial]]", _trial(trial, file, list(campaign.channels)))
     for event in campaign.events:
-        trials = _list([_quoted(name) for name in event.trials])
-        lines += ["", "[[event]]", f"name = {_quoted(event.name)}", f"trials = {trials}"]
-        lines += [f"time = {_number(event.time)}"]
-        lines += [] if event.until is None else [f"until = {_number(event.until)}"]
+        what = {"name": event.name, "trials": event.trials, "time": event.time, "until": event.until}
+        lines += _section("[[event]]", what)
     return "\n".join(lines) + "\n"
 
 
-def _channel_lines(channel: Channel) -> list[str]:
-    unit = UNITS[channel.quantity].written
-    values: dict[str, str] = {
-        "name": _quoted(channel.name),
-        "quantity": _quoted(channel.quantity.value),
-        "unit": _quoted(unit),
-        "output": _quoted(channel.output),
-    }
-    for name in ("station", "chord"):
-        place = getattr(channel, name)
-        if place is not None:
-            values[name] = _number(place)
-    if channel.gain_deviation:
-        values["gain_deviation"] = (
-            '"free"' if isinf(channel.gain_deviation) else _number(channel.gain_deviation)
-        )
-    if channel.offset_deviation:
-        values["offset_deviation"] = (
-            '"free"'
-            if isinf(channel.offset_deviation)
-            else _toml_float(in_unit(channel.offset_deviation, channel.quantity, unit))
-        )
-    record = channel.noise
+class _Printed(str):
+    """A number as it is to stand in the file."""
+
+
+def _channel(channel: Channel, si: bool) -> dict[str, Any]:
+    unit, record, noise = _unit(channel, si), channel.noise, None
+
+    def printed(deviation: float) -> str:
+        return "free" if isinf(deviation) else _Printed(in_unit(deviation, channel.quantity, unit))
+
     if record is not None and record.samples is None:
-        deviation = _toml_float(in_unit(record.standard_deviation, channel.quantity, unit))
-        freedom = (
-            ""
-            if isinf(record.degrees_of_freedom)
-            else (f", degrees_of_freedom = {_number(record.degrees_of_freedom)}")
-        )
-        source = "" if record.source == "stated" else f", source = {_quoted(record.source)}"
-        values["noise"] = f"{{ standard_deviation = {deviation}{freedom}{source} }}"
-    return [f"{key} = {value}" for key, value in values.items()]
+        freedom, source = record.degrees_of_freedom, record.source
+        noise = {
+            "standard_deviation": printed(record.standard_deviation),
+            "degrees_of_freedom": None if isinf(freedom) else freedom,
+            "source": None if source == "stated" else source,
+        }
+    gain = "free" if isinf(channel.gain_deviation) else channel.gain_deviation
+    return {
+        "name": channel.name, "quantity": channel.quantity, "unit": unit, "output": channel.output,
+        "station": channel.station, "chord": channel.chord, "gain_deviation": gain or None,
+        "offset_deviation": printed(channel.offset_deviation) if channel.offset_deviation else None,
+        "noise": noise,
+    }  # fmt: skip
 
 
-def _input_lines(item: RecordedInput) -> list[str]:
-    lines = [
-        f"name = {_quoted(item.name)}",
-        f"quantity = {_quoted(item.quantity.value)}",
-        f"unit = {_quoted(UNITS[item.quantity].si)}",
-        f"hold = {_quoted(item.hold.value)}",
-    ]
-    if item.quantity.moving and item.hold is not Hold.SMOOTH:
-        lines.append("reference = true")
-    return [
-        *lines,
-        *([f"offset_deviation = {_number(item.offset_deviation)}"] if item.offset_deviation else []),
-    ]
+def _input(item: RecordedInput) -> dict[str, Any]:
+    return {
+        "name": item.name, "quantity": item.quantity, "unit": UNITS[item.quantity].si, "hold": item.hold,
+        "reference": True if item.quantity.moving and item.hold is not Hold.SMOOTH else None,
+        "offset_deviation": item.offset_deviation or None,
+    }  # fmt: skip
 
 
-def _trial_lines(trial: Trial, file: str, order: list[str]) -> list[str]:
-    values: dict[str, str] = {
-        "name": _quoted(trial.name),
-        "kind": _quoted(trial.kind.value),
-        "file": _quoted(file),
-    }
-    if trial.run:
-        values["run"] = _quoted(trial.run)
-    if trial.held_out:
-        values["held_out"] = "true"
-    if trial.noise_factor != 1.0:
-        values["noise_factor"] = _number(trial.noise_factor)
-    if trial.start or not trial.is_dynamic:
-        values["start"] = _number(trial.start)
-    if trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED:
-        values["begins"] = _quoted(trial.begins.value)
-    place = trial.load_place
-    if place != "tip_load":
-        values["load_place"] = (
-            _quoted(place) if isinstance(place, str) else f"[{_number(place[0])}, {_number(place[1])}]"
-        )
-    if list(trial.channels) != [name for name in order if name in trial.channels]:
-        values["channels"] = _list([_quoted(name) for name in trial.channels])
+def _trial(trial: Trial, file: str, order: list[str]) -> dict[str, Any]:
     left_out = {
-        name: (np.flatnonzero(~trial.used[:, index]) + 1).tolist()
+        _toml(name): (np.flatnonzero(~trial.used[:, index]) + 1).tolist() or None
         for index, name in enumerate(trial.channels)
     }
-    rows = [
-        f"{_quoted(name)} = {_list([str(n) for n in numbers])}"
-        for name, numbers in left_out.items()
-        if numbers
-    ]
-    if rows:
-        values["left_out"] = f"{{ {', '.join(rows)} }}"
-    if trial.release is not None:
-        values["release"] = _release_text(trial.release)
-    return [f"{key} = {value}" for key, value in values.items()]
+    said = trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED
+    in_order = list(trial.channels) == [name for name in order if name in trial.channels]
+    return {
+        "name": trial.name, "kind": trial.kind, "file": file, "run": trial.run or None,
+        "held_out": trial.held_out or None,
+        "noise_factor": None if trial.noise_factor == 1.0 else trial.noise_factor,
+        "start": trial.start if trial.start or not trial.is_dynamic else None,
+        "begins": trial.begins if said else None,
+        "load_place": None if trial.load_place == "tip_load" else trial.load_place,
+        "channels": None if in_order else trial.channels,
+        "left_out": left_out if any(left_out.values()) else None,
+        "release": None if trial.release is None else asdict(trial.release),
+    }  # fmt: skip
 
 
-def _release_text(release: Release) -> str:
-    return (
-        f"{{ displacement = {_number(release.displacement)}, deviation = {_number(release.deviation)}, "
-        f"at_rest = {'true' if release.at_rest else 'false'}, mode_count = {release.mode_count}, "
-        f"time_zero_deviation = {_number(release.time_zero_deviation)} }}"
-    )
+# ---------------------------------------------------------------- values
 
 
-def _list(items: list[str]) -> str:
-    return f"[{', '.join(items)}]"
+def _section(head: str, content: Mapping[str, Any]) -> list[str]:
+    """Return the lines of a table; what is None is left out."""
+    return ["", head, *(f"{key} = {_toml(value)}" for key, value in content.items() if value is not None)]
 
 
-def _number(value: float) -> str:
-    return _toml_float(repr(float(value)))
-
-
-def _toml_float(text: str) -> str:
-    """Return the text of a float as TOML has it: `E+5` is not one of its exponents after a bare point."""
-    mantissa, letter, exponent = text.lower().partition("e")
-    if mantissa.endswith("."):
-        mantissa += "0"
-    return f"{mantissa}e{int(exponent)}" if letter else mantissa
-
-
-def _quoted(text: str) -> str:
-    """Return a TOML string; JSON's escapes are TOML's but for DEL, which JSON leaves bare."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+def _toml(value: Any) -> str:
+    """Return a value as TOML has it."""
+    if isinstance(value, Mapping):
+        return (
+            f"{{ {', '.join(f'{key} = {_toml(item)}' for key, item in value.items() if item is not None)} }}"
+        )
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, float | _Printed):
+        # `E+5` is not one of its exponents after a bare point.
+        mantissa, letter, exponent = str(value).lower().partition("e")
+        mantissa += "0" if mantissa.endswith(".") else ""
+        return f"{mantissa}e{int(exponent)}" if letter else mantissa
+    # JSON's escapes are TOML's but for DEL, which JSON leaves bare.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -120,7 +120,15 @@ def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
                 trial=trial.name,
             )
         samples = 1.0 / (trial.interval * frequency)
-        if samples < LEAST_SAMPLES:
+        if samples < LEAST_SAMPLES / 10.0 and 1e3 * samples >= LEAST_SAMPLES:
+            yield DataFault(
+                FaultKind.UNDERSAMPLED,
+                f"The time of the trial {trial.name!r} looks like milliseconds: taken as seconds it gives "
+                f"{samples:.2g} samples per period of the first mode ({frequency:.3g} Hz), as milliseconds "
+                f"{1e3 * samples:.3g}; write it in seconds, as `uav-twin discrepancy import` does.",
+                trial=trial.name,
+            )
+        elif samples < LEAST_SAMPLES:
             yield DataFault(
                 FaultKind.UNDERSAMPLED,
                 f"The trial {trial.name!r} has {samples:.2g} samples per period of the first mode "

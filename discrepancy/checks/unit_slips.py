@@ -24,7 +24,7 @@ FOREIGN: Mapping[Quantity, Mapping[str, float]] = {
     Quantity.FLOW: {"l/h": 1e-3 / 3600.0, "m3/min": 1.0 / 60.0},
     Quantity.CHARGE: {"mA h": 3.6},
 }
-"""Units that instruments show and files cannot state, and what one of them is in SI."""
+"""Units that instruments show beside the usual ones, and what one of them is in SI."""
 _DRIVES = {
     TrialKind.STATIC: (Quantity.FORCE, "N"), TrialKind.FORCED: (Quantity.FORCE, "N"),
     TrialKind.RINGDOWN: (Quantity.DISPLACEMENT, ""), TrialKind.FLIGHT: (Quantity.ACCELERATION, "g"),
@@ -77,8 +77,11 @@ def slip_between(scale: float, quantity: Quantity, stated: str = "", *, drive: b
     drive : bool
         The quantity is what drives the model: what is too small there shows as data that are too large.
     """
-    sizes = {unit: si_value("1.0", quantity, unit) for unit in units_of(quantity)}
-    sizes = dict(FOREIGN.get(quantity, {})) | sizes
+    if abs(log(abs(scale))) < log(LEAST / 1.1):
+        return None
+    units = {*units_of(quantity), *([stated] if stated else [])}
+    sizes = {unit: si_value("1.0", quantity, unit) for unit in sorted(units)}
+    sizes |= FOREIGN.get(quantity, {})
     slips = [
         Slip(sizes[meant] / size if drive else size / sizes[meant], meant, unit)
         for unit, size in sizes.items()

@@ -2,14 +2,19 @@
 
 import logging
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
-from fe.runtime.errors import ReducedModelFileError
+from fe.runtime.errors import ReducedModelFileError, ReductionError
 
 _logger = logging.getLogger(__name__)
+
+_PAUSE = 0.1
+"""Between two looks whether another process has ended its work [s]."""
+_SILENT_LOOKS, _MOST_LOOKS = 10, 36_000
 
 _Kept = TypeVar("_Kept")
 
@@ -46,8 +51,13 @@ def built_once(
         Makes it.
     keep : callable
         Writes it; where that raises `OSError` it is used all the same, with a warning.
+
+    Raises
+    ------
+    ReductionError
+        If another process has been building it for an hour.
     """
-    with _locked(path.with_suffix(".lock")):
+    with _locked(path.with_suffix(".lock"), path):
         try:
             return load()  # another process may have been faster
         except (OSError, ReducedModelFileError):
@@ -63,7 +73,7 @@ def built_once(
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def _locked(path: Path, what: Path) -> Iterator[None]:
     """Hold a lock file while building; without a writable folder there is nothing to guard."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,9 +83,29 @@ def _locked(path: Path) -> Iterator[None]:
         return
     try:
         with suppress(ImportError):  # Windows: several builders then build the same
-            import fcntl
-
-            fcntl.flock(handle, fcntl.LOCK_EX)
+            _take(handle, what)
         yield
     finally:
         os.close(handle)
+
+
+def _take(handle: int, what: Path) -> None:
+    """Take a lock; who waits for it for more than a second says so, and how the wait has ended."""
+    import fcntl
+
+    for look in range(_MOST_LOOKS):
+        with suppress(BlockingIOError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.truncate(handle, 0)
+            os.pwrite(handle, str(os.getpid()).encode(), 0)
+            if look > _SILENT_LOOKS and not what.exists():
+                _logger.warning("The other process has ended without leaving %s; it is made here.", what)
+            return
+        if look == _SILENT_LOOKS:
+            holder = os.pread(handle, 20, 0).decode()
+            _logger.warning("Waiting for another process (number %s) that makes %s.", holder, what)
+        time.sleep(_PAUSE)
+    raise ReductionError(
+        f"Another process (number {holder}) has been making {what} for more than "
+        f"{_MOST_LOOKS * _PAUSE / 60:.0f} minutes. Start again to wait on; if it hangs, end it first."
+    )

@@ -1,14 +1,14 @@
 """What an FMU declares in its model description, as plain records for all FMI versions."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from fmu_asset.errors import visible
+from fmu_asset.errors import FmuInputError, visible
 from fmu_asset.instances.plan import Interface
 
 NUMERIC_KINDS = frozenset(
@@ -41,6 +41,8 @@ class VariableInfo:
         Declared start value; of an array, its elements.
     shape : tuple of int
         Of an array of FMI 3, with the start values of its structural parameters; empty for a scalar.
+    dimensions : tuple of str or None
+        For each number of the shape the name of the structural parameter that it is, if it is one.
     clocked : bool
         Whether it changes with a clock of FMI 3 only.
     """
@@ -57,6 +59,7 @@ class VariableInfo:
     maximum: float | None
     start: str | None
     shape: tuple[int, ...] = ()
+    dimensions: tuple[str | None, ...] = ()
     clocked: bool = False
 
     @property
@@ -64,10 +67,41 @@ class VariableInfo:
         """Number of values."""
         return math.prod(self.shape)
 
+    def resized(self, lengths: Mapping[str | None, int]) -> "VariableInfo":
+        """Return the variable with other values of structural parameters; one start value stands for all.
+
+        Raises
+        ------
+        FmuInputError
+            If it would be an array of too many elements.
+        """
+        shape = [lengths.get(name, length) for name, length in zip(self.dimensions, self.shape, strict=True)]
+        start = {*(self.start or "").split()}
+        alike = start.pop() if len(start) == 1 else self.start
+        return replace(self, shape=_checked(self.name, shape), start=alike)
+
     @property
     def numeric(self) -> bool:
         """Whether its values are numbers."""
         return self.kind in NUMERIC_KINDS
+
+    @property
+    def base_type(self) -> str:
+        """Its type in the words of FMI 2 and SSP 1.0, which have one size of reals and one of integers."""
+        if self.kind in FLOAT_KINDS:
+            return "Real"
+        return "Integer" if self.kind.lstrip("U").startswith("Int") else self.kind
+
+    @property
+    def single(self) -> bool:
+        """Whether it is one number that is there at any time: no text, array or clocked variable."""
+        return self.numeric and not self.shape and not self.clocked
+
+    @property
+    def startable(self) -> bool:
+        """Whether it is an output or local variable with a start value, to be set before initialisation."""
+        free = self.causality in ("output", "local") and self.variability != "constant"
+        return free and self.start is not None
 
     @property
     def continuous(self) -> bool:
@@ -213,6 +247,11 @@ def read_declared(
         value = getattr(experiment, attribute, None)
         return None if value is None else float(value)
 
+    # fmpy 0.3.32 passes over the range of unsigned integers.
+    unsigned = {e.get("name"): e for e in root.iterfind("ModelVariables/*") if e.tag.startswith("UInt")}
+    for variable in declared.modelVariables:
+        if (element := unsigned.get(variable.name)) is not None:
+            variable.min, variable.max = element.get("min"), element.get("max")
     fixed = getattr(chosen, "fixedInternalStepSize", None)
     return FmuDescription(
         path=file,
@@ -247,6 +286,14 @@ def read_declared(
     )
 
 
+def _checked(name: str, shape: Sequence[int]) -> tuple[int, ...]:
+    if any(length < 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
+        raise FmuInputError(
+            f"{name!r} is an array of {' x '.join(map(str, shape))} elements; {_LARGEST_ARRAY} are the most."
+        )
+    return tuple(shape)
+
+
 def _variable(declared: Any) -> VariableInfo:
     declared_type = declared.declaredType
 
@@ -256,9 +303,6 @@ def _variable(declared: Any) -> VariableInfo:
             getattr(declared_type, attribute, None) if value is None and declared_type is not None else value
         )
 
-    shape = tuple(declared.shape or ())
-    if any(length < 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
-        raise ValueError(f"{declared.name!r} is an array of {' x '.join(map(str, shape))} elements")
     return VariableInfo(
         name=str(declared.name),
         reference=int(declared.valueReference),
@@ -271,7 +315,8 @@ def _variable(declared: Any) -> VariableInfo:
         minimum=None if of("min") is None else float(of("min")),
         maximum=None if of("max") is None else float(of("max")),
         start=None if declared.start is None else str(declared.start),
-        shape=shape,
+        shape=_checked(declared.name, declared.shape or ()),
+        dimensions=tuple(d.variable and str(d.variable.name) for d in declared.dimensions or ()),
         clocked=bool(declared.clocks),
     )
 

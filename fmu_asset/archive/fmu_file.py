@@ -1,6 +1,7 @@
 """An FMU file from outside: sound, safe to extract, of a kind that can be flown, and what it declares."""
 
 import hashlib
+import lzma
 import os
 import re
 import shutil
@@ -39,6 +40,7 @@ _SMALL_ENOUGH = 256 * 1024**2
 _MOST_ENTRIES = 100_000
 _DEEPEST = 100
 _LARGEST_DESCRIPTION = 256 * 1024**2
+_UNREADABLE = (OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
 # A hyphen is none of C, but tools put one there, and the folder of the binary has no harm of it.
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
@@ -173,7 +175,7 @@ def extract_fmu(description: FmuDescription) -> Path:
             raise OSError(f"it needs {needed // 1024**2} MiB, and {free // 1024**2} MiB are free")
         with zipfile.ZipFile(description.path) as archive:
             archive.extractall(folder)
-    except (OSError, zipfile.BadZipFile, zlib.error) as error:
+    except _UNREADABLE as error:
         remove_folder(folder)
         raise FmuFileError(f"{description.path} could not be extracted to {folder} ({error}).") from error
     return folder
@@ -224,7 +226,7 @@ def check_archive(file: Path, size: int, what: str = "FMU", again: str = "build"
                 raise FmuFileError(f"{file} is damaged: the checksum of {broken} is wrong; fetch it again.")
             _refuse_unequal_twins(file, archive)
             return {*names}
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
+    except (*_UNREADABLE, EOFError, NotImplementedError, RuntimeError) as error:
         raise FmuFileError(
             f"{file} is not a sound {what} archive ({error}); fetch or {again} it again."
         ) from error

@@ -98,7 +98,7 @@ def every_output(wiring: Wiring) -> dict[str, str]:
     for component, item in wiring.declared.items():
         for variable in item.variables.values():
             own = Endpoint(component, variable.name) not in shown
-            if own and variable.causality == "output" and variable.kind != "String":
+            if own and variable.causality == "output" and variable.single:
                 observed[f"{component}.{variable.name}"] = variable.unit or "1"
     return observed
 

@@ -252,10 +252,10 @@ class Layout:
     def _any_output(self, name: str) -> str:
         """Return an output to look at for a component of which nothing is asked."""
         for variable in self._wiring.declared[name].variables.values():
-            if variable.causality == "output" and variable.kind != "String":
+            if variable.causality == "output" and variable.single:
                 return variable.name
         raise CouplingError(
-            f"The component {name!r} has no numeric output, so it takes no part; leave it out."
+            f"The component {name!r} has no output of a single number, so it takes no part; leave it out."
         )
 
     def parameters(self, given: Mapping[str, float]) -> list[dict[str, float]]:

@@ -97,7 +97,7 @@ def _targets(wiring: Wiring, name: str, unit: str, where: str, kind: str) -> tup
             raise BindingError(f"{where} names {name!r}, which goes to {listed(wrong)}; {kind}s are needed.")
         return tuple(port._replace(conversion=composed(own, port.conversion)) for port in ports)
     variable = wiring.variable(end)
-    if variable.causality != kind or variable.kind == "String":
+    if variable.causality != kind or not variable.single:
         raise BindingError(
             f"{where} names {name!r}, which is declared as {variable.causality} of the type {variable.kind}; "
             f"a numeric {kind} is needed."
@@ -119,7 +119,7 @@ def _source(wiring: Wiring, name: str, unit: str, where: str) -> ConnectedVariab
         own = _unit(unit, wiring.units[name], wiring, Endpoint("", name), where, outward=True)
         return port._replace(conversion=composed(port.conversion, own))
     variable = wiring.variable(end)
-    if variable.causality not in READABLE or variable.kind == "String":
+    if variable.causality not in READABLE or not variable.single:
         raise BindingError(
             f"{where} names {name!r}, which is declared as {variable.causality} of the type {variable.kind}; "
             "a numeric output is needed."

@@ -37,12 +37,15 @@ class Setting:
         Its unit; that of the variable if None.
     factor, offset : float
         The variable is factor * value + offset, the value converted to its unit.
+    units : tuple of UnitInfo
+        Definitions that go before those of the system: a parameter set brings its own.
     """
 
     value: SettingValue
     unit: str | None = None
     factor: float = 1.0
     offset: float = 0.0
+    units: tuple[UnitInfo, ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import difflib
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 from fmu_asset.archive.fmu_file import UnitInfo, VariableInfo
@@ -15,9 +16,9 @@ from .structure import Component, Connection, Connector, Endpoint, Setting, Syst
 
 _FITS = {
     "Real": {"Real"},
-    "Integer": {"Integer", "Real"},
+    "Integer": {"Integer", "Real", "Enumeration"},
     "Boolean": {"Boolean"},
-    "Enumeration": {"Enumeration"},
+    "Enumeration": {"Enumeration", "Integer"},
 }
 """For each type of a source, the types of targets that can take it."""
 
@@ -45,10 +46,19 @@ class ConnectedVariable(NamedTuple):
 class Wiring:
     """A system whose connections were checked.
 
+    Parameters
+    ----------
+    structure : SystemStructure
+        The system.
+    leave_out_unknown : bool
+        Whether settings of variables that the FMU does not have are left out instead of refused.
+
     Attributes
     ----------
     structure : SystemStructure
-        As given.
+        As given, without what was left out.
+    left_out : list of str
+        The names of these settings.
     declared : dict of str to DeclaredFmu
         The FMUs by component.
     feeds : tuple of Feed
@@ -72,8 +82,7 @@ class Wiring:
         If an FMU cannot be used.
     """
 
-    def __init__(self, structure: SystemStructure) -> None:
-        self.structure = structure
+    def __init__(self, structure: SystemStructure, *, leave_out_unknown: bool = False) -> None:
         names = [component.name for component in structure.components]
         if not names:
             raise CouplingError(f"The system {structure.name} has no component; name at least one FMU.")
@@ -86,6 +95,10 @@ class Wiring:
         self.declared: dict[str, DeclaredFmu] = {
             c.name: read_declared(c.fmu, c.interface) for c in structure.components
         }
+        self.left_out: list[str] = []
+        if leave_out_unknown:
+            structure = replace(structure, components=tuple(map(self._known, structure.components)))
+        self.structure = structure
         self.settings = {c.name: self._settings(c) for c in structure.components}
         self._connectors = {connector.name: connector for connector in structure.connectors}
         self.units: dict[str, str | None] = {c.name: c.unit for c in structure.connectors}
@@ -178,7 +191,7 @@ class Wiring:
 
     def _enter(self, connection: Connection) -> None:
         connector = self._connector(connection.source, ("input", "parameter"), "the source")
-        causalities = ("input",) if connector.kind == "input" else ("parameter",)
+        causalities = ("input",) if connector.kind == "input" else ("parameter", "input")
         target = self._writable(connection.target, causalities)
         if connection.delayed:
             raise CouplingError(f"The connection from the input {connection.source} cannot be delayed.")
@@ -197,30 +210,30 @@ class Wiring:
 
     def _readable(self, end: Endpoint) -> VariableInfo:
         variable = self.variable(end)
-        if variable.causality not in READABLE or variable.kind == "String":
+        if variable.causality not in READABLE or not variable.single:
             raise CouplingError(
                 f"{end} cannot be the source of a connection: it is declared as {variable.causality} of the "
-                f"type {variable.kind}, and a numeric output is needed."
+                f"type {variable.kind}, and an output of a single number is needed."
             )
         return variable
 
     def _writable(self, end: Endpoint, causalities: tuple[str, ...]) -> VariableInfo:
         variable = self.variable(end)
-        if variable.causality not in causalities or variable.kind == "String":
+        if variable.causality not in causalities or not variable.single:
             raise CouplingError(
                 f"{end} cannot be the target of this connection: it is declared as {variable.causality} of "
-                f"the type {variable.kind}, and a numeric {' or '.join(causalities)} is needed."
+                f"the type {variable.kind}, and a single number is needed as {' or '.join(causalities)}."
             )
         return variable
 
     def _fit(self, connection: Connection, source: VariableInfo, target: VariableInfo) -> None:
-        if target.kind not in _FITS[source.kind]:
+        if target.base_type not in _FITS[source.base_type]:
             raise CouplingError(
                 f"{connection.source} is of the type {source.kind} and cannot feed {connection.target}, "
                 f"which is of the type {target.kind}."
             )
         scaled = (connection.factor, connection.offset) != (1.0, 0.0)
-        if scaled and target.kind != "Real":
+        if scaled and target.base_type != "Real":
             raise CouplingError(
                 f"The connection from {connection.source} to {connection.target} has a linear "
                 "transformation, but "
@@ -246,6 +259,12 @@ class Wiring:
 
     # ------------------------------------------------------------------ parameters
 
+    def _known(self, component: Component) -> Component:
+        variables = self.declared[component.name].variables
+        settings = {name: setting for name, setting in component.settings.items() if name in variables}
+        self.left_out += [f"{component.name}.{name}" for name in component.settings if name not in settings]
+        return replace(component, settings=settings)
+
     def _settings(self, component: Component) -> dict[str, float]:
         if component.substeps < 1:
             raise CouplingError(
@@ -265,7 +284,7 @@ class Wiring:
             If there is no such parameter or input, or the value is of another type or unit.
         """
         variable = self.variable(end)
-        if variable.causality not in ("parameter", "input"):
+        if variable.causality not in ("parameter", "input") and not variable.startable:
             raise CouplingError(f"{end} cannot be set: it is declared as {variable.causality}.")
         value = setting.value
         if isinstance(value, str):
@@ -276,10 +295,9 @@ class Wiring:
                 f"{end} cannot be set to {value!r}: it is of the type {variable.kind}"
                 + (f" with the items {listed(items)}." if items else ", and a number is needed.")
             )
-        units = (*self.structure.units, *self.declared[end.component].description.units)
-        conversion = between(
-            setting.unit, units, variable.unit, self.declared[end.component].description.units
-        )
+        own = self.declared[end.component].description.units
+        units = (*setting.units, *self.structure.units, *own)
+        conversion = between(setting.unit, units, variable.unit, own)
         if conversion is None:
             raise CouplingError(
                 f"{end} is given in {setting.unit!r}, but it is in {variable.unit!r}, and there is no "
@@ -289,8 +307,8 @@ class Wiring:
         wrong = (
             (isinstance(value, bool) and variable.kind != "Boolean")
             or (not isinstance(value, bool) and variable.kind == "Boolean" and value not in (0, 1))
-            or (variable.kind in ("Integer", "Enumeration") and not number.is_integer())
-            or variable.kind == "String"
+            or (variable.base_type in ("Integer", "Enumeration") and not number.is_integer())
+            or not variable.single
             or not math.isfinite(number)
         )
         if wrong:

@@ -217,6 +217,8 @@ class Header(Section):
     interpolation : {"zero-order", "linear"}
         How inputs go on between communication points: held, or, where the FMU can follow and both ends are
         continuous, in a straight line to the value given for a step, which they reach at its end.
+    structural_parameters : dict of str to float
+        Structural parameters (FMI 3) by their names in the FMU; arrays have the sizes that follow.
     state : {"auto", "serialised", "replay"}
         How `save_state` keeps the state; auto trusts what the FMU declares.
     description : str
@@ -231,6 +233,7 @@ class Header(Section):
     interface: Interface | None = None
     tolerance: _Positive | None = None
     interpolation: Interpolation = "zero-order"
+    structural_parameters: dict[str, _Number] = Field(default_factory=dict)
     state: Literal["auto", "serialised", "replay"] = "auto"
     description: str = ""
 

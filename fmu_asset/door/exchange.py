@@ -12,6 +12,7 @@ from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
 from .binding import INPUT_ROLES, Binding, Input
+from .configuration import configured
 from .layout import BlockLayout, Place, element_names, find, start_values
 from .reading import OutputTable, Selection
 from .slots import Slot, in_unit, put, value_range
@@ -36,6 +37,8 @@ class Exchange:
 
     Attributes
     ----------
+    description : FmuDescription
+        The FMU, with the structural parameters of the binding.
     binding : Binding
         The binding, with arrays that are observed or recorded as their elements.
     plan : Plan
@@ -51,13 +54,14 @@ class Exchange:
     """
 
     def __init__(self, description: FmuDescription, binding: Binding) -> None:
-        self._description = description
         wanted = binding.binding.fmi_version
         if wanted is not None and wanted[0] != description.fmi_version[0]:
             raise BindingError(
                 f"The binding {binding.name} is for FMI {wanted}, but {description.path} is of FMI "
                 f"{description.fmi_version}; correct `fmi_version`, or leave it out."
             )
+        description, configuration = configured(description, binding)
+        self.description = self._description = description
         self.binding = self._binding = binding.with_arrays(self._elements)
         self._reads_ports = self._port_directions()
         self._make_outputs()
@@ -77,6 +81,7 @@ class Exchange:
             states=description.states,
             event_indicators=description.event_indicators,
             completed_step=description.completed_step,
+            configuration=configuration,
         )
 
     # ------------------------------------------------------------------ resolving
@@ -296,8 +301,13 @@ class Exchange:
 
     # ------------------------------------------------------------------ sending
 
-    def start_values(self) -> list[float]:
+    def start_values(self, *given: Values | None) -> list[float]:
         """Return a request block with the FMU's own start values of the inputs.
+
+        Parameters
+        ----------
+        *given : mapping of str to float, or None
+            What is going to be put in their place, by role: whole arrays of it are left at zero.
 
         Raises
         ------
@@ -305,8 +315,14 @@ class Exchange:
             If a start value is no number.
         """
         values = [0.0, 0.0]
+        slots = [
+            self.slot(role, name)
+            for role, part in zip(self._slots, given, strict=False)
+            for name in part or ()
+        ]
+        whole = {slot.variable.name for slot in slots if len(slot.positions) == slot.variable.size}
         for variable in self._inputs.variables:
-            values += start_values(self._description, variable)
+            values += start_values(self._description, variable, given=variable.name in whole)
         return values + values[2 : 2 + self.plan.linear_count]
 
     def settings(self, parameters: Values) -> Settings:
@@ -343,7 +359,8 @@ class Exchange:
             variable = slots[name].variable
             if variable.name not in set_values:
                 kind = self._description.exchange_kind(variable)
-                start = start_values(self._description, variable) if variable.shape else [0.0]
+                whole = len(slots[name].positions) == variable.size
+                start = start_values(self._description, variable, given=whole)
                 set_values[variable.name] = (kind, variable.reference, start)
             put(set_values[variable.name][2], slots[name], value)
         return list(set_values.values())

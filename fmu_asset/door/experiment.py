@@ -62,7 +62,7 @@ def default_experiment(
     step_size : float, optional
         Communication step size [s]; the FMU's own, or a 500th of the time to the end.
     values : mapping of str to float or list, optional
-        Parameters and inputs by the names of the FMU's variables, in its units.
+        Parameters (structural ones, too) and inputs by the names of the FMU's variables, in its units.
 
     Raises
     ------
@@ -80,6 +80,8 @@ def default_experiment(
         places |= {item.variable: (role, name) for name, item in binding.inputs(role).items()}
     for name, port in binding.port.items():
         places |= {v.variables[0]: ("port", f"{name}.{key}") for key, v in port.quantities.items()}
+    structural = [v.name for v in description.variables if v.causality == "structuralParameter"]
+    places |= {name: ("structural", name) for name in structural}
     given: dict[str, dict[str, Value]] = {}
     for variable, value in (values or {}).items():
         if variable not in places:
@@ -90,6 +92,8 @@ def default_experiment(
             )
         role, name = places[variable]
         given.setdefault(role, {})[name] = value
+    header = {"structural_parameters": given.pop("structural", {})}
+    binding = binding.model_copy(update={"binding": binding.binding.model_copy(update=header)})
     return Experiment(binding, steps, given.pop("parameter", {}), given)
 
 

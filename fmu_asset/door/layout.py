@@ -13,6 +13,7 @@ from fmu_asset.instances.plan import Group
 _CAUSALITY: Mapping[str, tuple[str, ...]] = {
     "input": ("input",),
     "parameter": ("parameter",),
+    "structuralParameter": ("structuralParameter",),
     "output": ("output", "local", "calculatedParameter", "none"),
 }
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:,\s*\d+)*)\]", re.DOTALL)
@@ -51,9 +52,9 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
         A variable, or an element of an array such as `p[3]`.
     label : str
         Place in the binding, for the error.
-    causality : {"input", "parameter", "output"}
-        What it must be; everything that is neither input nor parameter can be read, and a tunable parameter
-        can be sent at every step like an input (co-simulation).
+    causality : {"input", "parameter", "structuralParameter", "output"}
+        What it must be; everything that is neither input nor parameter can be read, a tunable parameter can
+        be sent at every step like an input (co-simulation), and a start value be set like a parameter.
 
     Raises
     ------
@@ -72,7 +73,8 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
         and (variable.causality, variable.variability) == ("parameter", "tunable")
         and description.interface == "co-simulation"
     )
-    if variable.causality not in _CAUSALITY[causality] and not sent:
+    started = causality == "parameter" and variable.startable
+    if variable.causality not in _CAUSALITY[causality] and not sent and not started:
         raise BindingError(
             f"{label} must be of causality {causality}, but {name!r} is declared as {variable.causality} in "
             f"{description.path}."
@@ -173,15 +175,17 @@ class BlockLayout:
         return [name for variable in self.variables for name in element_names(variable)]
 
 
-def start_values(description: FmuDescription, variable: VariableInfo) -> list[float]:
+def start_values(description: FmuDescription, variable: VariableInfo, *, given: bool = False) -> list[float]:
     """Return the declared start values; one value stands for all elements of an array.
+
+    Where others are `given` for all elements, their number is all that counts, and they are zero.
 
     Raises
     ------
     FmuFileError
         If one is no number, or their number does not fit.
     """
-    words = (variable.start or "0").lower().split() or ["0"]
+    words = ("" if given else variable.start or "0").lower().split() or ["0"]
     try:
         values = [float({"true": "1", "false": "0"}.get(word, word)) for word in words]
     except ValueError as error:
@@ -193,6 +197,6 @@ def start_values(description: FmuDescription, variable: VariableInfo) -> list[fl
     if len(values) != variable.size:
         raise FmuFileError(
             f"{variable.name!r} of {description.path} has {variable.size} elements but {len(values)} "
-            "start values."
+            "start values; give all of its values."
         )
     return values

@@ -50,9 +50,9 @@ class OpenedFmu(SteppedAsset):
         parameters: Values | None = None,
     ) -> None:
         given = binding if isinstance(binding, Binding) else load_binding(binding)
-        self._description = read_fmu(fmu_path, given.binding.interface)
         limits = limits_of(given, step_timeout, load_timeout, memory_limit)
-        self._exchange = Exchange(self._description, given)
+        self._exchange = Exchange(read_fmu(fmu_path, given.binding.interface), given)
+        self._description = self._exchange.description
         self._housing = Housing(self._description, self._exchange.plan, limits, isolated=isolated)
         super().__init__(self._exchange.binding)
         self._settings = self._exchange.settings(parameters or {})
@@ -194,7 +194,7 @@ class OpenedFmu(SteppedAsset):
         if parameters is not None:
             self._settings = self._exchange.settings(parameters)
             self._parameters = plain_values(parameters)
-        start = self._exchange.start_values()
+        start = self._exchange.start_values(control, health, load, port)
         given = self._exchange.place(start, control, health, load, port)
         self._begin(start, with_inputs=given)
 

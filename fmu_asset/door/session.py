@@ -309,9 +309,8 @@ class FmiAsset(OpenedFmu):
         if replayed or not (ready and same):
             self._settings = self._exchange.settings(saved.parameters)
             self._parameters = plain_values(saved.parameters)
-            start = self._exchange.start_values()
-            if saved.start_inputs:
-                start[2:] = np.frombuffer(saved.start_inputs).tolist()
+            held = np.frombuffer(saved.start_inputs).tolist()
+            start = [0.0, 0.0, *held] if held else self._exchange.start_values()
             self._begin(start, with_inputs=bool(saved.start_inputs))
         instance = self._housing.instance
         assert instance is not None

@@ -127,6 +127,10 @@ class FmuInstance(ABC):
         experiment = {"startTime": start_time, "tolerance": tolerance}
         if self._plan.fmi_version == 2:
             fmu.setupExperiment(**experiment)
+        if self._plan.configuration:
+            fmu.enterConfigurationMode()
+            self._apply(self._plan.configuration)
+            fmu.exitConfigurationMode()
         self._apply(parameters)
         fmu.enterInitializationMode(**(experiment if self._plan.fmi_version == 3 else {}))
         if with_inputs:

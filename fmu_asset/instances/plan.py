@@ -1,7 +1,7 @@
 """What an instance exchanges with its FMU: plain values, sent to a worker as JSON."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Literal, Self
 
 Interface = Literal["co-simulation", "model-exchange"]
@@ -61,6 +61,8 @@ class Plan:
         Numbers of continuous states and event indicators (model exchange).
     completed_step : bool
         Whether the FMU wants to hear of completed integrator steps (model exchange).
+    configuration : Settings
+        Structural parameters (FMI 3), set before everything else.
     """
 
     folder: str
@@ -77,6 +79,7 @@ class Plan:
     states: int = 0
     event_indicators: int = 0
     completed_step: bool = False
+    configuration: Settings = field(default_factory=list)
 
     @property
     def linear_count(self) -> int:

@@ -10,7 +10,7 @@ from fmu_asset.coupling.experiment import every_output
 from fmu_asset.coupling.schedule import loop_sentence
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import Binding, Header, Vector
-from fmu_asset.door.units import between
+from fmu_asset.door.units import IDENTITY, between
 from fmu_asset.errors import FmuError, SspError
 from fmu_asset.folders import scratch_folder
 
@@ -40,6 +40,8 @@ class SspCheck:
         How many there are.
     loops : tuple of str
         Algebraic loops; a system with one is sound, but `ssp simulate` needs to be told how to break it.
+    unused : tuple of str
+        Parameters that the file sets and nothing takes, which SSP allows.
     """
 
     path: Path
@@ -48,6 +50,7 @@ class SspCheck:
     connections: int = 0
     parameters: int = 0
     loops: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -71,7 +74,8 @@ def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
     CouplingError, FmuFileError, FmuUnsupportedError
         If the system does not fit its FMUs.
     """
-    wiring = Wiring(system.structure.delayed(delayed))
+    wiring = Wiring(system.structure.delayed(delayed), leave_out_unknown=True)
+    wiring.left_out += system.unused
     definitions = system.structure.units
     for end, declared in system.declared.items():
         variable = wiring.variable(end)
@@ -80,20 +84,15 @@ def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
                 f"The connector {end} is declared as {declared.kind}, but its FMU has it as "
                 f"{variable.causality}."
             )
-        if declared.type is not None and declared.type != variable.kind:
+        if declared.type is not None and declared.type != variable.base_type:
             raise SspError(
                 f"The connector {end} is declared of the type {declared.type}, but its FMU has it as "
                 f"{variable.kind}."
             )
         units = wiring.declared[end.component].description.units
-        if between(declared.unit, (*definitions, *units), variable.unit, units) is None:
+        if between(declared.unit, (*definitions, *units), variable.unit, units) != IDENTITY:
             raise SspError(
                 f"The connector {end} is declared in {declared.unit!r}, but its FMU has it in "
-                f"{variable.unit!r}."
-            )
-        if declared.unit is not None and declared.unit != variable.unit:
-            raise SspError(
-                f"The connector {end} is declared in {declared.unit!r} and its FMU has it in "
                 f"{variable.unit!r}; connectors of components must have the unit of the FMU."
             )
     return wiring
@@ -122,6 +121,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
             connections=len(wiring.structure.connections),
             parameters=sum(len(component.settings) for component in wiring.structure.components),
             loops=(loop_sentence(plan.loops),) if plan.loops else (),
+            unused=tuple(wiring.left_out),
         )
     except FmuError as error:
         return SspCheck(file, (str(error),))

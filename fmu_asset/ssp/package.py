@@ -43,6 +43,11 @@ _SCHEMAS = {
 class SspPackage:
     """An SSP file that was checked: sound, safe, and with a system structure in it.
 
+    Attributes
+    ----------
+    unused : list of str
+        Names of parameters, gathered by those who read: what the file sets and nothing takes.
+
     Raises
     ------
     SspError
@@ -51,6 +56,7 @@ class SspPackage:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
+        self.unused: list[str] = []
         if not self.path.is_file():
             raise SspError(
                 f"There is no SSP file {self.path}; check the path, or write it with `uav-twin ssp export`."
@@ -121,7 +127,7 @@ def parse_xml(content: bytes, where: str) -> Any:
     try:
         root = etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
-        raise SspError(f"{where} is not well-formed XML ({error}).") from error
+        raise SspError(f"{where} is not well-formed XML ({error.msg}).") from error
     if root.getroottree().docinfo.doctype:
         raise SspError(
             f"{where} has a document type declaration, which SSP files have no need of; it was refused."
@@ -190,7 +196,7 @@ def validate(root: Any, kind: str, where: str) -> None:
         for uri in NAMESPACES.values():
             text = text.replace(f"{{{uri}}}", "")
         raise SspError(
-            f"{where} is not valid by the schema of SSP 1.0 (line {first.line}): {text.rstrip('.')}."
+            f"{where} is not valid by the schema of SSP 1.0 (line {first.line}): {text[:400].rstrip('.')}."
         )
 
 

@@ -1,8 +1,8 @@
 """Parameter sets (SSV) and mappings (SSM): read into plain values by target name."""
 
-from dataclasses import dataclass, replace
-from math import isclose, isfinite
-from typing import Any, NamedTuple
+from dataclasses import replace
+from math import isfinite
+from typing import Any
 
 from fmu_asset.archive.fmu_file import UnitInfo
 from fmu_asset.coupling.structure import Setting, SettingValue
@@ -12,30 +12,14 @@ from .package import NAMESPACES, SspPackage, tag, validate
 
 _SET_TYPE = "application/x-ssp-parameter-set"
 _MAPPING_TYPE = "application/x-ssp-parameter-mapping"
+VALUE_TYPES = ("Real", "Integer", "Boolean", "Enumeration", "String", "Binary")
+"""What SSP 1.0 knows; a text or a binary value is refused where something would take it."""
 
 
-class ParameterBinding(NamedTuple):
-    """A parameter binding of an element: values by target name, and the units that the set defines."""
-
-    values: dict[str, Setting]
-    units: tuple[UnitInfo, ...]
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A mapping entry: target = factor * source + offset."""
-
-    source: str
-    target: str
-    factor: float
-    offset: float
-    convert_units: bool
-
-
-def read_units(element: Any) -> tuple[UnitInfo, ...]:
-    """Return the unit definitions below an element that holds `ssc:Unit`."""
+def read_units(root: Any, kind: str) -> tuple[UnitInfo, ...]:
+    """Return the unit definitions of a document of a kind: "ssd" or "ssv"."""
     found = []
-    for unit in element.findall(tag("ssc", "Unit")):
+    for unit in root.findall(f"{kind}:Units/ssc:Unit", NAMESPACES):
         base = unit.find(tag("ssc", "BaseUnit"))
         exponents = tuple(
             int(base.get(symbol, "0")) for symbol in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
@@ -52,28 +36,21 @@ def read_units(element: Any) -> tuple[UnitInfo, ...]:
     return tuple(found)
 
 
-def alike(one: UnitInfo, other: UnitInfo) -> bool:
-    """Return whether two definitions of a unit say the same, to the digits in which they are written."""
-    return one.exponents == other.exponents and all(
-        isclose(a, b, rel_tol=1e-9) for a, b in ((one.factor, other.factor), (one.offset, other.offset))
-    )
-
-
-def read_bindings(element: Any, package: SspPackage, where: str) -> list[ParameterBinding]:
-    """Return the parameter bindings of a component or system.
+def read_bindings(element: Any, package: SspPackage, where: str) -> dict[str, Setting]:
+    """Return what the parameter bindings of a component or system give, by target name; the last one counts.
 
     Raises
     ------
     SspError
         If a set or mapping is missing, not valid, or uses what is not supported.
     """
-    return [
-        _read_binding(item, package, where)
-        for item in element.findall("ssd:ParameterBindings/ssd:ParameterBinding", NAMESPACES)
-    ]
+    found: dict[str, Setting] = {}
+    for item in element.findall("ssd:ParameterBindings/ssd:ParameterBinding", NAMESPACES):
+        found |= _read_binding(item, package, where)
+    return found
 
 
-def _read_binding(element: Any, package: SspPackage, where: str) -> ParameterBinding:
+def _read_binding(element: Any, package: SspPackage, where: str) -> dict[str, Setting]:
     what = f"a parameter binding of {where}"
     if element.get("type", _SET_TYPE) != _SET_TYPE:
         raise SspError(
@@ -81,20 +58,20 @@ def _read_binding(element: Any, package: SspPackage, where: str) -> ParameterBin
         )
     root = _content(element, "ssd:ParameterValues", "ssv", "ParameterSet", package, what)
     prefix = element.get("prefix", "")
-    units = root.find(tag("ssv", "Units"))
+    units = read_units(root, "ssv")
     values: dict[str, Setting] = {}
     for parameter in root.findall("ssv:Parameters/ssv:Parameter", NAMESPACES):
         name = prefix + parameter.get("name")
         if name in values:
             raise SspError(f"{what} in {package.path} gives {name!r} twice; keep one of the two.")
-        values[name] = _value(parameter, f"{what} in {package.path}")
+        values[name] = replace(_value(parameter, f"{what} in {package.path}"), units=units)
     mapping = element.find(tag("ssd", "ParameterMapping"))
     if mapping is not None and (mapping.get("source") or len(mapping)):  # an empty one maps nothing
         if mapping.get("type", _MAPPING_TYPE) != _MAPPING_TYPE:
             raise SspError(f"{what} in {package.path} has a mapping of the type {mapping.get('type')!r}.")
         entries = _content(mapping, None, "ssm", "ParameterMapping", package, f"the mapping of {what}")
-        values = _mapped(values, _entries(entries, f"{what} in {package.path}"), f"{what} in {package.path}")
-    return ParameterBinding(values, () if units is None else read_units(units))
+        values = _mapped(values, entries, package, f"{what} in {package.path}")
+    return values
 
 
 def _content(element: Any, inline: str | None, kind: str, name: str, package: SspPackage, what: str) -> Any:
@@ -123,31 +100,15 @@ def _detached(element: Any) -> Any:
 
 def _value(parameter: Any, where: str) -> Setting:
     name = parameter.get("name")
-    for kind in ("Real", "Integer", "Boolean", "Enumeration"):
-        item = parameter.find(tag("ssv", kind))
-        if item is None:
-            continue
-        text = item.get("value")
-        value: SettingValue = text
-        if kind == "Real":
-            value = _finite(text, f"the value of {name!r} of {where}")
-        elif kind == "Integer":
-            value = int(text)
-        elif kind == "Boolean":
-            value = text.strip() in ("true", "1")
-        return Setting(value, item.get("unit"))
-    raise SspError(
-        f"{where} gives {name!r} as a text or binary value; only numbers, Booleans and enumerations are set."
-    )
-
-
-def _entries(root: Any, where: str) -> list[_Entry]:
-    found = []
-    for entry in root.findall(tag("ssm", "MappingEntry")):
-        factor, offset = read_transformation(entry, f"the mapping of {entry.get('source')!r} of {where}")
-        convert = not flag(entry, "suppressUnitConversion")
-        found.append(_Entry(entry.get("source"), entry.get("target"), factor, offset, convert))
-    return found
+    item = next(item for kind in VALUE_TYPES if (item := parameter.find(tag("ssv", kind))) is not None)
+    value: SettingValue = item.get("value")
+    if item.tag == tag("ssv", "Real"):
+        value = _finite(item.get("value"), f"the value of {name!r} of {where}")
+    elif item.tag == tag("ssv", "Integer"):
+        value = int(item.get("value"))
+    elif item.tag == tag("ssv", "Boolean"):
+        value = flag(item, "value")
+    return Setting(value, item.get("unit"))
 
 
 def flag(element: Any, name: str) -> bool:
@@ -187,20 +148,23 @@ def _finite(text: str, what: str) -> float:
     return value
 
 
-def _mapped(values: dict[str, Setting], entries: list[_Entry], where: str) -> dict[str, Setting]:
+def _mapped(values: dict[str, Setting], root: Any, package: SspPackage, where: str) -> dict[str, Setting]:
     """Return the values under the names that a mapping gives them; what it does not name is not used."""
     found: dict[str, Setting] = {}
-    for entry in entries:
-        if entry.source not in values:
-            raise SspError(f"{where} maps {entry.source!r}, which is not in its parameter set.")
-        if entry.target in found:
-            raise SspError(f"{where} maps two parameters to {entry.target!r}; keep one of the two.")
-        setting = values[entry.source]
-        if (entry.factor, entry.offset) != (1.0, 0.0):
+    for entry in root.findall(tag("ssm", "MappingEntry")):
+        source, target = entry.get("source"), entry.get("target")
+        factor, offset = read_transformation(entry, f"the mapping of {source!r} of {where}")
+        if source not in values:  # one mapping may serve several sets
+            package.unused.append(target)
+            continue
+        if target in found:
+            raise SspError(f"{where} maps two parameters to {target!r}; keep one of the two.")
+        setting = values[source]
+        if (factor, offset) != (1.0, 0.0):
             if isinstance(setting.value, bool | str):
-                raise SspError(f"{where} scales {entry.source!r}, which is no number.")
-            setting = replace(setting, factor=entry.factor, offset=entry.offset)
-        if not entry.convert_units:
+                raise SspError(f"{where} scales {source!r}, which is no number.")
+            setting = replace(setting, factor=factor, offset=offset)
+        if flag(entry, "suppressUnitConversion"):
             setting = replace(setting, unit=None)
-        found[entry.target] = setting
+        found[target] = setting
     return found

@@ -8,14 +8,13 @@ Of SSP 2.0 the same is read; see `package.in_words_of_1`.
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 from fmu_asset.coupling.structure import (
     Component,
     Connector,
     ConnectorKind,
     Endpoint,
-    Setting,
     SystemStructure,
 )
 from fmu_asset.instances.plan import Interface
@@ -23,7 +22,7 @@ from reporting.files import atomic_write_bytes
 
 from .flatten import flat_connections, flat_settings
 from .package import NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
-from .parameters import alike, flag, read_bindings, read_transformation, read_units
+from .parameters import VALUE_TYPES, flag, read_bindings, read_transformation, read_units
 from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree
 
 _INTERFACES: dict[str, Interface | None] = {
@@ -46,11 +45,14 @@ class SspSystem:
         The connectors of the components, as the file declares them.
     span : (float or None, float or None)
         Start and end of the default experiment [s], where the file says them.
+    unused : tuple of str
+        Names of parameters that are set, but are of no element of the system.
     """
 
     structure: SystemStructure
     declared: dict[Endpoint, DeclaredConnector]
     span: tuple[float | None, float | None] = (None, None)
+    unused: tuple[str, ...] = ()
 
 
 def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> SspSystem:
@@ -76,9 +78,6 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
     package = SspPackage(path)
     root = package.parse(SSD_NAME, "ssd")
     tree = Tree(package)
-    units = root.find(tag("ssd", "Units"))
-    for unit in () if units is None else read_units(units):
-        tree.units[unit.name] = unit
     system = root.find(tag("ssd", "System"))
     _system(tree, system, ())
     names = _names(tree)
@@ -100,15 +99,14 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
         for node, declared in tree.connectors.items()
         if node.path == ()
     )
-    structure = SystemStructure(
-        str(root.get("name")), components, connectors, connections, tuple(tree.units.values())
-    )
+    units = read_units(root, "ssd")
+    structure = SystemStructure(str(root.get("name")), components, connectors, connections, units)
     inner = {
         Endpoint(names[node.path], node.connector): declared
         for node, declared in tree.connectors.items()
         if node.path in names
     }
-    return SspSystem(structure, inner, _span(root))
+    return SspSystem(structure, inner, _span(root), tuple(package.unused))
 
 
 def _span(root: Any) -> tuple[float | None, float | None]:
@@ -120,15 +118,11 @@ def _span(root: Any) -> tuple[float | None, float | None]:
 
 
 def _kind(tree: Tree, node: Node, declared: DeclaredConnector) -> ConnectorKind:
-    if declared.kind == "input":
-        return "input"
-    if declared.kind == "output":
-        return "output"
-    if declared.kind == "parameter":
-        return "parameter"
-    raise tree.error(
-        f"the connector {str(node)!r} of the system is of the kind {declared.kind}, which is not supported."
-    )
+    if declared.kind not in get_args(ConnectorKind):
+        raise tree.error(
+            f"the connector {str(node)!r} of the system is of the kind {declared.kind}, not supported."
+        )
+    return cast("ConnectorKind", declared.kind)
 
 
 # ---------------------------------------------------------------------- the tree
@@ -142,10 +136,7 @@ def _system(tree: Tree, element: Any, path: ElementPath) -> None:
         )
     _connectors(tree, element, path)
     children: set[str] = set()
-    elements = element.find(tag("ssd", "Elements"))
-    for child in () if elements is None else elements:
-        if not isinstance(child.tag, str):
-            continue  # a comment
+    for child in element.iterfind("ssd:Elements/*", NAMESPACES):
         own = str(child.get("name"))
         if own in children:
             raise tree.error(
@@ -190,10 +181,10 @@ def _connectors(tree: Tree, element: Any, path: ElementPath) -> None:
         if node in tree.connectors:
             raise tree.error(f"the connector {str(node)!r} is there twice.")
         kind, unit = None, None
-        for name in ("Real", "Integer", "Boolean", "Enumeration", "String", "Binary"):
+        for name in VALUE_TYPES:
             item = connector.find(tag("ssc", name))
             if item is not None:
-                kind, unit = name, item.get("unit")
+                kind, unit = name, item.get("unit") or None
         if kind == "Binary":
             raise tree.error(f"the connector {str(node)!r} is binary, which is not supported.")
         tree.connectors[node] = DeclaredConnector(str(connector.get("kind")), kind, unit)
@@ -240,41 +231,22 @@ def _connection(tree: Tree, element: Any, path: ElementPath, children: set[str])
 def _bind(tree: Tree, element: Any, path: ElementPath) -> None:
     """Take the parameter bindings of an element; they go before those of the elements inside it."""
     where = f"the element {'.'.join(path) or str(element.get('name'))!r}"
-    own: dict[Node, Setting] = {}
-    for values, units in read_bindings(element, tree.package, where):
-        for unit in units:
-            if not alike(unit, tree.units.setdefault(unit.name, unit)):
-                raise tree.error(f"the unit {unit.name!r} is defined in two ways.")
-        for name, setting in values.items():
-            for node in _nodes_of(tree, name, path, where):
-                if node in own:
-                    raise tree.error(f"{where} sets {str(node)!r} twice; keep one of the two.")
-                own[node] = setting
-    tree.settings |= own
+    for name, setting in read_bindings(element, tree.package, where).items():
+        nodes = _nodes_of(tree, name, path)
+        tree.settings |= dict.fromkeys(nodes, setting)
+        tree.package.unused += [] if nodes else [str(Node(path, name))]
 
 
-def _nodes_of(tree: Tree, name: str, path: ElementPath, where: str) -> list[Node]:
-    """Return the variables of components, or connectors of systems, that a parameter name stands for."""
-    if path in tree.components:
-        return [Node(path, name)]
-    if Node(path, name) in tree.connectors:
-        return [Node(path, name)]
-    owners = [
-        place
-        for place in (*tree.components, *{node.path for node in tree.connectors})
-        if len(place) > len(path)
-        and place[: len(path)] == path
-        and name.startswith(".".join(place[len(path) :]) + ".")
-    ]
-    if not owners:
-        raise tree.error(f"{where} sets {name!r}, which begins with no element and is no connector of it.")
-    owner = max(owners, key=lambda place: len(".".join(place)))
-    node = Node(owner, name[len(".".join(owner[len(path) :])) + 1 :])
-    if owner not in tree.components and node not in tree.connectors:
-        raise tree.error(
-            f"{where} sets {name!r}, but {'.'.join(owner)!r} has no connector {node.connector!r}."
-        )
-    return [node]
+def _nodes_of(tree: Tree, name: str, path: ElementPath) -> list[Node]:
+    """Return the connectors of systems, and the variables that components may have, of a parameter's name."""
+    found = []
+    for place in dict.fromkeys((*tree.components, *(node.path for node in tree.connectors))):
+        before = "".join(f"{step}." for step in place[len(path) :])
+        node = Node(place, name.removeprefix(before))
+        known = place in tree.components or node in tree.connectors
+        if known and place[: len(path)] == path and name.startswith(before):
+            found.append(node)
+    return found
 
 
 def _names(tree: Tree) -> dict[ElementPath, str]:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from fmu_asset.archive.fmu_file import UnitInfo
 from fmu_asset.coupling.structure import Setting
 from fmu_asset.errors import SspError
 from fmu_asset.instances.plan import Interface
@@ -61,8 +60,6 @@ class Tree:
         Where each target of a connection gets its value from.
     settings : dict of Node to Setting
         Values of parameter bindings; those of outer systems have taken the place of inner ones.
-    units : dict of str to UnitInfo
-        Unit definitions.
     """
 
     package: SspPackage
@@ -70,7 +67,6 @@ class Tree:
     connectors: dict[Node, DeclaredConnector] = field(default_factory=dict)
     edges: dict[Node, Edge] = field(default_factory=dict)
     settings: dict[Node, Setting] = field(default_factory=dict)
-    units: dict[str, UnitInfo] = field(default_factory=dict)
 
     def error(self, sentence: str) -> SspError:
         """Return the error that says what is wrong with the system structure."""

@@ -183,14 +183,14 @@ def _type(
     enumerations: dict[str, Mapping[str, int]],
 ) -> None:
     variable = wiring.variable(end)
-    if variable.kind == "Real":
+    if variable.base_type == "Real":
         SubElement(element, tag("ssc", "Real"), {} if unit is None else {"unit": unit})
-    elif variable.kind == "Enumeration":
+    elif variable.base_type == "Enumeration":
         name = f"{end.component}.{variable.name}"
         enumerations[name] = wiring.declared[end.component].items.get(variable.name, {})
         SubElement(element, tag("ssc", "Enumeration"), name=name)
     else:
-        SubElement(element, tag("ssc", variable.kind))
+        SubElement(element, tag("ssc", variable.base_type))
 
 
 def _component(
@@ -284,13 +284,13 @@ def _parameter_set(wiring: Wiring, names: Mapping[Endpoint, str], units: Mapping
         variable = wiring.variable(end)
         parameter = SubElement(holder, tag("ssv", "Parameter"), name=name)
         value = wiring.number(end, setting)
-        if variable.kind == "Real":
+        if variable.base_type == "Real":
             # In the FMU's own unit, so that no conversion stands between the file and the value.
             own = {"unit": variable.unit} if variable.unit in units and variable.unit is not None else {}
             SubElement(parameter, tag("ssv", "Real"), {"value": number(value), **own})
-        elif variable.kind == "Boolean":
+        elif variable.base_type == "Boolean":
             SubElement(parameter, tag("ssv", "Boolean"), value="true" if value else "false")
-        elif variable.kind == "Enumeration":
+        elif variable.base_type == "Enumeration":
             items = wiring.declared[end.component].items.get(variable.name, {})
             item = next((key for key, number_ in items.items() if number_ == int(value)), None)
             if item is None:

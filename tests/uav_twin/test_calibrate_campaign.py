@@ -156,7 +156,7 @@ def test_json_has_the_same_figures(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("[[parameter]]", "[[place]]"), "'place[1].terms' is not a key of a lumped model"),
+        (("[[parameter]]", "[[place]]"), "'place[1].high' are not keys of a lumped model"),
         (('unit = "mm"', 'unit = "m"'), "1000"),
         (("mean = 1.0", "mean = 1.6"), "a factor needs 0 < low <= mean <= high"),
         (('unit = "mm"', 'unit = "N"'), "unit"),

@@ -179,6 +179,7 @@ def test_start_up_is_lazy() -> None:
     code = (
         "import sys, uav_twin.cli\n"
         "heavy = {'numpy', 'scipy', 'skfem', 'pymor', 'fmpy', 'xarray', 'matplotlib', 'numba', 'pydantic'}\n"
+        "heavy |= {'pint', 'openpyxl'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import subprocess
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,11 @@ import pytest
 import xarray as xr
 
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import load_binding
+from fmu_asset.door.binding import load_binding, parse_binding
 from fmu_asset.door.experiment import default_experiment, fly
 from fmu_asset.door.history_file import read_histories
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuInputError
+from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from reporting.progress import SilentProgress
 from tests import command_line
 from tests.command_line import command
@@ -131,6 +132,73 @@ def test_an_fmu_alone(
     ):
         assert flown(monkeypatch, fmu, *wrong) != 0
         assert sentence in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("where", [(), ("--in-process",)], ids=["worker", "in process"])
+def test_structural_parameters_size_the_arrays(
+    foreign_fmu: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    where: tuple[str, ...],
+) -> None:
+    """Each element sums its weight times its input: n of them, set in configuration mode."""
+    fmu, out = foreign_fmu("resize3"), tmp_path / "x.csv"
+    wanted = ("--stop-time", 3, "--step-size", 1, "--out", out, *where)
+    assert flown(monkeypatch, fmu, *wanted, "--set", "n=4", "--set", "u=1,2,0,-1") == 0
+    rows = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
+    assert rows.dtype.names == ("time", "y[1]", "y[2]", "y[3]", "y[4]", "total")
+    assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
+    capsys.readouterr()
+    for wrong, sentence in (
+        (("n=2.5",), "structural_parameters.n must be a whole number, but is 2.5"),
+        (("n=-1",), "n = -1.0 lies outside the range of 'n', 0 to 8"),
+        (("n=9",), "n = 9.0 lies outside the range of 'n', 0 to 8"),
+        (("n=nan",), "structural_parameters.n must be finite"),
+        (("n=1,2",), "structural_parameters.n must be a number, but is [1.0, 2.0]"),
+        (("m=3",), "has no parameter or input 'm' that takes numbers; it has w, u, n"),
+        (("n=3",), "'u' of {} has 3 elements but 2 start values; give all of its values."),
+        (("n=3", "u=1,2"), "control.u takes 3 values, but 2 came"),
+    ):
+        assert flown(monkeypatch, fmu, *wanted[:4], *where, *(w for v in wrong for w in ("--set", v))) != 0
+        error = capsys.readouterr().err
+        assert sentence.format(fmu) in " ".join(error.split())
+        assert "Traceback" not in error
+
+
+def test_structural_parameters_of_a_binding(foreign_fmu: Any) -> None:
+    """They hold after every start, in a state and for an asset beside it; some cannot be taken."""
+    header = {"name": "r", "step_size": 1.0, "structural_parameters": {"n": 3}}
+    content = {
+        "binding": header,
+        "control": {"u": {"variable": "u", "unit": "1"}},
+        "parameter": {"w": {"variable": "w", "unit": "1"}, "one": {"variable": "w[2]", "unit": "1"}},
+        "observation": {"y": {"variables": "y", "unit": "1"}},
+    }
+    with closing(FmiAsset(foreign_fmu("resize3"), parse_binding(content))) as asset:
+        for _ in range(2):
+            asset.reset({"w": [1.0, 1.0, 4.0]}, control={"u": [1.0, 2.0, 3.0]})
+            assert asset.step().values.tolist() == [1.0, 2.0, 12.0]
+        with asset.fork() as other:
+            assert other.step(control={"u": [0.0, 0.0, 1.0]}).values.tolist() == [1.0, 2.0, 16.0]
+        with pytest.raises(FmuFileError, match=r"'w' of .* has 3 elements but 2 start values"):
+            asset.reset({"one": 5.0}, control={"u": [1.0, 2.0, 3.0]})
+        with pytest.raises(FmuFileError, match=r"'u' of .* has 3 elements but 2 start values"):
+            asset.reset({})
+    content["binding"] = {**header, "structural_parameters": {"rows": 3}}
+    with pytest.raises(
+        BindingError,
+        match=r"structural_parameters\.rows of the binding r names 'rows', which is not a variable",
+    ):
+        FmiAsset(foreign_fmu("resize3"), parse_binding(content))
+    huge = foreign_fmu.changed("resize3", "many", ('max="8"', ""))
+    content["binding"] = {**header, "structural_parameters": {"n": 1e9}}
+    with pytest.raises(FmuInputError, match="'y' is an array of 1000000000 elements; 10000000 are the most"):
+        FmiAsset(huge, parse_binding(content))
+    states = '<UInt64 name="n" valueReference="100" causality="structuralParameter" start="2"/>'
+    exchange = foreign_fmu.changed("swing3", "sized", ("</ModelVariables>", f"{states}</ModelVariables>"))
+    with pytest.raises(BindingError, match=r"is run by model exchange; .* in co-simulation only"):
+        FmiAsset(exchange, default_experiment(read_fmu(exchange), values={"n": 3.0}).binding)
 
 
 def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu: Any) -> None:

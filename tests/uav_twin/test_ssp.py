@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -120,6 +121,20 @@ def test_a_system_is_simulated_as_it_lies_there(
     assert "declared as output" in capsys.readouterr().err
     assert call(monkeypatch, *simulate, "--interpolation", "linear") == 1
     assert "asks for linear interpolation of inputs, but no component" in capsys.readouterr().err
+
+
+def test_what_nothing_takes_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], system: Path, tmp_path: Path
+) -> None:
+    end = "</ssm:ParameterMapping>"
+    more = f'<ssm:MappingEntry source="conductance" target="heat_exchanger.fin" />{end}'
+    file = str(changed(system, tmp_path / "more.ssp", **{end: more}))
+    for command in (("check", file), ("simulate", file, "--stop-time", "1", "--in-process")):
+        assert call(monkeypatch, "ssp", *command) == 0
+        said = capsys.readouterr().out
+        assert "warning: nothing in the system has these parameters, not used: heat_exchanger.fin." in said
+    assert call(monkeypatch, "ssp", "check", file, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["unused"] == ["heat_exchanger.fin"]
 
 
 def test_the_words_of_ssp_2_are_read(

@@ -295,10 +295,10 @@ def test_noise_from_repeats_is_the_pooled_deviation(tmp_path: Path) -> None:
 RELEASE = TABLES["release.csv"]
 WRONG_TOML = [
     ("format = 1", "format = 2", r"`format` is 2; this version reads campaigns with `format = 1`\."),
-    ("format = 1", "", "`format` is missing"),
-    ("name = ", "nam = ", r"unknown key `nam`"),
-    ('unit = "microstrain"', 'unit = "mm"', "one of the units 1, microstrain, percent, and 'mm' came"),
-    ('quantity = "strain"', 'quantity = "stress"', r"`channel\[1\].quantity` should be 'strain'"),
+    ("format = 1", "", "'format' is missing"),
+    ("name = ", "nam = ", "'nam' is not a key of a campaign"),
+    ('unit = "microstrain"', 'unit = "mm"', "a unit such as 1, microstrain or percent, and 'mm' came"),
+    ('quantity = "strain"', 'quantity = "stress"', r"channel\[1\].quantity: input should be 'strain'"),
     ('column = "w [mm]"', 'column = "force"', "the column 'force' holds an input"),
     ('column = "w [mm]"', 'column = "g17"', "more than one channel reads the column 'g17'"),
     ('column = "w [mm]"', "", "release.csv of the trial 'release' holds no channel"),
@@ -306,22 +306,22 @@ WRONG_TOML = [
      "channel 'tip' is in no trial: no table has a column 'g'"),
     ('name = "tip"', 'name = "g17"', "more than one channel called 'g17'"),
     ('name = "tip"', 'name = "*"', r"cannot be called '\*'"),
-    ('kind = "flight"', 'kind = "fly"', r"`trial\[3\].kind` should be 'static'"),
+    ('kind = "flight"', 'kind = "fly"', r"trial\[3\].kind: input should be 'static'"),
     ('file = "turn.csv"', 'file = "turns.csv"', "There is no file turns.csv .* noise.csv, release.csv"),
     ('file = "turn.csv"', 'file = "../turn.csv"', "must lie in the campaign's folder"),
-    ("held_out = true", 'held_out = "yes"', "should be a valid boolean, and 'yes' came"),
+    ("held_out = true", 'held_out = "yes"', "true or false is expected, but 'yes' came"),
     ("held_out = true", "left_out = { g17 = [3] }", "leaves out row 3 of 'g17', and turn.csv has 2 rows"),
     ("held_out = true", "left_out = { g18 = [1] }", "names the channel 'g18'"),
     ("held_out = true", 'channels = ["tip"]', r"turn.csv has no column 'w \[mm\]', which the chan"),
     ("held_out = true", "temperature = 21", "gives its temperature twice"),
     ("held_out = true", "health = { z1 = 0.1 }", "gives z1 twice"),
     ("load_place = [1.0, 0.35]", "load_place = [1.0]", r"must be a name or \[y, x\]"),
-    ("release = {", "releases = {", r"unknown key `trial\[2\].releases`"),
-    ('release = { displacement = 50, unit = "mm" }', "", "the ring-down 'release' needs `release`"),
+    ("release = {", "releases = {", r"'trial\[2\].releases' is not a key of a campaign"),
+    ('release = { displacement = 50, unit = "mm" }', "", r"'trial\[2\].release.displacement' is missing"),
     ("displacement = 50", "displacement = 0", "must not be zero: its sign is the side"),
     ("reference_temperature = 20.0", "", "the campaign has no `reference_temperature`"),
     ("standard_deviation = 0.05", "standard_deviation = 0", "should be greater than 0"),
-    ("z1 = 0.2", "z1 = 20", "less than or equal to 1, and 20 came"),
+    ("z1 = 0.2", "z1 = 20", "less than or equal to 1, but 20 came"),
     ("[noise]", "[noise", "is not valid TOML"),
 ]  # fmt: skip
 WRONG_TABLES = [
@@ -446,3 +446,20 @@ def test_uneven_stamps_are_taken_as_they_come(tmp_path: Path, table: str, said: 
     np.testing.assert_array_equal(trial.time, stamps)
     assert not trial.is_even
     assert any(said in remark for remark in campaign.remarks)
+
+
+def test_all_missing_and_all_unknown_keys_are_named_at_once(tmp_path: Path) -> None:
+    toml = (
+        '[[channel]]\nname = "tip"\n[[channel]]\nunit = "mm"\noutput = "x"\nquantity = "displacement"\n'
+        '[[trial]]\nkind = "ringdown"\n'
+    )
+    with pytest.raises(CampaignFileError) as caught:
+        read_campaign(folder_of(tmp_path, toml))
+    assert str(caught.value).endswith(
+        "campaign.toml: 'format', 'name', 'channel[1].quantity', 'channel[1].unit', 'channel[1].output', "
+        "'channel[2].name', 'trial[1].name', 'trial[1].file' and 'trial[1].release.displacement' are missing."
+    )
+    with pytest.raises(
+        CampaignFileError, match=r"'channel\[1\].units' and 'trial\[1\].sort' are not keys of a campaign"
+    ):
+        read_campaign(folder_of(tmp_path, toml.replace('"tip"', '"tip"\nunits = "m"') + 'sort = "a"\n'))

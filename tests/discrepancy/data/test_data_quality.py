@@ -211,6 +211,19 @@ def test_outputs_and_lengths(oscillator, campaign) -> None:
     assert (FaultKind.TOO_SHORT, "") in found(check_against_model(cut(100), oscillator))
     assert found(check_against_model(cut(401), oscillator)) == set()
     assert (FaultKind.UNDERSAMPLED, "") in found(check_against_model(cut(401, 16), oscillator))
+    slow = [fault.sentence for fault in check_against_model(cut(401, 16), oscillator)]
+    assert not any("milliseconds" in sentence for sentence in slow)
+    whole = cut(401)
+    (trial,) = whole.trials
+    in_milliseconds = replace(whole, trials=(replace(trial, time=1e3 * trial.time),))
+    said = [
+        fault.sentence
+        for fault in check_against_model(in_milliseconds, oscillator)
+        if fault.kind is FaultKind.UNDERSAMPLED
+    ]
+    assert len(said) == 1
+    assert "looks like milliseconds" in said[0]
+    assert "sample faster" not in said[0]
 
 
 # ---------------------------------------------------------------- what needs no model

@@ -107,7 +107,11 @@ def test_a_forced_trial_says_what_it_assumes_of_its_begin(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ('unit = "kW"', 'unit = "kN"', "the input 'heater' is heat and must have one of the units W, mW, kW"),
+        (
+            'unit = "kW"',
+            'unit = "kN"',
+            "the unit of 'heater': heat must have a unit such as W, mW or kW, and 'kN'",
+        ),
         ('column = "x"', 'column = "x"\nhold = "linear"', "'table' is a motion, which no drive makes"),
         ('column = "x"', 'column = "plate"', "more than one channel or input reads the column 'plate'"),
         ('column = "x"', 'column = "z1"', "the column 'z1' is reserved"),

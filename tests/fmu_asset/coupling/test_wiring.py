@@ -49,7 +49,10 @@ def link(source: str, target: str, **options: object) -> Connection:
             "wing.load_factor cannot be the source.*declared as input",
         ),
         ([("damage.z1", "wing.strain[1]")], r"wing.strain\[1\] cannot be the target.*declared as output"),
-        ([("push", "wing.young_modulus_factor")], "declared as parameter.*a numeric input is needed"),
+        (
+            [("push", "wing.young_modulus_factor")],
+            "declared as parameter.*a single number is needed as input",
+        ),
         (
             [("damage.z1", "wing.health.z1"), ("damage.z2", "wing.health.z1")],
             "wing.health.z1 has two sources, damage.z1 and damage.z2",
@@ -62,7 +65,7 @@ def link(source: str, target: str, **options: object) -> Connection:
             [("wing.tip_displacement", "wing.load_factor")],
             "is in 'm' and wing.load_factor in '1'.*no conversion",
         ),
-        ([("damage.status", "spring.misbehaviour")], "of the type Enumeration and cannot feed.*Integer"),
+        ([("damage.status", "wing.load_factor")], "of the type Enumeration and cannot feed.*Real"),
     ],
 )
 def test_connections_that_do_not_fit(
@@ -71,6 +74,11 @@ def test_connections_that_do_not_fit(
     with pytest.raises(CouplingError, match=words) as caught:
         Wiring(replace(base, connections=tuple(link(*pair) for pair in connections)))
     assert "\n" not in str(caught.value)
+
+
+def test_enumerations_and_integers_feed_each_other(base: SystemStructure) -> None:
+    joined = Wiring(replace(base, connections=(link("damage.status", "spring.misbehaviour"),)))
+    assert joined.feeds[0].conversion == (1.0, 0.0)
 
 
 def test_ends_and_patterns_that_cannot_be_read() -> None:

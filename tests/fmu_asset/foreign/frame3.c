@@ -13,6 +13,7 @@ HOOK void model_derivatives(Model *m, double *dx) {}
 HOOK void model_event_indicators(Model *m, double *z) {}
 HOOK void model_event(Model *m, int *due, double *time) {}
 HOOK int model_early(Model *m) { return 0; }
+HOOK int model_configure(Model *m, int begins) { return ERROR; }
 HOOK int model_finished(Model *m) { return 0; }
 
 typedef struct { fmi3LogMessageCallback log; fmi3InstanceEnvironment environment; } Messenger;
@@ -130,8 +131,8 @@ NO(GetNumberOfVariableDependencies, fmi3ValueReference vr, size_t *n)
 NO(GetVariableDependencies, fmi3ValueReference d, size_t a[], fmi3ValueReference i[], size_t b[], fmi3DependencyKind k[], size_t n)
 NO(GetDirectionalDerivative, const fmi3ValueReference u[], size_t nu, const fmi3ValueReference k[], size_t nk, const fmi3Float64 s[], size_t ns, fmi3Float64 d[], size_t nd)
 NO(GetAdjointDerivative, const fmi3ValueReference u[], size_t nu, const fmi3ValueReference k[], size_t nk, const fmi3Float64 s[], size_t ns, fmi3Float64 d[], size_t nd)
-fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) { return fmi3Error; }
-fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) { return fmi3Error; }
+fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) { return (fmi3Status)model_configure(M, 1); }
+fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) { return (fmi3Status)model_configure(M, 0); }
 NO(GetIntervalDecimal, VR, fmi3Float64 i[], fmi3IntervalQualifier q[])
 NO(GetIntervalFraction, VR, fmi3UInt64 a[], fmi3UInt64 b[], fmi3IntervalQualifier q[])
 NO(GetShiftDecimal, VR, fmi3Float64 s[])

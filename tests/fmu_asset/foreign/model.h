@@ -21,6 +21,7 @@ enum { OK, WARNING, DISCARD, ERROR, FATAL, PENDING };
 
 void model_start(Model *m);                          /* start values */
 int model_initialise(Model *m);                      /* status */
+int model_configure(Model *m, int begins);           /* FMI 3: configuration mode begins or ends; status */
 int model_input_slope(Model *m, unsigned int reference, double slope); /* status */
 int model_step(Model *m, double time, double size);  /* status */
 void model_outputs(Model *m);                        /* before values are read */

@@ -1,0 +1,345 @@
+"""Tables as laboratories save them: whatever stands in a file is read as meant, asked or refused."""
+
+from __future__ import annotations
+
+import csv
+import io
+import random
+import time
+from datetime import datetime, timedelta
+from datetime import time as clock
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from openpyxl import Workbook
+
+from discrepancy.campaign.importing import Understanding
+from discrepancy.campaign.sheet import Sheet, read_sheet
+from discrepancy.errors import CampaignFileError, DiscrepancyError
+
+ODD = {
+    "title rows, units row, footer with statistics": (
+        "Prüfstand 3;;\nDatum: 12.03.2026;;\nAbtastrate;500;Hz\n\nZeit;Weg;Kraft\nms;mm;kN\n"
+        "0,0;1,5;0,25\n2,0;1,25;0,5\n4,0;-0,5;0,75\nMittelwert;0,75;0,5\nMaximum;1,5;0,75\n".encode("latin-1"),
+        ("Zeit", "Weg", "Kraft"), ("ms", "mm", "kN"), ["0.0 1.5 0.25", "2.0 1.25 0.5", "4.0 -0.5 0.75"],
+    ),
+    "units in heads, byte order mark, micro sign": (
+        "t [s],ε1 (µm/m),F / kN\r\n0.0,12.5,1\r\n0.5,13.5,2\r\n".encode("utf-8-sig"),
+        ("t", "ε1", "F"), ("s", "µm/m", "kN"), ["0.0 12.5 1", "0.5 13.5 2"],
+    ),
+    "micro sign in latin-1": (
+        "t [s];ε [µm/m];T [°C]\n0;1,5;20,1\n1;2,5;20,2\n".replace("ε", "e").encode("latin-1"),
+        ("t", "e", "T"), ("s", "µm/m", "°C"), ["0 1.5 20.1", "1 2.5 20.2"],
+    ),
+    "empty trailing columns and cells": (
+        b"w [mm];F [N];;;\n0,1;0,5;;;\n;1,0;;;\n0,2;;;;\n0,3;1,5;;;\n",
+        ("w", "F"), ("mm", "N"), ["0.1 0.5", " 1.0", "0.2 ", "0.3 1.5"],
+    ),
+    "repeated head": (
+        b"t [s]\tw [mm]\n0\t0.5\n1\t0.6\nt [s]\tw [mm]\n2\t0.7\n\n3\t0.8\n",
+        ("t", "w"), ("s", "mm"), ["0 0.5", "1 0.6", "2 0.7", "3 0.8"],
+    ),
+    "quoted numbers with decimal commas between commas": (
+        b'"Kraft, kN","Weg, mm"\n"0,5","1,25"\n"1,0","2,5"\n',
+        ("Kraft", "Weg"), ("kN", "mm"), ["0.5 1.25", "1.0 2.5"],
+    ),
+    "thousands with points": (
+        b"F [N];w [mm]\n1.234,5;0,5\n12.345,0;1.000\n",
+        ("F", "w"), ("N", "mm"), ["1234.5 0.5", "12345.0 1000"],
+    ),
+    "thousands with commas, in quotes": (
+        b'F [lbf],w [in]\n"1,234.5",0.5\n"12,345",1.5\n',
+        ("F", "w"), ("lbf", "in"), ["1234.5 0.5", "12345 1.5"],
+    ),
+    "thousands with apostrophes and hard blanks": (
+        "F [N];w [mm]\n1'234,5;0,5\n12\u202f345,5;1,5\n".encode(),
+        ("F", "w"), ("N", "mm"), ["1234.5 0.5", "12345.5 1.5"],
+    ),
+    "clock times over midnight, with dates": (
+        b"Zeit;w [mm]\n31.12.2025 23:59:59,5;0,5\n01.01.2026 00:00:00,0;0,6\n01.01.2026 00:00:00,5;0,7\n",
+        ("Zeit", "w"), ("s", "mm"), ["0.0 0.5", "0.5 0.6", "1.0 0.7"],
+    ),
+    "clock times, with dates as ISO has them": (
+        b"Time,w [mm]\n2026-12-03T10:00:00.25,0.5\n2026-12-03 10:01:00.50,0.6\n",
+        ("Time", "w"), ("s", "mm"), ["0.00 0.5", "60.25 0.6"],
+    ),
+    "a comment column, a comment line, exponents, a true minus": (
+        "# t [s];w [mm];Bemerkung\n0;1,5E-3;ok\n# Pause\n1;−2,5e+0;gut, sehr\n".encode(),
+        ("t", "w"), ("s", "mm"), ["0 1.5E-3", "1 -2.5e+0"],
+    ),
+    "an index without a name, one name twice": (
+        b",t [s],w [mm],w [mm]\n0,0.0,1.5,2.5\n1,0.5,3.5,4.5\n",
+        ("column 1", "t", "w", "w 2"), ("", "s", "mm", "mm"), ["0 0.0 1.5 2.5", "1 0.5 3.5 4.5"],
+    ),
+    "separator said, integers, blanks around": (
+        b"sep=;\n F (N) ; w (um) \n 1 ; 2 \n 3 ; 4 \n",
+        ("F", "w"), ("N", "um"), ["1 2", "3 4"],
+    ),
+}  # fmt: skip
+
+
+def text_of(sheet: Sheet) -> list[str]:
+    assert sheet.decimal is not None
+    columns = [sheet.numbers(head, sheet.decimal) for head in sheet.heads]
+    return [" ".join(row) for row in zip(*columns, strict=True)]
+
+
+def sheet_of(folder: Path, content: bytes) -> Sheet:
+    (folder / "odd.csv").write_bytes(content)
+    return read_sheet(folder / "odd.csv")
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_odd_files_are_read_as_they_are_meant(tmp_path: Path, name: str) -> None:
+    content, heads, units, rows = ODD[name]
+    sheet = sheet_of(tmp_path, content)
+    assert (sheet.heads, sheet.units) == (heads, units)
+    assert text_of(sheet) == rows
+
+
+def test_what_is_passed_over_is_told(tmp_path: Path) -> None:
+    sheet = sheet_of(tmp_path, ODD["title rows, units row, footer with statistics"][0])
+    assert sheet.remark == "lines 7 to 9, semicolons between cells; what stands from 10 on is left out"
+    sheet = sheet_of(tmp_path, b"t [s];w [mm];Notiz\n0;0,5;ok\n1;0,6;\n")
+    assert sheet.remark.endswith("; the column 'Notiz' holds no numbers and is left out")
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"t;w\n0;0.5\n1;0,5\n",
+         "decimals with a point ('0.5' in line 2) and with a comma ('0,5' in line 3)"),
+        (b"t;w\n0;0,5\n1;OVL\n2;0,7\n",
+         "line 3: numbers must stand under 't' and the other names, and '1 and"),
+        (b"t,w\n0,1,2,3\n0,2,2,4\n", "line 2: 4 cells came, and the row above names 2 columns"),
+        (b"0;1\n1;2\n", "holds no table"),
+        (b"", "holds no table"),
+        (b"some words\nand more\n", "holds no table"),
+        (b"t;w\n03/12/2026 10:00:00;1\n04/12/2026 10:00:00;2\n", "'03/12/2026 10:00:00' is no time, or has"),
+        (b"t;w\n31.2.2026 10:00:00;1\n1.3.2026 10:00:00;2\n", "line 2: '31.2.2026 10:00:00' is no time"),
+        (b"t;w\n10:00:00;1\n5;2\n", "line 3: '5' is no time, or has a date that can be read"),
+        (b"t;w\n\x00;1\n", "zero byte"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_one_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
+    with pytest.raises(CampaignFileError) as caught:
+        sheet_of(tmp_path, content)
+    assert sentence in str(caught.value)
+    assert "odd.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "decimal"),
+    [
+        (b"F;w\n1,234;5\n2,345;6\n", None),
+        (b'F,w\n"1,234",5\n"2,345",6\n', None),
+        (b"F\tw\n1.234\t5\n", None),
+        (b"F,w\n1.234,5\n", "."),  # what commas stand between has no decimal comma
+        (b"F;w\n1,234;0,5\n", ","),
+        (b"F;w\n1,234;0.5\n", "."),
+        (b"F;w\n0,123;5\n", ","),  # no thousand begins with a nought
+        (b"F;w\n1,234;1.234,5\n", ","),
+        (b"F;w\n1,234e3;5\n", ","),
+    ],
+)
+def test_a_number_of_two_readings_is_not_guessed(tmp_path: Path, content: bytes, decimal: str | None) -> None:
+    sheet = sheet_of(tmp_path, content)
+    assert sheet.decimal == decimal
+    if decimal is None:
+        assert sheet.unclear in ("'1,234' in line 2", "'1.234' in line 2")
+        assert sheet.numbers("F", ",")[0] != sheet.numbers("F", ".")[0]
+
+
+# ---------------------------------------------------------------- any dialect, any damage
+
+_NUMBERS = st.floats(min_value=-1e12, max_value=1e12, allow_nan=False).map(lambda value: round(value, 6))
+_TABLES = st.integers(2, 4).flatmap(
+    lambda width: st.lists(st.lists(_NUMBERS, min_size=width, max_size=width), min_size=1, max_size=12)
+)
+
+
+@given(_TABLES, st.sampled_from([";", ",", "\t"]), st.sampled_from(".,"), st.data())
+@settings(deadline=None, suppress_health_check=list(HealthCheck))
+def test_a_table_comes_back_from_any_dialect(
+    tmp_path_factory: pytest.TempPathFactory,
+    table: list[list[float]],
+    separator: str,
+    mark: str,
+    data: st.DataObject,
+) -> None:
+    grouped = data.draw(st.sampled_from(["", *{".": ",'\u202f", ",": ".'\u202f"}[mark]]))
+
+    def written(value: float) -> str:
+        text = repr(value) if "e" in repr(value) else f"{value:,}".replace(",", "\0")
+        return text.replace(".", mark).replace("\0", grouped)
+
+    stream = io.StringIO()
+    quoting = data.draw(st.sampled_from([csv.QUOTE_MINIMAL, csv.QUOTE_ALL]))
+    writer = csv.writer(
+        stream,
+        delimiter=separator,
+        quoting=quoting,
+        lineterminator=data.draw(st.sampled_from(["\n", "\r\n"])),
+    )
+    heads = [f"c{at} [mm]" for at in range(len(table[0]))]
+    for _ in range(data.draw(st.integers(0, 3))):
+        writer.writerow([data.draw(st.sampled_from(["Versuch", "a; b, c", "", "Prüfer: Müller"]))])
+    writer.writerow(heads)
+    writer.writerows([written(value) for value in row] for row in table)
+    encoding = data.draw(
+        st.sampled_from(["utf-8", "utf-8-sig", "latin-1" if grouped != "\u202f" else "utf-8"])
+    )
+    folder = tmp_path_factory.mktemp("sheet")
+    sheet = sheet_of(folder, stream.getvalue().encode(encoding))
+    assert sheet.decimal in (mark, None)
+    assert sheet.heads == tuple(f"c{at}" for at in range(len(heads)))
+    read = [[float(cell) for cell in sheet.numbers(head, mark)] for head in sheet.heads]
+    assert read == [list(column) for column in zip(*table, strict=True)]
+
+
+def refusal(path: Path) -> str:
+    """Return what is said of a file that becomes no campaign of a force and outputs."""
+    try:
+        sheet = read_sheet(path)
+        first, *others = dict.fromkeys(sheet.heads)
+        columns = {first: "force", **{head: f"output {head}" for head in others}}
+        units = {first: "N", **dict.fromkeys(others, "mm")}
+        said = {"column": columns, "unit": units, "kind": {"": "static"}, "decimal": {"": ","}}
+        Understanding([sheet], said).campaign("fuzz")
+    except DiscrepancyError as error:
+        return str(error)
+    return ""
+
+
+def test_300_damaged_files_are_read_or_refused_in_one_sentence(tmp_path: Path) -> None:
+    rng = random.Random(7)
+    pieces = [
+        b"",
+        b";",
+        b",",
+        b"\t",
+        b'"',
+        b"\n",
+        b"\r",
+        b"nan",
+        b"1e999",
+        b"\xff",
+        b"[",
+        b"(" * 50,
+        b"9" * 400,
+        b"=",
+        b"#",
+        b":",
+        b"31.2.26 1:2:3",
+    ]
+    started, outcomes = time.monotonic(), set()
+    for content, *_ in [*ODD.values()] * 22:
+        damaged = bytearray(content)
+        for _ in range(rng.randint(1, 6)):
+            at, until = sorted(rng.randrange(len(damaged) + 1) for _ in range(2))
+            damaged[at : min(until, at + 9)] = rng.choice(pieces)
+        (tmp_path / "odd.csv").write_bytes(bytes(damaged))
+        said = refusal(tmp_path / "odd.csv")
+        outcomes.add("refused" if said else "read")
+        assert "\n" not in said
+        assert said.endswith(".") or not said
+    assert outcomes == {"read", "refused"}
+    assert time.monotonic() - started < 30.0
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"(" * 200_000,
+        b"a" * 200_000,
+        b"1" * 200_000,
+        b"a [" + b"m " * 90_000 + b"];b\n1;2\n",
+        b"1," * 100_000,
+        b'"' * 99_999,
+    ],
+)
+def test_long_lines_take_no_long_time(tmp_path: Path, content: bytes) -> None:
+    started = time.monotonic()
+    with pytest.raises(CampaignFileError):
+        sheet_of(tmp_path, content + b"\n" + content)
+    assert time.monotonic() - started < 10.0
+
+
+# ---------------------------------------------------------------- Excel
+
+
+def book_of(folder: Path, rows: list[list[object]], **more: list[list[object]]) -> Path:
+    book = Workbook()
+    for title, found in {"Messung": rows, **more}.items():
+        sheet = book.active if title == "Messung" else book.create_sheet(title)
+        assert sheet is not None
+        sheet.title = title
+        for row in found:
+            sheet.append(row)
+    book.save(folder / "lab.xlsx")
+    return folder / "lab.xlsx"
+
+
+ROWS: list[list[object]] = [
+    ["Prüfstand 3"],
+    [],
+    ["Zeit", "Weg [mm]", "Notiz"],
+    [datetime(2026, 3, 12, 10, 0, 0), 1.234, "ok"],
+    [datetime(2026, 3, 12, 10, 0, 0, 500_000), 5, None],
+    ["Mittel", 3.1, None],
+]
+
+
+def test_an_excel_workbook(tmp_path: Path) -> None:
+    sheet = read_sheet(book_of(tmp_path, ROWS))
+    assert (sheet.name, sheet.heads, sheet.units) == ("lab.xlsx", ("Zeit", "Weg"), ("s", "mm"))
+    assert text_of(sheet) == ["0 1.234", "0.500000 5"]  # typed numbers are in no doubt
+    assert sheet.remark.startswith("rows 4 to 5; the column 'Notiz'") or "rows 4 to 5" in sheet.remark
+
+
+def test_times_of_excel(tmp_path: Path) -> None:
+    of_day = [["t", "w [mm]"], [clock(10, 0, 0), 1], [clock(10, 0, 2), 2]]
+    assert text_of(read_sheet(book_of(tmp_path, of_day))) == ["0 1", "2 2"]
+    lasting = [["t", "w [mm]"], [timedelta(seconds=1.5), 1], [timedelta(hours=30, seconds=2), 2]]
+    sheet = read_sheet(book_of(tmp_path, lasting))
+    assert [float(cell) for cell in sheet.numbers("t", ".")] == [0.0, 108000.5]
+
+
+def test_texts_in_excel_cells_are_read_like_those_of_a_file(tmp_path: Path) -> None:
+    rows = [["t [s]", "w [mm]"], [0.125, "1,5"], [1.125, "2,5"]]
+    assert text_of(read_sheet(book_of(tmp_path, rows))) == ["0.125 1.5", "1.125 2.5"]
+
+
+def test_true_and_false_are_no_numbers(tmp_path: Path) -> None:
+    rows = [["t [s]", "w [mm]", "ok"], [0.125, 1.5, True], [1.125, 2.5, False]]
+    assert read_sheet(book_of(tmp_path, rows)).heads == ("t", "w")
+
+
+def test_one_of_several_sheets(tmp_path: Path) -> None:
+    path = book_of(tmp_path, ROWS, Ruhe=[["Zeit [s]", "Weg [mm]"], [0, 0.5], [1, 0.25]])
+    with pytest.raises(CampaignFileError, match=r"has the sheets Messung, Ruhe: say which as lab.xlsx#SHEET"):
+        read_sheet(path)
+    assert text_of(read_sheet(Path(f"{path}#Ruhe"))) == ["0 0.5", "1 0.25"]
+    with pytest.raises(CampaignFileError, match="say which as"):
+        read_sheet(Path(f"{path}#Ruh"))
+
+
+def test_damaged_workbooks_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    path = book_of(tmp_path, ROWS)
+    whole = path.read_bytes()
+    rng = random.Random(3)
+    for number in range(40):
+        content = bytearray(whole[: rng.randrange(len(whole))] if number % 4 == 0 else whole)
+        for _ in range(rng.randint(1, 20)):
+            if content:
+                content[rng.randrange(len(content))] = rng.randrange(256)
+        path.write_bytes(content)
+        said = refusal(path)
+        assert "\n" not in said
+        assert "lab" in said or not said
+    path.write_text("no workbook", "utf-8")
+    with pytest.raises(CampaignFileError, match="cannot be read as an Excel workbook"):
+        read_sheet(path)

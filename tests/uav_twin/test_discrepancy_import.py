@@ -1,0 +1,327 @@
+"""`uav-twin discrepancy import` as a laboratory calls it, with a terminal and without."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import shlex
+import subprocess
+import sys
+import time
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from openpyxl import Workbook
+
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign, TrialKind
+from discrepancy.model_choice import choose_model
+from discrepancy.sources.examples import example_campaign, plan_for
+from tests.command_line import command
+
+MODEL = "single_mass_rig"
+COLUMNS = ("--column", "Weg=displacement", "--column", "Dehnung=leaf_strain")
+
+
+def call(*words: object) -> subprocess.CompletedProcess[str]:
+    return command("discrepancy", "import", *words)
+
+
+def laboratory(folder: Path) -> Campaign:
+    """Return a simulated campaign, its trials written as a laboratory's programme writes them."""
+    model = choose_model(MODEL).model
+    plan = plan_for(model, ("displacement", "leaf_strain"), model.description.input[0].name)  # type: ignore[attr-defined]
+    campaign = example_campaign(model, "laboratory", 1, plan)
+
+    def german(values: np.ndarray, power: int) -> list[str]:
+        return [str(Decimal(repr(value)).scaleb(power)).replace(".", ",") for value in values.tolist()]
+
+    for trial in campaign.trials:
+        still = trial.kind is TrialKind.STATIC
+        lead = german(trial.force, -3) if still else german(trial.time, 3)
+        head = f"Versuch {trial.name};;\n\n{'Kraft;Weg;Dehnung' if still else 'Zeit;Weg;Dehnung'}\n"
+        head += "kN;mm;µm/m\n" if still else "ms;mm;µm/m\n"
+        columns = (lead, german(trial.values[:, 0], 3), german(trial.values[:, 1], 6))
+        rows = "".join(";".join(row) + "\n" for row in zip(*columns, strict=True))
+        text = f"{head}{rows}Mittelwert;1,0;2,0\n"
+        (folder / f"{trial.name}.csv").write_bytes(text.encode("latin-1"))
+    return campaign
+
+
+def test_a_folder_of_files_becomes_the_campaign_to_the_last_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = laboratory(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    files = [f"{trial.name}.csv" for trial in campaign.trials]
+    kinds = [f"{trial.name}.csv={trial.kind.value}" for trial in campaign.trials]
+    releases = [f"{t.name}.csv={1e3 * t.release.displacement!r}mm" for t in campaign.trials if t.release]
+    options = [word for kind in kinds for word in ("--kind", kind)]
+    options += [word for release in releases for word in ("--release", release)]
+    done = call(*files, *options, *COLUMNS, "--out", "lab", "--load-place", "mass", "--model", MODEL)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "release 1.csv: ringdown; lines 5 to" in done.stdout
+    assert "semicolons between cells; what stands from" in done.stdout
+    assert "Next: uav-twin discrepancy check lab --model single_mass_rig" in done.stdout
+    read = read_campaign("lab")
+    assert [trial.name for trial in read.trials] == [trial.name for trial in campaign.trials]
+    for ours, theirs in zip(read.trials, campaign.trials, strict=True):
+        assert ours.kind is theirs.kind
+        for name in ("values", "time", "force"):
+            if name != "time" or ours.is_dynamic:
+                np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+        assert ours.load_place == "mass"
+        if theirs.release is not None:
+            assert ours.release is not None
+            assert ours.release.displacement == pytest.approx(theirs.release.displacement, rel=1e-15)
+    origin = next(remark for remark in read.remarks if "release 1.csv" in remark)
+    assert "Imported from release 1.csv (SHA-256 " in origin
+    assert "'Zeit' [ms] is time, 'Weg' [mm] is displacement and 'Dehnung' [µm/m] is leaf_strain" in origin
+    toml = Path("lab/campaign.toml").read_text("utf-8")
+    assert 'unit = "m"' in toml
+    assert 'unit = "1"' in toml
+    checked = command("discrepancy", "check", "lab", "--model", MODEL)
+    assert checked.returncode == 0, checked.stderr
+    # a second time nothing is touched
+    again = call(*files, *options, *COLUMNS, "--out", "lab")
+    assert (again.returncode, "not empty" in again.stderr) == (1, True)
+
+
+TWO = {
+    "pull.csv": b"F;Weg;Temp [K];U [V];q\n1;1,234;293;0;5\n2;2,345;293;1;5\n",
+    "swing.csv": b"t [ms];Weg\n" + b"".join(b"%d;%d,000\n" % (2 * k, k % 7 + 1) for k in range(9)),
+}
+
+
+def test_everything_that_is_not_said_is_named_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, content in TWO.items():
+        Path(name).write_bytes(content)
+    done = call(*TWO, "--kind", "swing.csv=ringdown")
+    assert done.returncode == 1
+    sentence = done.stderr.strip()
+    assert "\n" not in sentence
+    for part in (
+        "13 answers are missing, and nothing was written",
+        "--kind NAME=... for 'pull.csv' (static, ringdown, forced, driven, flight or noise)",
+        "--decimal NAME=... for 'pull.csv' (. or ,: '1,234' in line 2 can be read as both)",
+        "--decimal NAME=... for 'swing.csv' (. or ,: '1,000' in line 2 can be read as both)",
+        "--column NAME=... for 'F', 'Weg', 'Temp', 'U' and 'q' (the model's output",
+        "--unit NAME=... for 'F', 'Weg' and 'q' (such as mm, kN or ms",
+        "--quantity NAME=... for 'U' (signal or voltage: V is a unit of each)",
+        "--release NAME=... for 'swing.csv' (how far the point was held",
+    ):
+        assert part in sentence
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(TWO)
+    columns = [
+        word for item in ("Weg=x", "F=force", "q=-", "Temp=-", "U=bridge") for word in ("--column", item)
+    ]
+    units = ("--quantity", "U=signal", "--unit", "F=kgf", "--unit", "Weg=in", "--release", "-0.5in")
+    given = (*columns, *units, "--kind", "pull.csv=static", "--decimal", ",")
+    done = call(*TWO, "--kind", "swing.csv=ringdown", *given, "--out", "lab")
+    assert done.returncode == 0, done.stderr
+    read = read_campaign("lab")
+    assert read.trials[0].force.tolist() == [9.80665, 2 * 9.80665]
+    assert read.trials[0].values[0].tolist() == [1.234 * 0.0254, 0.0]
+    assert read.trials[1].time.tolist()[1] == 0.002
+    assert read.trials[1].release is not None
+    assert read.trials[1].release.displacement == -0.0127
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--kind", "fly"),
+         "--kind must be static, ringdown, forced, driven, flight or noise, and 'fly' came"),
+        (("--kind", "pul.csv=static"), "--kind must be NAME=... about 'pull.csv', and 'pul.csv' came"),
+        (("--unit", "Weg"), "--unit must be NAME=... about 'F', 'Weg', 'Temp', 'U' or 'q', and '' came"),
+        (("--unit", "Weg=kg"), "pull.csv, column 'Weg': 'kg' is no unit of a quantity that is measured here"),
+        (("--unit", "F=mm", "--column", "F=force"),
+         "column 'F': force must have a unit such as N, mN or kN, and 'mm' came"),
+        (("--column", "Temp=temperature"), "column 'Temp': a temperature must be in degC, and 'K' came"),
+        (("--quantity", "U=tension", "--column", "U=u"), "a quantity is strain, displacement"),
+        (("--quantity", "U=strain", "--column", "U=u"),
+         "column 'U': strain must have a unit such as 1, microstrain or percent"),
+        (("--kind", "ringdown", "--release", "1,5 mm"),
+         "--release must be a length or a voltage such as 15.5mm, and '1,5 mm' came"),
+        (("--column", "Weg=y", "--unit", "Weg=mm", "--model", MODEL),
+         "column 'Weg': the model has no output 'y'"),
+        (
+            ("--column", "Temp=temperature", "--unit", "Temp=°C", "--reference-temperature", "warm"),
+            "--reference-temperature must be in degC, and 'warm' came",
+        ),
+        (("--decimal", "x"), "--decimal must be . or ,, and 'x' came"),
+        (("--out", "."), ". exists and is not empty"),
+    ],
+)  # fmt: skip
+def test_an_answer_that_does_not_fit_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], sentence: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("pull.csv").write_bytes(TWO["pull.csv"])
+    done = call("pull.csv", *options)
+    assert done.returncode == 1
+    assert sentence in done.stderr
+    assert "\n" not in done.stderr.strip()
+    assert [path.name for path in tmp_path.iterdir()] == ["pull.csv"]
+
+
+def test_faults_of_the_data_name_the_laboratory_s_own_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rows = "".join(f"{t};1,5\n" for t in (0, 2, 4, 6, 5, 8, 10, 12, 14))
+    Path("a.csv").write_text(f"Versuch\n\nt [ms];Weg [mm]\n{rows}", "utf-8")
+    done = call("a.csv", "--kind", "driven", "--column", "Weg=x")
+    assert done.returncode == 1
+    assert "a.csv: the time of the trial 'a' does not increase after sample 4" in done.stderr
+    Path("b.csv").write_text("F [N];Weg [mm]\n1;0,5\n;0,75\n3;0,8\n", "utf-8")
+    done = call("b.csv", "--kind", "static", "--column", "Weg=x")
+    assert "b.csv, line 3" in done.stderr
+    assert not Path("a").exists()
+    assert not Path("b").exists()
+
+
+def test_samples_at_rest_inputs_and_temperatures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    rest = "".join(f"{k / 100},{(k * 7) % 11 - 5},20\n" for k in range(40))
+    Path("rest.csv").write_text(f"time [s],x [um],temperature [degC]\n{rest}", "utf-8")
+    moved = "".join(f"{k / 100},{k % 5},{k},{20 + k / 8}\n" for k in range(16))
+    Path("moved.csv").write_text(f"time [s],x [um],Motor [mA],temperature [°C]\n{moved}", "utf-8")
+    done = call(
+        "rest.csv", "moved.csv", "--kind", "rest.csv=noise", "--kind", "moved.csv=driven", "--column", "x=x",
+        "--column", "Motor=input:current", "--reference-temperature", "20", "--out", "lab",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    read = read_campaign("lab")
+    noise = read.channels["x"].noise
+    assert noise is not None
+    assert noise.samples is not None
+    assert noise.interval == pytest.approx(0.01)
+    (trial,) = read.trials
+    assert [item.name for item in trial.inputs] == ["current"]
+    assert trial.inputs[0].values[3] == 3e-3
+    assert trial.temperature[8] == 1.0
+
+
+def test_a_force_is_no_input_of_a_driven_trial_unless_it_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rows = "".join(f"{k / 100},{k % 5},{k}\n" for k in range(16))
+    Path("push.csv").write_text(f"time [s],force [N],x [mm]\n{rows}", "utf-8")
+    done = call("push.csv", "--kind", "driven", "--column", "x=x")
+    assert "1 answer is missing" in done.stderr
+    assert "--column NAME=... for 'force'" in done.stderr
+    done = call("push.csv", "--kind", "driven", "--column", "x=x", "--column", "force=force")
+    assert "a driven trial has input:NAME in the place of force" in done.stderr
+    done = call(
+        "push.csv", "--kind", "driven", "--column", "x=x", "--column", "force=input:force", "--out", "a"
+    )
+    assert done.returncode == 0, done.stderr
+    assert read_campaign("a").trials[0].inputs[0].values[3] == 3.0
+    done = call("push.csv", "--kind", "ringdown", "--column", "x=x", "--release", "1mm", "--out", "b")
+    assert done.returncode == 0, done.stderr
+    assert read_campaign("b").trials[0].force.tolist() == [0.0] * 16
+
+
+def test_the_sheets_of_a_workbook_are_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    book = Workbook()
+    for number in (1, 2):
+        sheet = book.create_sheet(f"pull {number}")
+        for row in (["F [lbf]", "w [in]"], [0, 0.0], [1, 0.5 * number], [2, 1.0]):
+            sheet.append(row)
+    book.save("lab.xlsx")
+    sheets = ("lab.xlsx#pull 1", "lab.xlsx#pull 2")
+    done = call(*sheets, "--kind", "static", "--column", "w=tip", "--out", "out")
+    assert (done.returncode, done.stderr) == (0, "")
+    read = read_campaign("out")
+    assert [trial.name for trial in read.trials] == ["pull 1", "pull 2"]
+    assert read.trials[1].values[:, 0].tolist() == [0.0, 0.0254, 0.0254]
+    assert read.trials[0].force.tolist() == [0.0, 4.4482216152605, 8.896443230521]
+    assert "Imported from lab.xlsx#pull 2 (SHA-256 " in read.remarks[1]
+
+
+def test_two_files_of_one_name_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("a", "b"):
+        Path(folder).mkdir()
+        (Path(folder) / "pull.csv").write_bytes(TWO["pull.csv"])
+    done = call("a/pull.csv", "b/pull.csv", "--kind", "static")
+    assert (done.returncode, "Two files have one name" in done.stderr) == (1, True)
+
+
+def test_the_documented_files_print_the_documented_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "laboratory_files.md").read_text("utf-8")
+    blocks = re.findall(r"^```\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    loading, release, asked, given, written = blocks[:5]
+    monkeypatch.chdir(tmp_path)
+    Path("loading.csv").write_text(loading, "utf-8-sig")
+    Path("release.csv").write_bytes(release.encode("latin-1"))
+    for block in (asked, given):
+        line, _, screen = block.replace("\\\n", "").partition("\n")
+        done = command(*shlex.split(line)[1:])
+        said = [row.rstrip() for row in (done.stdout + done.stderr).splitlines() if row.strip()]
+        assert [row.rstrip() for row in screen.splitlines() if row.strip()] == said
+    assert Path("lab/02_release.csv").read_text("utf-8").startswith(written.rpartition("...")[0])
+
+
+# ---------------------------------------------------------------- a terminal
+
+
+def in_a_terminal(folder: Path, answers: list[str], *words: str) -> tuple[int, str]:
+    """Return exit code and screen of the command, its questions answered one after the other."""
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "uav_twin", "discrepancy", "import", *words],
+        stdin=slave, stdout=slave, stderr=slave, cwd=folder,
+        env={**os.environ, "TERM": "dumb", "COLUMNS": "160"},
+    )  # fmt: skip
+    os.close(slave)
+    screen, until, left = "", time.monotonic() + 120.0, list(answers)
+    try:
+        while time.monotonic() < until:
+            ready, _, _ = select.select([master], [], [], 0.2)
+            if ready:
+                try:
+                    screen += os.read(master, 65536).decode("utf-8")
+                except OSError:  # the other end is closed
+                    break
+            elif left and screen.rstrip(" ").endswith(":") and screen.endswith(": "):
+                os.write(master, (left.pop(0) + "\n").encode())
+            elif process.poll() is not None:
+                break
+        return process.wait(10.0), screen.replace("\r\n", "\n")
+    finally:
+        process.kill()
+        os.close(master)
+
+
+def test_a_terminal_is_asked(tmp_path: Path) -> None:
+    (tmp_path / "swing.csv").write_bytes(TWO["swing.csv"])
+    answers = ["swinging", "ringdown", ",", "tip", "miles per hour", "mm", "12 mm", "y"]
+    code, screen = in_a_terminal(tmp_path, answers, "swing.csv", "--out", "lab")
+    assert code == 0, screen
+    assert "--kind must be static, ringdown, forced, driven, flight or noise, and 'swinging' came." in screen
+    assert "Write lab?" in screen
+    read = read_campaign(tmp_path / "lab")
+    assert read.trials[0].values[1, 0] == 2e-3
+    assert read.trials[0].release is not None
+    assert read.trials[0].release.displacement == 0.012
+
+
+def test_a_no_writes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "swing.csv").write_bytes(TWO["swing.csv"])
+    code, screen = in_a_terminal(tmp_path, ["ringdown", ",", "tip", "mm", "12 mm", "n"], "swing.csv")
+    assert code == 1, screen
+    assert "Nothing was written." in screen
+    assert [path.name for path in tmp_path.iterdir()] == ["swing.csv"]
