@@ -21,6 +21,7 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.errors import ModelError
+from discrepancy.models.input_course import Course
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.sensing import observe
@@ -250,7 +251,12 @@ def _motion(
             )
         else:
             motion = system.forced(
-                row, force, trial.time, laws, clock=conditions.clock, refinement=refinement
+                row,
+                Course.of(trial.time, force, trial.hold),
+                trial.time,
+                laws,
+                clock=conditions.clock,
+                refinement=refinement,
             )
         response = motion.response(rows, [Quantity.DISPLACEMENT] * len(rows))
         return response.values, response.rates, behind * force

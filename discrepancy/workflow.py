@@ -357,11 +357,11 @@ def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> t
             rows.append(NotFitted(effect.identifier, unavailable))
         elif effect.identifier not in fitted:
             gain = search.promised.get(effect.identifier, nan)
-            why = (
-                "less promising than others on the beginnings of the records"
-                if isnan(gain)
-                else f"screened out: {gain:.1f} nat at most beside the model as it is"
-            )
+            why = f"screened out: {gain:.1f} nat at most beside the model as it is"
+            if effect.identifier in search.problem.refusals and not 0.0 < gain < SEARCH.worth_fitting:
+                why = f"could not be fitted: {search.problem.refusals[effect.identifier]}"
+            elif isnan(gain):
+                why = "less promising than others on the beginnings of the records"
             rows.append(NotFitted(effect.identifier, why, gain))
     return tuple(rows)
 

@@ -224,14 +224,12 @@ def _trial(
         begins=section.begins or Start.SETTLED,
         inputs=inputs,
         file=section.file,
+        hold=section.hold,
     )
 
 
 def _inputs(
-    section: TrialSection,
-    table: TextTable,
-    campaign: CampaignSection,
-    user: str,
+    section: TrialSection, table: TextTable, campaign: CampaignSection, user: str
 ) -> tuple[RecordedInput, ...]:
     """Return the recorded inputs of a driven or static trial: those whose columns are there."""
     if section.kind not in (TrialKind.DRIVEN, TrialKind.STATIC):

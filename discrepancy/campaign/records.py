@@ -97,8 +97,8 @@ class RecordedInput:
         What it is.
     values : (N,) ndarray
         At the samples [SI].
-    hold : Hold
-        Between them.
+    hold : Hold or None
+        Between them; None: nobody said it, and it is taken as linear.
     offset_deviation : float
         Prior standard deviation of a constant that the record lacks in this trial [SI]; zero: none.
     unit : str
@@ -108,7 +108,7 @@ class RecordedInput:
     name: str
     quantity: Quantity
     values: FloatArray
-    hold: Hold = Hold.LINEAR
+    hold: Hold | None = None
     offset_deviation: float = 0.0
     unit: str = field(default="", compare=False)
 
@@ -278,6 +278,8 @@ class Trial:
     inputs : tuple of RecordedInput
         Driven trials: what acted. `force` is then the first force or torque among them, or zero. Static
         trials: what was held in each row beside the force.
+    hold : Hold or None
+        Forced trials: as that of an input, for the force.
     file : str
         That holds it; empty where there is none.
     """
@@ -301,6 +303,7 @@ class Trial:
     noise_factor: float = 1.0
     begins: Start = Start.SETTLED
     inputs: tuple[RecordedInput, ...] = ()
+    hold: Hold | None = None
     file: str = field(default="", compare=False)
 
     @property

@@ -122,10 +122,9 @@ class InputSection(ColumnSection):
         return self
 
     @property
-    def holds(self) -> Hold:
-        """What it does between its samples: a motion is smooth, the rest linear unless it is said."""
-        moved = self.quantity.moving and not self.reference
-        return self.hold or (Hold.SMOOTH if moved else Hold.LINEAR)
+    def holds(self) -> Hold | None:
+        """What it does between its samples: a motion is smooth, of the rest it is said or not."""
+        return Hold.SMOOTH if self.quantity.moving and not self.reference else self.hold
 
 
 class ReleaseSection(Section):
@@ -171,6 +170,7 @@ class TrialSection(Section):
     channels: tuple[Name, ...] | None = None
     left_out: dict[str, tuple[Annotated[int, Field(ge=1)], ...]] = Field(default_factory=dict)
     begins: Start | None = Field(default=None, strict=False)
+    hold: Hold | None = Field(default=None, strict=False)
 
     @model_validator(mode="before")
     @classmethod
@@ -213,6 +213,11 @@ class TrialSection(Section):
             raise ValueError(
                 f"the trial {self.name!r} is {self.kind.value}, and `begins` is for forced and driven ones; "
                 "a ring-down says it by its `release`"
+            )
+        if self.hold is not None and self.kind is not TrialKind.FORCED:
+            raise ValueError(
+                f"the trial {self.name!r} is {self.kind.value}, and its `hold` is for the force of a forced "
+                "one: say that of a driven one in its [[input]]"
             )
         return self
 

@@ -229,7 +229,7 @@ def _trial(trial: Trial, file: str, order: list[str]) -> dict[str, Any]:
         "held_out": trial.held_out or None,
         "noise_factor": None if trial.noise_factor == 1.0 else trial.noise_factor,
         "start": trial.start if trial.start or not trial.is_dynamic else None,
-        "begins": trial.begins if said else None,
+        "begins": trial.begins if said else None, "hold": trial.hold,
         "load_place": None if trial.load_place == "tip_load" else trial.load_place,
         "channels": None if in_order else trial.channels,
         "left_out": left_out if any(left_out.values()) else None,

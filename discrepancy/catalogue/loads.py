@@ -137,7 +137,7 @@ INERTIA_RELIEF = Effect(
     ),
     build=_inertia_relief,
     unavailable=needs(trial_of(FLIGHT), carried(InertiaRelief)),
-    confusable=("washout", "root_compliance"),
+    confusable=("washout", "root_compliance", "point_mass"),
 )
 
 EFFECTS = (LOAD_PLACE, LOAD_CELL, WASHOUT, INERTIA_RELIEF)

@@ -16,6 +16,8 @@ from discrepancy.catalogue.building import (
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, ModulusTemperature, PointMass, RootCompliance
 
+ACCELERATED = DYNAMIC | {TrialKind.FLIGHT}
+"""Trials in which a mass acts: by its inertia, in flight by its weight times the load factor."""
 LARGEST_LOSS = 0.9
 """Stiffness losses beyond this are built as this: a section without stiffness is no wing."""
 
@@ -46,9 +48,10 @@ POINT_MASS = Effect(
     name="unmodelled point mass",
     family="mass at a free place",
     equation="M -> M + m delta(y - y_m), m = mu m_1",
-    signature="Frequencies fall by phi_r(y_m)^2 m / (2 m_r) each; the static response stays as it is.",
+    signature="Frequencies fall by phi_r(y_m)^2 m / (2 m_r) each; in flight n m g relieves the lift inboard "
+    "of it; the static response stays as it is.",
     reference="Blevins 1979, Formulas for Natural Frequency and Mode Shape",
-    acts_on=DYNAMIC | {TrialKind.FLIGHT},
+    acts_on=ACCELERATED,
     parameters=(
         EffectParameter(
             "mass_ratio",
@@ -68,8 +71,14 @@ POINT_MASS = Effect(
         ),
     ),
     build=_point_mass,
-    unavailable=needs(trial_of(DYNAMIC), carried(PointMass), has_stations),
-    confusable=("root_compliance", "clock_error", "stiffness_drift", "local_stiffness_loss"),
+    unavailable=needs(trial_of(ACCELERATED), carried(PointMass), has_stations),
+    confusable=(
+        "root_compliance",
+        "clock_error",
+        "stiffness_drift",
+        "local_stiffness_loss",
+        "inertia_relief",
+    ),
 )
 
 ROOT_COMPLIANCE = Effect(

@@ -16,17 +16,18 @@ MATTERS = 0.3
 def hold_sentence(campaign: Campaign, model: Model, trial: Trial, conditions: Conditions) -> str | None:
     """Return what to say where straight lines and curves between an input's samples are not the same.
 
-    None if no channel with a noise record sees a difference, or no input is read as straight lines.
+    None if no channel with a noise record sees a difference, or of every input it is said what it did.
     """
-    straight = [item.name for item in trial.inputs if item.hold is Hold.LINEAR]
-    if trial.kind is not TrialKind.DRIVEN or not straight or len(trial.time) < 4:
+    forced = trial.kind is TrialKind.FORCED and trial.hold is None
+    straight = ["force"] if forced else [item.name for item in trial.inputs if item.hold is None]
+    if trial.kind not in (TrialKind.FORCED, TrialKind.DRIVEN) or not straight or len(trial.time) < 4:
         return None
     curved = tuple(
         replace(item, hold=Hold.SMOOTH) if item.name in straight else item for item in trial.inputs
     )
     one, other = (
         observe(model, campaign, item, ModelPatch(), conditions).values
-        for item in (trial, replace(trial, inputs=curved))
+        for item in (trial, replace(trial, inputs=curved, hold=Hold.SMOOTH if forced else trial.hold))
     )
     worst, where = 0.0, ""
     for column, name in enumerate(trial.channels):
@@ -42,5 +43,6 @@ def hold_sentence(campaign: Campaign, model: Model, trial: Trial, conditions: Co
     return (
         f"In the trial {trial.name!r} straight lines and curves between the samples of {names} differ by "
         f"{worst:.2g} noise deviations (rms) in {where!r}: say what it did, hold = "
-        '"smooth" or "zero_order", or record it faster.'
+        f'"smooth", "zero_order" or "linear" in its {"[[trial]]" if forced else "[[input]]"}, or record it '
+        "faster."
     )

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from discrepancy.errors import FitError, ModelError
+from discrepancy.errors import DiscrepancyError, FitError
 
 from .candidate import Candidate
+from .cholesky import Cholesky, finite
 from .derivatives import TrialDerivatives
 from .linearisation import Base, Linearisation, Point
 from .problem import Problem
@@ -147,6 +147,7 @@ def trial_block(
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a step too long, which is taken back
 def fit(
     problem: Problem,
     candidate: Candidate,
@@ -182,7 +183,7 @@ def fit(
     Raises
     ------
     FitError
-        If the model gives numbers that are not finite at the start.
+        If the model gives numbers that are not finite at the start, or none of which a curvature can be made.
     """
     # without evidence the step needs a direction only: one side is half the work
     descent = _Descent(problem, candidate, base, local_only, central=evidence)
@@ -232,10 +233,11 @@ def fit(
 
 
 def attempt(problem: Problem, candidate: Candidate, start: Point, **options: Any) -> CandidateFit | None:
-    """Return what `fit` does, or None where the structure cannot carry what the fit comes to."""
+    """Return what `fit` does, or None where the candidate cannot be what the fit comes to; why, is kept."""
     try:
         return fit(problem, candidate, start, **options)
-    except (FitError, ModelError):
+    except DiscrepancyError as cause:
+        problem.refused(candidate, cause)
         return None
 
 
@@ -279,12 +281,11 @@ class _Descent:
         parts: list[Linearisation] = []
         residuals, responses = [], []
         for number in range(len(problem.trials)):
-            with np.errstate(over="ignore", invalid="ignore"):  # a step too long, which is taken back
-                part = problem.linearise(
-                    number, point, self.candidate, self.base, derivatives=derivatives,
-                    known=None if known is None else known[number], effect_steps=self.deviation,
-                    central=self.central,
-                )  # fmt: skip
+            part = problem.linearise(
+                number, point, self.candidate, self.base, derivatives=derivatives,
+                known=None if known is None else known[number], effect_steps=self.deviation,
+                central=self.central,
+            )  # fmt: skip
             parts.append(part)
             responses.append(part.response)
             residuals.append(problem.residual(number, point, part.response))
@@ -322,7 +323,7 @@ class _Descent:
                     proposal = self.state(ahead, derivatives=False)
                 if proposal.objective < state.objective:
                     return self.state(ahead, known=state.parts)
-            except (FitError, ModelError):  # outside what the structure can carry: a shorter step
+            except DiscrepancyError:  # outside what the structure can carry: a shorter step
                 continue
         return None
 
@@ -350,22 +351,16 @@ def _step(
     eliminated = []
     for block in blocks:
         local = block.local + damping * np.diag(np.diag(block.local))
-        solved = np.linalg.solve(local, np.column_stack((block.cross, block.local_gradient)))
+        solved = np.linalg.solve(finite(local), np.column_stack((block.cross, block.local_gradient)))
         inner, inner_gradient = solved[:, :-1], solved[:, -1]
         matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
         np.add.at(damped_diagonal, block.index, np.diag(block.shared))
         gradient_part = block.shared_gradient - block.cross.T @ inner_gradient
         np.add.at(gradient, block.index, gradient_part)
         eliminated.append((inner, inner_gradient))
-    if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(gradient))):
-        raise FitError("The model gives derivatives that are not finite where a fit has come to.")
-    try:
-        effect = np.eye(size)[:, shared_size:]
-        variance = np.diag(cho_solve(cho_factor(matrix), effect)[shared_size:])
-        damped = matrix + damping * np.diag(damped_diagonal + prior)
-        step = np.zeros(size) if local_only else cho_solve(cho_factor(damped), gradient)
-    except LinAlgError as cause:
-        raise FitError("The normal equations of a fit are singular; a parameter has no influence.") from cause
+    variance = np.diag(Cholesky.of(matrix).solve(np.eye(size)[:, shared_size:])[shared_size:])
+    damped = matrix + damping * np.diag(damped_diagonal + prior)
+    step = np.zeros(size) if local_only else Cholesky.of(damped).solve(finite(gradient))
     promised = 0.5 * float(gradient @ step)
     local_steps = []
     for block, (inner, inner_gradient) in zip(blocks, eliminated, strict=True):
@@ -391,14 +386,14 @@ def _finished(
             block = trial_block(
                 problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision
             )
-            factor = cho_factor(block.local)
-            inner = cho_solve(factor, block.cross)
+            factor = Cholesky.of(block.local)
+            inner = factor.solve(block.cross)
             matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
-            log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
+            log_determinant += factor.log_determinant
             pieces.append((block, factor, inner))
-        factor = cho_factor(matrix)
-        log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
-        covariance = cho_solve(factor, np.eye(size))
+        factor = Cholesky.of(matrix)
+        log_determinant += factor.log_determinant
+        covariance = factor.solve(np.eye(size))
         log_evidence -= 0.5 * log_determinant
         for n, (block, local_factor, inner) in enumerate(pieces):
             # leverage of each channel: trace of J Cov J^T; local unknowns follow the shared ones
@@ -406,7 +401,7 @@ def _finished(
             known = covariance[np.ix_(block.index, block.index)]
             joint = np.empty((count + len(known), count + len(known)))
             followed = inner @ known
-            joint[:count, :count] = cho_solve(local_factor, np.eye(count)) + followed @ inner.T
+            joint[:count, :count] = local_factor.solve(np.eye(count)) + followed @ inner.T
             joint[:count, count:], joint[count:, :count] = -followed, -followed.T
             joint[count:, count:] = known
             leverage = block.derivatives.spread(block.products, block.precision, joint)

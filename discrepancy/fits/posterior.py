@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.catalogue.entry import NINETY
-from discrepancy.errors import ModelError
+from discrepancy.errors import DiscrepancyError
 
 from .fitting import LARGEST_EFFECT, CandidateFit
 from .problem import Problem
@@ -59,7 +59,7 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
             return np.inf
         try:
             rise = screen.rise(effect)
-        except ModelError:  # more than the structure can carry
+        except DiscrepancyError:  # more than the structure can carry
             return np.inf
         return rise + 0.5 * float(effect @ effect - centre @ centre)
 

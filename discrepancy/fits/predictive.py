@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from discrepancy.campaign.records import Trial
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 
+from .cholesky import Cholesky
 from .fitting import CandidateFit, TrialBlock, fit, trial_block
 from .problem import Problem
 from .remainder_inference import plain_point
@@ -56,10 +56,10 @@ def _fitted(problem: Problem, found: CandidateFit, *, sensitivities: bool) -> li
             found.residuals[number], ones,
         )  # fmt: skip
         local, shared = _halves(block)
-        factor = cho_factor(block.local, lower=True)
-        own = solve_triangular(np.tril(factor[0]), local, lower=True)
+        factor = Cholesky.of(block.local)
+        own = factor.half(local)
         # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
-        follow = (shared - cho_solve(factor, block.cross).T @ local).T @ shared_root[block.index]
+        follow = (shared - factor.solve(block.cross).T @ local).T @ shared_root[block.index]
         leverage = np.einsum("kn,kn->n", own, own)
         if found.point.remainder is None:
             leverage = leverage + np.einsum("nk,nk->n", follow, follow)
@@ -96,9 +96,9 @@ def _held_out(problem: Problem, found: CandidateFit, trials: tuple[Trial, ...]) 
             adapted.residuals[number], ones,
         )  # fmt: skip
         local, shared = _halves(block)
-        factor = cho_factor(block.local, lower=True)
-        follow = shared - cho_solve(factor, block.cross).T @ local
-        own = np.einsum("kn,kn->n", local, cho_solve(factor, local))
+        factor = Cholesky.of(block.local)
+        follow = shared - factor.solve(block.cross).T @ local
+        own = np.einsum("kn,kn->n", local, factor.solve(local))
         covariance = found.covariance[np.ix_(block.index, block.index)]
         carried = np.einsum("kn,kn->n", follow, covariance @ follow)
         shape = adapted.residuals[number].shape

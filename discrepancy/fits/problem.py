@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import Campaign, Trial
 from discrepancy.catalogue.entry import Setting
-from discrepancy.errors import CampaignDataError
+from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.models.interface import Model
 from discrepancy.models.memo import MemoModel
 from discrepancy.models.sensing import observe
@@ -93,6 +93,7 @@ class Problem:
         self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
         self._responses: dict[object, tuple[FloatArray, FloatArray | None]] = {}
         self._gains: dict[tuple[str, ...], tuple[IntArray, IntArray]] = {}
+        self.refusals: dict[str, str] = {} if like is None else like.refusals
         self.shared: GlobalUnknowns
         if like is not None:
             self.shared = like.shared
@@ -101,6 +102,10 @@ class Problem:
             ratios = self._unit_responses()
             if ratios:
                 self.shared = global_unknowns(campaign, model, chosen, ratios)
+
+    def refused(self, candidate: Candidate, cause: DiscrepancyError) -> None:
+        """Keep why a candidate could not be evaluated or fitted, by the identifiers of its effects."""
+        self.refusals |= {term.effect.identifier: str(cause) for term in candidate.terms}
 
     def _unit_responses(self) -> dict[str, float]:
         """Estimate data over model for signals of unknown scale."""

@@ -17,16 +17,16 @@ from typing import NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import ndtri
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
-from discrepancy.errors import ModelError
+from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 
 from .candidate import Candidate, Term
+from .cholesky import Cholesky, finite
 from .derivatives import TrialDerivatives
 from .fitting import LARGEST_EFFECT, CandidateFit, trial_block
 from .problem import Problem
@@ -117,12 +117,12 @@ class Screen:
                 problem, number, fit.point, fit.linearisations[number], candidate,
                 fit.residuals[number], precision,
             )  # fmt: skip
-            factor = cho_factor(block.local, lower=True)
-            inner = cho_solve(factor, block.cross)
+            factor = Cholesky.of(block.local)
+            inner = factor.solve(block.cross)
             matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
             np.add.at(gradient, block.index, block.shared_gradient - inner.T @ block.local_gradient)
             root = np.sqrt(block.precision)[:, np.newaxis]
-            own = solve_triangular(np.tril(factor[0]), np.eye(len(block.local)), lower=True)
+            own = factor.half(np.eye(len(block.local)))
             self._pieces.append(
                 _Piece(
                     block.derivatives,
@@ -134,8 +134,7 @@ class Screen:
                     np.zeros(fit.residuals[number].size),
                 )
             )
-        lower = np.tril(cho_factor(matrix, lower=True)[0])
-        self._inverse = solve_triangular(lower, np.eye(size), lower=True)
+        self._inverse = Cholesky.of(matrix).half(np.eye(size))
         self._gradient = self._inverse @ gradient
         self._size = size
 
@@ -154,6 +153,7 @@ class Screen:
         _, fits, size = self._moved(candidate, effect, candidate.acts_on, frozenset())
         return 0.5 * size - fits
 
+    @np.errstate(over="ignore", invalid="ignore")
     def _moved(
         self,
         candidate: Candidate,
@@ -193,6 +193,7 @@ class Screen:
         y = self._inverse @ total
         fits -= float(self._gradient @ y)
         square -= float(y @ y)
+        finite(np.array((fits, square)))
         return np.concatenate((*parts, *tail, y)), fits, square
 
     def shrunk(self, change: Change) -> tuple[Change, float]:
@@ -253,8 +254,8 @@ class Screen:
         for start in grid(term, self._peaks(term), fine=fine):
             try:
                 yield self.change(term, start)
-            except ModelError:  # such as a spring softer than what is taken from it
-                continue
+            except DiscrepancyError as cause:  # such as a spring softer than what is taken from it
+                self.problem.refused(Candidate((term,)), cause)
 
 
 def _channels_of(patch: ModelPatch) -> frozenset[str]:

@@ -12,11 +12,11 @@ from math import isinf
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2, f
 
 from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.cholesky import Cholesky
 from discrepancy.fits.fitting import CandidateFit, trial_block
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.trial_data import TrialData
@@ -236,7 +236,7 @@ def _projected(
         shared = np.block([[block.shared, between], [between.T, products]])
         along = np.array([np.vdot(residual, column) for column in weighted])
         index = np.concatenate((block.index, size + acting))
-        inner = cho_solve(cho_factor(block.local), cross)
+        inner = Cholesky.of(block.local).solve(cross)
         matrix[np.ix_(index, index)] += shared - cross.T @ inner
         np.add.at(
             gradient, index,
@@ -244,8 +244,8 @@ def _projected(
         )  # fmt: skip
     known, between = matrix[:size, :size], matrix[:size, size:]
     scale = 1.0 / np.sqrt(np.diag(known))
-    factor = cho_factor(known * np.outer(scale, scale) + 1e-12 * np.eye(size))
-    followed = scale[:, np.newaxis] * cho_solve(factor, scale[:, np.newaxis] * between)
+    factor = Cholesky.of(known * np.outer(scale, scale) + 1e-12 * np.eye(size))
+    followed = scale[:, np.newaxis] * factor.solve(scale[:, np.newaxis] * between)
     return (
         gradient[size:] - followed.T @ gradient[:size],
         matrix[size:, size:] - between.T @ followed,

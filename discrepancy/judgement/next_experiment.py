@@ -13,6 +13,7 @@ from scipy.special import logsumexp
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
+from discrepancy.fits.cholesky import finite
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
@@ -121,7 +122,7 @@ def mutual_information(
         spreads.append(np.concatenate((local / np.sqrt(precision)[:, np.newaxis], root.T @ shared)))
     middle = np.average(means, axis=0, weights=weights)
     columns = np.concatenate((np.stack(means) - middle, *spreads))
-    _, values, basis = np.linalg.svd(columns, full_matrices=False)
+    _, values, basis = np.linalg.svd(finite(columns), full_matrices=False)
     basis = basis[values > 1e-6 * max(values[0], 1e-300)]
     means_in = [basis @ (mean - middle) for mean in means]
     roots = [

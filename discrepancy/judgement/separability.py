@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, NoiseRecord, Start, Trial
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting
-from discrepancy.errors import DiscrepancyError, ModelError
+from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.linearisation import PARAMETER_STEP, Point
@@ -208,7 +208,7 @@ def _references(screen: Screen, effect: Effect, places: Sequence[str]) -> list[C
     for place in places:
         try:
             found.append(_reference(screen, effect, place))
-        except ModelError:
+        except DiscrepancyError:
             continue
     return found
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from discrepancy.fits.cholesky import Cholesky
 from discrepancy.fits.fitting import CandidateFit, trial_block
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import is_magnitude
@@ -91,7 +92,7 @@ def sizes_by_trial(problem: Problem, found: CandidateFit) -> list[SizeByTrial]:
             problem, number, found.point, found.linearisations[number], found.candidate,
             found.residuals[number], precision,
         )  # fmt: skip
-        inner = np.linalg.solve(block.local, np.column_stack((block.cross, block.local_gradient)))
+        inner = Cholesky.of(block.local).solve(np.column_stack((block.cross, block.local_gradient)))
         matrix = block.shared - block.cross.T @ inner[:, :-1]
         gradient = block.shared_gradient - block.cross.T @ inner[:, -1]
         at = first

@@ -12,6 +12,7 @@ from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_patch import SortedPatch
 from discrepancy.models.fmu_runs import FmuRuns
+from discrepancy.models.input_course import Course, acting_force
 from discrepancy.models.interface import Conditions
 
 FloatArray = NDArray[np.float64]
@@ -85,31 +86,24 @@ class FmuTrials:
     def _forced(
         self, trial: Trial, patch: SortedPatch, step: float, steps: int
     ) -> list[tuple[Excitation, float]]:
-        at_ends = np.interp(step * np.arange(steps + 1), trial.time, trial.force)
-        held = 0.5 * (at_ends[1:] + at_ends[:-1])
-        on = (at_ends[1:] != 0.0) | (at_ends[:-1] != 0.0)
-        name = self._input_of(trial)
-        loads = [(Excitation("input", name, held, float(trial.force[0])), 1.0 + patch.gain)]
-        if patch.tare:
-            loads.append(
-                (Excitation("input", name, on.astype(float), float(trial.force[0] != 0.0)), patch.tare)
-            )
-        inputs = self._description.inputs
-        for lever, moment in (
-            (patch.along_span, inputs.bending_moment),
-            (patch.along_chord, inputs.torque),
-        ):
-            if lever and moment is not None:
-                begin, variable = float(trial.force[0]), self._runs.variable(moment)
-                loads.append((Excitation("input", variable, held, begin), (1.0 + patch.gain) * lever))
-                if patch.tare:
-                    loads.append(
-                        (
-                            Excitation("input", variable, on.astype(float), float(begin != 0.0)),
-                            patch.tare * lever,
-                        )
-                    )
+        begins, ends = Course.of_force(trial).ends(np.linspace(0.0, steps * step, steps + 1))
+        held, first = 0.5 * (begins + ends), float(trial.force[0])
+        on = ((begins != 0.0) | (ends != 0.0)).astype(float)
+        loads = []
+        for variable, lever in self._pushed(trial, patch):
+            loads.append((Excitation("input", variable, held, first), (1.0 + patch.gain) * lever))
+            if patch.tare:
+                loads.append((Excitation("input", variable, on, float(first != 0.0)), patch.tare * lever))
         return loads
+
+    def _pushed(self, trial: Trial, patch: SortedPatch) -> list[tuple[str, float]]:
+        """Return the inputs that a force at a place of a patch pushes, each with its lever."""
+        inputs = self._description.inputs
+        moments = ((inputs.bending_moment, patch.along_span), (inputs.torque, patch.along_chord))
+        return [
+            (self._input_of(trial), 1.0),
+            *((self._runs.variable(name), lever) for name, lever in moments if name is not None and lever),
+        ]
 
     def loads_at_rest(
         self, trial: Trial, patch: SortedPatch, conditions: Conditions
@@ -129,25 +123,15 @@ class FmuTrials:
                 f"load_factor in [inputs]; leave it out."
             )
         count = len(trial.force)
-        held = self._held(trial, conditions)
+        held, acting = self._held(trial, conditions), acting_force(trial, patch.gain, patch.tare)
         loads: list[dict[str, float]] = []
         for row in range(count):
             if flight:
                 loads.append({self._runs.variable(str(inputs.load_factor)): float(trial.load_factor[row])})
                 continue
-            recorded = float(trial.force[row])
-            acting = recorded * (1.0 + patch.gain) + patch.tare * (recorded != 0.0)
             given = {name: float(values[row]) for name, values in held.items()}
-            if held and not np.any(trial.force):
-                loads.append(given)
-                continue
-            given[self._input_of(trial)] = acting
-            for lever, moment in (
-                (patch.along_span, inputs.bending_moment),
-                (patch.along_chord, inputs.torque),
-            ):
-                if lever and moment is not None:
-                    given[self._runs.variable(moment)] = acting * lever
+            if not held or np.any(trial.force):
+                given |= {name: float(acting[row]) * lever for name, lever in self._pushed(trial, patch)}
             loads.append(given)
         return loads
 

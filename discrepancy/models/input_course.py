@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PPoly
 
-from discrepancy.campaign.records import Hold
+from discrepancy.campaign.records import Hold, Trial
 from discrepancy.models.memory import Memory
 from fe.runtime.expression import Expression
 
@@ -18,6 +18,9 @@ FloatArray = NDArray[np.float64]
 KEPT_COURSES, KEPT_TIMES = 64, 24
 """Records whose courses are kept, and times at which each of them is: a search asks for the same ones."""
 _courses = Memory(KEPT_COURSES)
+
+SMOOTH_PARTS = 8
+"""Steps of an interval under an input that is a spline; straight lines on them err by 1e-6 of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +41,16 @@ class Course:
     _known: Memory = field(default_factory=lambda: Memory(KEPT_TIMES), init=False, repr=False)
 
     @staticmethod
-    def of(time: FloatArray, values: FloatArray, hold: Hold) -> "Course":
-        """Return the course of a record, the same one for the same record."""
-        key = (hold, time.tobytes(), values.tobytes())
-        return _courses.get(key, lambda: Course(time, values, hold))
+    def of(time: FloatArray, values: FloatArray, hold: Hold | None = None) -> "Course":
+        """Return the course of a record, the same one for the same record; linear unless it is said."""
+        known = hold or Hold.LINEAR
+        key = (known, time.tobytes(), values.tobytes())
+        return _courses.get(key, lambda: Course(time, values, known))
+
+    @staticmethod
+    def of_force(trial: Trial, gain: float = 0.0, tare: float = 0.0) -> "Course":
+        """Return the course of the force of a forced trial, see `acting_force`."""
+        return Course.of(trial.time, acting_force(trial, gain, tare), trial.hold)
 
     @property
     def edges(self) -> tuple[float, ...]:
@@ -89,6 +98,11 @@ class Course:
         bend = np.diff(time) ** 2 / 12.0
         curve = self._spline(self._inside(time), 2)
         return found[:-1] - bend * curve[:-1], found[1:] - bend * curve[1:]
+
+
+def acting_force(trial: Trial, gain: float, tare: float) -> FloatArray:
+    """Return (1 + gain) times the recorded force (N,) of a trial, plus the tare where it is not zero [N]."""
+    return (1.0 + gain) * trial.force + tare * (trial.force != 0.0) if gain or tare else trial.force
 
 
 @dataclass(frozen=True, eq=False)

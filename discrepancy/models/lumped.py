@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.input_course import Course, acting_force
 from discrepancy.models.interface import (
     Conditions,
     ModelParameter,
@@ -208,7 +209,7 @@ class LumpedModel:
         own = patch.in_trial(trial.name)
         structure, forces, gain, tare, along_span, along_chord, loads = sorted_lumped(own, self)
         laws = laws_at(forces, self._ports)
-        acting = trial.force * (1.0 + gain) + tare * (trial.force != 0.0) if gain or tare else trial.force
+        acting = acting_force(trial, gain, tare)
         switched = bool(laws.spans) and trial.kind is not TrialKind.RINGDOWN
         if self._as_rig(trial) or loads or switched:
             lumped = self._rig(conditions.parameters, structure, float(trial.temperature[0]))
@@ -245,7 +246,8 @@ class LumpedModel:
         else:
             row = self._moved_row(trial.load_place, row, along_span, along_chord)
             motion = system.forced(
-                row, acting, trial.time, laws, clock=conditions.clock, refinement=refinement
+                row, Course.of_force(trial, gain, tare), trial.time, laws, clock=conditions.clock,
+                refinement=refinement,
             )  # fmt: skip
         return motion.response(rows, quantities)
 
@@ -432,7 +434,7 @@ class LumpedModel:
         if trial.kind is TrialKind.STATIC:
             return system.static(np.outer(trial.force, row), NO_LAWS)
         if trial.kind is TrialKind.FORCED:
-            return system.forced(row, trial.force, trial.time, NO_LAWS).q @ system.shapes.T
+            return system.forced(row, Course.of_force(trial), trial.time, NO_LAWS).q @ system.shapes.T
         size = trial.release.displacement if trial.release is not None else 0.0
         shape = system.flexibility(row)
         return (size / float(row @ shape) * shape)[None]

@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course, Drive, FormulaCourse
+from discrepancy.models.input_course import Course, Drive, FormulaCourse, acting_force
 from discrepancy.models.interface import Conditions, Response
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
@@ -182,7 +182,7 @@ class LumpedRig:
             section = self._section(trial, item)
             values = item.values + offset if offset else item.values
             if section.quantity.moving:
-                if item.hold is not Hold.SMOOTH:
+                if item.hold not in (None, Hold.SMOOTH):
                     raise ModelError(
                         f"The input {item.name!r} of the trial {trial.name!r} is a motion that "
                         f"{self.description.name!r} prescribes, which no drive makes in steps or corners: "
@@ -225,7 +225,7 @@ class LumpedRig:
                 f"The load place {place!r} is not an input of the lumped model {self.description.name!r}; it "
                 f"has {', '.join(self._inputs) or 'none'}."
             )
-        return (RecordedInput(place, self._inputs[place].quantity, trial.force, Hold.LINEAR),)
+        return (RecordedInput(place, self._inputs[place].quantity, trial.force, trial.hold),)
 
     def _section(self, trial: Trial, item: RecordedInput) -> InputSection:
         section = self._inputs.get(item.name)
@@ -280,7 +280,7 @@ class LumpedRig:
         if trial.kind is TrialKind.STATIC:
             row = self._padded(self._inputs[self.recorded(trial)[0].name].vector)
             place = place if place is None else self._padded(place)
-            force = trial.force * (1.0 + gain) + tare * (trial.force != 0.0)
+            force = acting_force(trial, gain, tare)
             return self._static(trial, force, row if place is None else place, self.shown(outputs), laws)
         rig, acting, drives = self.acting(trial, conditions, gain, tare, place)
         if at_ports:

@@ -18,6 +18,7 @@ from scipy.linalg import eigh, null_space
 from discrepancy.campaign.records import Quantity, Start
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
+from discrepancy.models.input_course import SMOOTH_PARTS
 from discrepancy.models.interface import Response
 from discrepancy.models.rig_records import Acting, Effort, Shown
 from discrepancy.models.stepwise import Boundaries, CoupledModes, ExactSteps, advance, exact_steps, substeps
@@ -28,8 +29,6 @@ FloatArray = NDArray[np.float64]
 
 HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest of the rig."""
-SMOOTH_PARTS = 8
-"""Steps of an interval under an input that is a spline; straight lines on them err by 1e-6 of it."""
 LEAST_PIVOT = 1e-9
 """A rig whose equilibrium is determined worse than this has none of its own."""
 

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, eigh
 from scipy.linalg.lapack import dpotrs
 
-from discrepancy.campaign.records import Release
+from discrepancy.campaign.records import Hold, Release
 from discrepancy.campaign.sampling import is_even
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.free_motion import free_motion
+from discrepancy.models.input_course import Course
 from discrepancy.models.second_order_motion import Motion
 from discrepancy.models.stepwise import simulate_at
 from fe.runtime.errors import SolutionError
@@ -259,41 +260,41 @@ class SecondOrderSystem:
     def forced(
         self,
         input_row: FloatArray,
-        force: FloatArray,
+        course: Course,
         time: FloatArray,
         laws: Laws,
         *,
         clock: tuple[float, float] = (0.0, 0.0),
         refinement: int = 1,
     ) -> Motion:
-        """Return the motion from rest under a force [N] that is known at `time` and linear in between.
+        """Return the motion at `time` (N,) from rest under the course of a force [N].
 
         The record of the force is taken as right; with a clock error the samples of the motion are taken at
         (1 + rate) t + zero, and the force is read there from its record. Parameters as in `ringdown`.
         """
         times = (1.0 + clock[0]) * time + clock[1]
-        acting = force if clock == (0.0, 0.0) else np.interp(times, time, force)
+        acting, begin = course.at(times), float(course.values[0])
         modes = len(self.angular_frequency)
         modal = self.modal
         shape = np.asarray(input_row @ self.shapes)
         q, v, memory = np.zeros(modes), np.zeros(modes), laws.memory()
         start, lead = float(time[0]), float(times[0] - time[0])
         # At rest before the record: under its first force where that is not zero.
-        if force[0] != 0.0:
+        if begin != 0.0:
             rows = self.port_rows(laws)
             flexible = self.flexibility(rows.T)
-            linear = force[0] * (rows @ self.flexibility(input_row))
+            linear = begin * (rows @ self.flexibility(input_row))
             solution = _solve(laws, linear[None], rows @ flexible)
-            acts = force[0] * shape - solution.forces[0] @ laws.rows(modal.ports, modes)
+            acts = begin * shape - solution.forces[0] @ laws.rows(modal.ports, modes)
             q, memory = acts / self.angular_frequency**2, solution.memory
         feed = np.stack((self._feed(input_row, laws), np.zeros(len(laws))))
         if lead > LEAST_LEAD * float(time[-1] - time[0]):
             first = simulate(
-                modal, laws, q=q, v=v, memory=memory, force=np.array([force[0], acting[0]]), interval=lead,
+                modal, laws, q=q, v=v, memory=memory, force=np.array([begin, acting[0]]), interval=lead,
                 shape=shape, feed=feed, start=start, refinement=refinement, kernel=compiled_kernel(),
             )  # fmt: skip
             q, v, memory, start = first.q[-1], first.v[-1], first.memory, start + lead
-        if is_even(time):
+        if course.hold is Hold.LINEAR and is_even(time):
             moved = simulate(
                 modal, laws, q=q, v=v, memory=memory, force=acting, shape=shape, feed=feed, start=start,
                 interval=float(times[-1] - times[0]) / (len(times) - 1), refinement=refinement,
@@ -301,8 +302,8 @@ class SecondOrderSystem:
             )  # fmt: skip
         else:
             moved = simulate_at(
-                modal, laws, q=q, v=v, time=times - times[0] + start, force=np.outer(acting, shape),
-                memory=memory, feed=np.outer(acting, feed[0]), refinement=refinement,
+                modal, laws, q=q, v=v, time=times, course=course, shape=shape, memory=memory, feed=feed[0],
+                refinement=refinement,
             )  # fmt: skip
         return Motion(self, times, moved.q, moved.v, acting, input_row, moved.port_forces, moved.lagged, laws)
 
@@ -363,8 +364,8 @@ class SecondOrderSystem:
                 start=float(time[0]), refinement=refinement, kernel=compiled_kernel(),
             )  # fmt: skip
         return simulate_at(
-            self.modal, laws, q=q, v=v, time=time, force=np.zeros((len(time), len(q))), memory=memory,
-            refinement=refinement,
+            self.modal, laws, q=q, v=v, time=time, course=Course.of(time[:1], np.zeros(1)),
+            shape=np.zeros(len(q)), memory=memory, refinement=refinement,
         )  # fmt: skip
 
     def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> tuple[FloatArray, FloatArray]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.models.compiled_motion import compiled_steps
+from discrepancy.models.input_course import SMOOTH_PARTS, Course
 from discrepancy.models.memory import Memory
 from discrepancy.models.stepwise_kernel import Structure
 from fe.runtime.modal_system import ModalSystem
@@ -175,12 +176,13 @@ def simulate_at(
     q: FloatArray,
     v: FloatArray,
     time: FloatArray,
-    force: FloatArray,
+    course: Course,
+    shape: FloatArray,
     memory: FloatArray | None = None,
     feed: FloatArray | None = None,
     refinement: int = 1,
 ) -> ModalMotion:
-    """Return the motion at time stamps from a state at the first of them.
+    """Return the motion at time stamps under a force, from a state at the first of them.
 
     Parameters
     ----------
@@ -192,12 +194,14 @@ def simulate_at(
         State at the first stamp.
     time : (N,) ndarray
         Stamps since the begin of the record [s], strictly increasing.
-    force : (N, M) ndarray
-        Modal forces at the stamps, linear between them.
+    course : Course
+        The force, linear, held or smooth between its samples.
+    shape : (M,) ndarray
+        Modal forces by a unit of it.
     memory : (J, 5 + E) ndarray, optional
         Of the laws; left out, each law has been loaded from zero to its first position without turning back.
-    feed : (N, J) ndarray, optional
-        What the loads add to the positions of the laws' ports beyond the modes.
+    feed : (J,) ndarray, optional
+        What a unit of the force adds to the positions of the laws' ports beyond the modes.
     refinement : int
         Steps are this many times smaller than usual.
 
@@ -206,12 +210,12 @@ def simulate_at(
     ModalMotion
         At the stamps, the first included.
     """
-    boundaries = substeps(system, laws, time, refinement, edges=laws.edges)
-    fed = np.zeros((len(time), len(laws))) if feed is None else feed
-    load, led = boundaries.between(force), boundaries.between(fed)
+    boundaries = substeps(system, laws, time, refinement, SMOOTH_PARTS if course.is_smooth else 1, laws.edges)
+    begin, end = (np.outer(force, shape) for force in course.ends(boundaries.time))
     found = exact_steps(system, boundaries.lengths)
-    push = found.push(load[:-1], load[1:])
-    return advance(system, laws, found, boundaries, q, v, push, load[:-1], load[1:], led, memory)
+    fed = np.outer(course.at(boundaries.time), np.zeros(len(laws)) if feed is None else feed)
+    push = found.push(begin, end)
+    return advance(system, laws, found, boundaries, q, v, push, begin, end, fed, memory)
 
 
 @dataclass(frozen=True)
@@ -222,8 +226,6 @@ class Boundaries:
     ----------
     time : (K + 1,) ndarray
         Of the boundaries of the steps [s].
-    at : (K + 1,) ndarray
-        The same as fractional numbers of stamps.
     sample : (N,) ndarray of int
         Boundary of each stamp.
     lengths : (K,) ndarray
@@ -231,17 +233,8 @@ class Boundaries:
     """
 
     time: FloatArray
-    at: FloatArray
     sample: IntArray
     lengths: FloatArray
-
-    def between(self, values: FloatArray) -> FloatArray:
-        """Return rows of values (N, ...) at the boundaries, linear between the stamps."""
-        if len(self.at) == len(values):
-            return np.ascontiguousarray(values)
-        row = np.minimum(self.at.astype(np.int64), len(values) - 2)
-        share = (self.at - row).reshape((-1, *(1,) * (values.ndim - 1)))
-        return np.ascontiguousarray((1.0 - share) * values[row] + share * values[row + 1])
 
 
 def substeps(
@@ -260,17 +253,15 @@ def substeps(
     if inside:
         moments = np.union1d(time, inside)
         found = substeps(system, laws, moments, refinement, least)
-        at = np.interp(found.time, time, np.arange(len(time)))
-        return replace(found, at=at, sample=found.sample[np.searchsorted(moments, time)])
+        return replace(found, sample=found.sample[np.searchsorted(moments, time)])
     parts = np.maximum(_substeps(system, laws, np.diff(time)), least) * refinement
     sample = np.concatenate(([0], np.cumsum(parts))).astype(np.int64)
     lengths = np.repeat(np.diff(time) / parts, parts)
     interval = np.repeat(np.arange(len(parts)), parts)
     place = np.arange(1, len(interval) + 1) - sample[:-1][interval]
-    at = np.concatenate(([0.0], interval + place / parts[interval]))
     moments = np.concatenate((time[:1], time[interval] + place * lengths))
     moments[sample] = time
-    return Boundaries(moments, at, sample, lengths)
+    return Boundaries(moments, sample, lengths)
 
 
 def advance(

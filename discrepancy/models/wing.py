@@ -12,6 +12,7 @@ from calibration.wing.result_file import load_calibration
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
+from discrepancy.models.input_course import Course
 from discrepancy.models.interface import (
     Conditions,
     ModelParameter,
@@ -371,8 +372,9 @@ class WingModel:
             )  # fmt: skip
         else:
             motion = system.forced(
-                self.wing.force_row(trial.load_place, loads) @ basis, _amounts(trial, loads)[:, 0],
-                trial.time, laws, clock=conditions.clock, refinement=refinement,
+                self.wing.force_row(trial.load_place, loads) @ basis,
+                Course.of(trial.time, _amounts(trial, loads)[:, 0], trial.hold), trial.time, laws,
+                clock=conditions.clock, refinement=refinement,
             )  # fmt: skip
         response = motion.response(rows @ basis, quantities)
         if not components:
@@ -395,7 +397,7 @@ class WingModel:
             return np.asarray(_amounts(trial, empty) @ units)
         row = self.wing.force_row(trial.load_place)
         if trial.kind is TrialKind.FORCED:
-            motion = moved.system.forced(row @ moved.basis, trial.force, trial.time, NO_LAWS)
+            motion = moved.system.forced(row @ moved.basis, Course.of_force(trial), trial.time, NO_LAWS)
             return motion.values(self._structure.point_rows @ moved.basis)
         shape = static.solve(row)
         size = trial.release.displacement if trial.release is not None else 0.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.errors import ModelError
+from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import CandidateFit, attempt, fit, objective
 from discrepancy.fits.gates import absolute_gate
@@ -79,15 +79,16 @@ class Beginnings:
 
     def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
         """Fit effects in addition to those of `base`, beginnings first; return the most promising ones."""
-        near = self.near(base)
-        screen = Screen(self.short, near)
+        screen = self.screen(base)
+        if screen is None:
+            return []
         ranked = [changes for effect in effects if (changes := starts(screen, effect, SEARCH.far_starts))]
         ranked.sort(key=lambda changes: -changes[0].gain)
         enough = SEARCH.promising * ranked[0][0].gain if ranked else 0.0
         first = max(SEARCH.least_promising, sum(changes[0].gain >= enough for changes in ranked))
-        found = self._from_beginnings(base, near, ranked[:first])
+        found = self._from_beginnings(base, screen.fit, ranked[:first])
         if not base.candidate.terms and not any(absolute_gate(self.problem, item).passed for item in found):
-            found += self._from_beginnings(base, near, ranked[first:])
+            found += self._from_beginnings(base, screen.fit, ranked[first:])
         return found
 
     def _from_beginnings(
@@ -110,17 +111,23 @@ class Beginnings:
                 begun.append(best)
         return self.whole(begun, base.objective)
 
-    def near(self, base: CandidateFit) -> CandidateFit:
-        """Fit the beginnings with the effects of a base; shared unknowns as expected before the data.
+    def screen(self, base: CandidateFit) -> Screen | None:
+        """Fit the beginnings with the effects of a base, and screen there; None where they cannot be so.
 
-        The nuisances of a wrong model are far off and make a bad start.
+        Shared unknowns are as expected before the data: the nuisances of a wrong model are far off and make a
+        bad start.
         """
         expected = Point(
             np.zeros_like(base.point.shared),
             tuple(np.zeros_like(u) for u in base.point.local),
             base.point.effect,
         )
-        return fit(self.short, base.candidate, expected, local_only=True, evidence=False)
+        try:
+            return Screen(
+                self.short, fit(self.short, base.candidate, expected, local_only=True, evidence=False)
+            )
+        except DiscrepancyError:
+            return None
 
     def shortly(
         self, near: CandidateFit, candidate: Candidate, added: FloatArray, give_up: float | None = None
@@ -168,7 +175,7 @@ class Beginnings:
             point = Point(found.point.shared, found.point.local, np.array(effect))
             try:
                 tried.append((objective(self.short, candidate, point), point))
-            except ModelError:  # more than the structure can carry
+            except DiscrepancyError:  # more than the structure can carry
                 continue
         return [point for _, point in sorted(tried, key=lambda item: item[0])[: SEARCH.related_starts]]
 

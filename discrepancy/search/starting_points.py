@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.errors import ModelError
+from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Term
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.search_settings import SEARCH
@@ -37,14 +37,17 @@ def starts(screen: Screen, effect: Effect, count: int = SEARCH.starts) -> list[C
 def _in_small(screen: Screen, change: Change) -> Change:
     try:
         return screen.shrunk(change)[0]
-    except ModelError:
+    except DiscrepancyError:
         return change
 
 
 def acts_within(effect: Effect, setting: Setting) -> bool:
     """Whether an effect acts within the structure or on its loads, not on readings only."""
     term = Term(effect, effect.places(setting)[0])
-    patch = effect.patch(setting, term.values(term.start() + 1.0), term.place)
+    try:
+        patch = effect.patch(setting, term.values(term.start() + 1.0), term.place)
+    except DiscrepancyError:  # a law that cannot be so large
+        return True
     return not all(isinstance(item, SENSORS) for item in patch)
 
 

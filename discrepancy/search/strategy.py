@@ -292,9 +292,8 @@ class Search(Hypotheses):
 
     def fit_pairs(self) -> None:
         """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
-        far = self._far(self.none)
-        near = self.beginnings.near(self.none) if far else self.none
-        screen = Screen(self.beginnings.short if far else self.problem, near)
+        begun = self.beginnings.screen(self.none) if self._far(self.none) else None
+        screen = begun or Screen(self.problem, self.none)
         changes = {effect.identifier: starts(screen, effect) for effect in self.effects}
         ranked = sorted(pairs(changes, screen.sign), key=lambda item: item[0])[: SEARCH.pairs_fitted]
         rough: list[CandidateFit] = []
@@ -305,13 +304,13 @@ class Search(Hypotheses):
             if key_of(candidate) in self.exact:
                 continue
             start = np.concatenate((rescaled(first), rescaled(second)))
-            if far:
-                found = self.beginnings.shortly(near, candidate, start)
-            else:
+            if begun is None:
                 found = self.roughly(self.none, candidate, start)
+            else:
+                found = self.beginnings.shortly(begun.fit, candidate, start)
             if found is not None:
                 rough.append(found)
-        if far:
+        if begun is not None:
             rough = self.beginnings.whole(rough, self.none.objective)
         for item in rough:
             self.keep(item, exact=False)

@@ -14,7 +14,16 @@ from hypothesis.extra.numpy import arrays
 
 from discrepancy.campaign.noise_records import pre_trigger_record
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    Hold,
+    NoiseRecord,
+    Quantity,
+    Release,
+    Trial,
+    TrialKind,
+)
 from discrepancy.campaign.schema import INPUT_COLUMNS
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
@@ -195,6 +204,7 @@ def campaigns(draw: st.DrawFn) -> Campaign:
                 st.integers(1, 5), positive)) if kind is TrialKind.RINGDOWN
                 else None,
                 held_out=draw(st.booleans()),
+                hold=draw(st.sampled_from([None, *Hold])) if kind is TrialKind.FORCED else None,
                 noise_factor=draw(st.just(1.0) | positive),
             )
         )  # fmt: skip
@@ -314,6 +324,8 @@ WRONG_TOML = [
     ("held_out = true", "left_out = { g18 = [1] }", "names the channel 'g18'"),
     ("held_out = true", 'channels = ["tip"]', r"turn.csv has no column 'w \[mm\]', which the chan"),
     ("held_out = true", "temperature = 21", "gives its temperature twice"),
+    ("held_out = true", 'hold = "smooth"', r"and its `hold` is for the force of a forced one: say that"),
+    ("held_out = true", 'hold = "held"', r"hold: input should be 'zero_order', 'linear' or 'smooth', but 'h"),
     ("held_out = true", "health = { z1 = 0.1 }", "gives z1 twice"),
     ("load_place = [1.0, 0.35]", "load_place = [1.0]", r"must be a name or \[y, x\]"),
     ("release = {", "releases = {", r"'trial\[2\].releases' is not a key of a campaign"),

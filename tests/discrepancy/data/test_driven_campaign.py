@@ -68,7 +68,7 @@ def test_inputs_come_out_in_si(tmp_path: Path) -> None:
     heater, table, fan = first.inputs
     assert (heater.quantity, heater.hold, heater.offset_deviation) == (Quantity.HEAT, Hold.ZERO_ORDER, 10.0)
     assert heater.values[:2].tolist() == [1000.0, 2000.0]
-    assert (table.hold, fan.hold) == (Hold.SMOOTH, Hold.LINEAR)
+    assert (table.hold, fan.hold) == (Hold.SMOOTH, None)
     assert table.values[3] == 3e-3
     assert first.force.tolist() == fan.values.tolist()
     assert fan.values[3] == 6e-3

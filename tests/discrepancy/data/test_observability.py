@@ -121,15 +121,25 @@ def test_only_plausible_unit_slips_are_looked_for(tmp_path: Path, model: LumpedM
     assert not slips(9.81)
 
 
-@pytest.mark.parametrize(("samples", "said"), [(9, True), (200, False)])
-def test_it_is_said_where_straight_lines_are_too_coarse(
-    tmp_path: Path, model: LumpedModel, samples: int, said: bool
+@pytest.mark.parametrize("hold", ["", 'hold = "linear"', 'hold = "smooth"'])
+@pytest.mark.parametrize("forced", [False, True])
+@pytest.mark.parametrize("samples", [9, 200])
+def test_it_is_asked_what_a_coarse_input_did_between_its_samples(
+    tmp_path: Path, model: LumpedModel, samples: int, forced: bool, hold: str
 ) -> None:
     time = np.arange(12 * samples) / samples
     rows = [f"{t!r},{float(1.0 * np.sin(2.0 * np.pi * t))!r},{10.0 * t!r}" for t in time.tolist()]
-    (tmp_path / "push.csv").write_text("\n".join(["time,motor,x", *rows]))
-    (tmp_path / "campaign.toml").write_text(TOML)
+    (tmp_path / "push.csv").write_text("\n".join([f"time,{'force' if forced else 'motor'},x", *rows]))
+    before, _, after = TOML.partition("[[input]]")
+    section, _, last = after.partition("[[trial]]")
+    toml = f"{before}[[input]]{section}{hold}\n[[trial]]{last}"
+    if forced:
+        toml = f"{before}[[trial]]{last.replace('driven', 'forced')}{hold}\n"
+    (tmp_path / "campaign.toml").write_text(toml)
     faults = check_against_model(read_campaign(tmp_path), model)
     found = [fault for fault in faults if fault.kind is FaultKind.BETWEEN_SAMPLES]
-    assert bool(found) is said
-    assert not said or "straight lines and curves between the samples of 'motor'" in found[0].sentence
+    assert bool(found) is (samples == 9 and not hold)
+    name, where = ("force", "[[trial]]") if forced else ("motor", "[[input]]")
+    for fault in found:
+        assert f"straight lines and curves between the samples of {name!r}" in fault.sentence
+        assert f'hold = "smooth", "zero_order" or "linear" in its {where}' in fault.sentence

@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 
 from discrepancy.campaign.records import Quantity, Release
 from discrepancy.models.compiled_motion import compiled_kernel
+from discrepancy.models.input_course import Course
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.second_order_motion import Motion
 from fe.runtime.laws.micro_slip import slip_displacements
@@ -328,7 +329,7 @@ def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
     time = np.linspace(0.0, 90.0, 3001)
     force = np.asarray(15.0 * np.sin(2.0 * np.pi * time / 90.0))
     rows = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
-    moved = system.forced(TIP, force, time, laws).values(rows)
+    moved = system.forced(TIP, Course.of(time, force), time, laws).values(rows)
     still = system.static(np.outer(force, TIP), laws) @ rows.T
     assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())
 

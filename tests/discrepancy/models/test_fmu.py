@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Hold, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.errors import ModelError
@@ -266,6 +266,20 @@ def test_forced_motion_converges(rig: FmuModel, lumped: LumpedModel) -> None:
         coarse, fine = (error(rig, lumped, SHAKEN, changes, refinement=n) for n in (1, 4))
         assert coarse < 3e-4
         assert np.log(coarse / fine) / np.log(4.0) > 1.75
+
+
+@pytest.mark.parametrize("hold", list(Hold))
+def test_a_coarse_force_does_between_its_samples_what_is_said(
+    rig: FmuModel, lumped: LumpedModel, hold: Hold
+) -> None:
+    time = 0.04 * np.arange(75)
+    coarse = trial(TrialKind.FORCED, 75, time=time, force=8.0 * np.sin(28.0 * time), hold=hold)
+    for changes in (patch(), patch(LAWS["coulomb"])):
+        assert error(rig, lumped, coarse, changes, refinement=4) < 1e-3
+        wanted = lumped.respond(coarse, OUTPUTS, changes, CONDITIONS).values
+        straight = rig.respond(replace(coarse, hold=None), OUTPUTS, changes, CONDITIONS).values
+        differ = np.abs(straight - wanted).max() > 0.02 * np.abs(wanted).max()
+        assert differ == (hold is not Hold.LINEAR)
 
 
 def test_stepping_the_fmu_gives_what_superposition_gives(

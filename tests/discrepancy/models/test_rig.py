@@ -1,5 +1,6 @@
 """Rigs of all kinds against closed forms, matrix exponentials and a general integrator."""
 
+import itertools
 import tomllib
 from dataclasses import replace
 from typing import Any
@@ -410,10 +411,10 @@ def test_plain_models_take_driven_trials_and_other_begins() -> None:
     force = np.cos(7.0 * time)
     outputs = {"x1": Quantity.DISPLACEMENT, "x3": Quantity.ACCELERATION}
     forced = trial(time, kind=TrialKind.FORCED, force=force, load_place="end", begins=Start.SETTLED)
-    driven = trial(time, RecordedInput("end", Quantity.FORCE, force), begins=Start.SETTLED)
     friction = PowerDamping("joint", 0.3, 0.0, 0.0, 1.0, 1.0)
-    for laws in ((), (friction,)):
-        one, other = (shown(model, what, outputs, *laws) for what in (forced, driven))
+    for hold, laws in itertools.product((None, *Hold), ((), (friction,))):
+        driven = trial(time, RecordedInput("end", Quantity.FORCE, force, hold), begins=Start.SETTLED)
+        one, other = (shown(model, what, outputs, *laws) for what in (replace(forced, hold=hold), driven))
         np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(one).max())
     still = shown(model, replace(forced, begins=Start.STILL), outputs)
     assert still[0, 0] == 0.0

@@ -10,6 +10,7 @@ from scipy.linalg import expm
 
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.models.compiled_motion import compiled_kernel
+from discrepancy.models.input_course import Course
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.stepwise import CoupledModes, exact_steps, simulate_at
@@ -89,7 +90,7 @@ def test_even_stamps_are_those_of_the_even_stepper(laws: tuple[Primitive, ...]) 
     even = simulate(
         system, internal, q=q, v=v, force=force, interval=0.01, shape=shape, kernel=compiled_kernel()
     )
-    found = simulate_at(system, internal, q=q, v=v, time=time, force=np.outer(force, shape))
+    found = simulate_at(system, internal, q=q, v=v, time=time, course=Course.of(time, force), shape=shape)
     for one, other in zip(found, even, strict=True):
         np.testing.assert_allclose(
             one, other, rtol=1e-9, atol=1e-9 * max(1e-9, float(np.abs(other).max(initial=0.0)))

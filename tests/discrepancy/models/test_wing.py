@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
 from calibration.wing.result import CalibrationResult
 from calibration.wing.result_file import save_calibration
-from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Hold, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
@@ -326,6 +327,30 @@ def test_a_harmonic_force_reaches_the_frequency_response(model: WingModel, condi
     amplitude = output_rows(model) @ np.linalg.solve(dynamic, 3.0 * model.wing.force_row("tip_load"))
     wanted = (amplitude[:, None] * np.exp(1j * omega * time[-1000:])).imag.T
     assert np.abs((values - wanted) / np.abs(amplitude)).max() < 2e-3
+
+
+@pytest.mark.parametrize("hold", list(Hold))
+def test_a_coarse_force_does_between_its_samples_what_is_said(
+    model: WingModel, conditions: Conditions, hold: Hold
+) -> None:
+    """At nine samples a period, against the same force recorded a hundred times as fast."""
+    time, fine = np.arange(120) / 81.0, np.arange(119 * 100 + 1) / 8100.0
+    force = 3.0 * np.sin(2.0 * np.pi * 9.0 * time)
+    coarse = make_trial(TrialKind.FORCED, 120, time=time, force=force, hold=hold)
+    between = {
+        Hold.LINEAR: np.interp(fine, time, force),
+        Hold.SMOOTH: CubicSpline(time, force)(fine),
+        Hold.ZERO_ORDER: force[np.maximum(np.arange(len(fine)) - 1, 0) // 100],
+    }[hold]
+    known = make_trial(TrialKind.FORCED, len(fine), time=fine, force=between)
+    found = model.respond(coarse, OUTPUTS, NONE, conditions).values
+    wanted = model.respond(known, OUTPUTS, NONE, conditions).values[::100]
+    largest = np.abs(wanted).max()
+    # the fine record of what is held goes up within its first interval
+    assert np.abs(found - wanted).max() < (2e-2 if hold is Hold.ZERO_ORDER else 1e-4) * largest
+    straight = model.respond(replace(coarse, hold=None), OUTPUTS, NONE, conditions).values
+    differ = np.abs(straight - wanted).max() > 2e-2 * largest
+    assert differ == (hold is not Hold.LINEAR)
 
 
 def test_a_small_mass_lowers_the_frequency_as_rayleigh_says(model: WingModel, conditions: Conditions) -> None:

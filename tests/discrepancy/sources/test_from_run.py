@@ -28,7 +28,7 @@ from discrepancy.models.sensing import observe
 from discrepancy.sources.from_run import RunPlan, held_out_turns, run_campaign, run_model
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
-from fe.runtime.patch import ModelPatch, SensorDrift, SensorGain, SensorRotation
+from fe.runtime.patch import ModelPatch, PointMass, SensorDrift, SensorGain, SensorRotation
 
 TURNS = 24
 DRIFT = SensorDrift("strain[17]", -1.2e-3, float(TURNS))
@@ -187,6 +187,25 @@ def test_a_drifting_gauge_is_found_in_the_run(campaign: Campaign, model: Model) 
     assert found.proof.held_out_before is not None
     assert found.proof.held_out_after is not None
     assert found.proof.held_out_after.chi_square_per_dof < found.proof.held_out_before.chi_square_per_dof
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+@pytest.mark.parametrize("mass", [0.2, 0.0])
+def test_a_mass_that_the_twin_does_not_know_is_found_in_the_run(tmp_path: Path, mass: float) -> None:
+    fly_mission(tmp_path / "heavy", 7, (PointMass(mass, 2.0),) if mass else (), turns=TURNS)
+    effects = [effect_by_identifier(name, library()) for name in ("point_mass", "inertia_relief")]
+    found = investigate(
+        run_campaign(tmp_path / "heavy"), run_model(tmp_path / "heavy"), effects, thorough=False
+    )
+    if not mass:
+        assert found.verdict.kind is VerdictKind.NOTHING_MISSING
+        return
+    members = {effect.identifier: effect for effect in found.verdict.effects}
+    assert found.verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP)
+    ratio = {item.name: item for item in members["point_mass"].parameters}["mass_ratio"]
+    assert found.problem is not None
+    assert ratio.low < mass / found.problem.setting.scales.modal_mass < ratio.high
 
 
 @given(st.integers(1, 200), st.integers(1, 12), st.floats(0.0, 0.9))
