@@ -147,28 +147,32 @@ def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tup
     """
     found: list[float] = []
     rest = samples
-    resolution = 1.0 / (len(samples) * interval)
     for frequency in MAINS:
-        shown = aliased(frequency, interval)
-        if shown < 2.0 * resolution or shown > 0.5 / interval - 2.0 * resolution:
-            continue
-        reach = MAINS_DEVIATION * frequency
-        line = _strongest_line(rest, interval, shown - reach, shown + reach)
-        left = rest - line
-        # against the neighbourhood of the line, so that coloured noise is not taken for one
-        spectrum = np.abs(np.fft.rfft(left)) ** 2
-        index = round(shown / resolution)
-        wide = 3 + ceil(reach / resolution)
-        near = np.r_[
-            spectrum[max(1, index - wide - 9) : max(1, index - wide + 1)],
-            spectrum[index + wide : index + wide + 10],
-        ]
-        level = near.mean() * 2.0 / len(samples)  # mean power that a line of noise alone takes from the sum
-        independent = 1.0 + 2.0 * reach / resolution
-        if level > 0.0 and line @ line > 0.5 * chi2.isf(LINE_LEVEL / independent, 2) * level:
+        line = line_near(rest, interval, aliased(frequency, interval), MAINS_DEVIATION * frequency)
+        if line is not None:
             found.append(frequency)
-            rest = left
+            rest = rest - line
     return rest, tuple(found)
+
+
+def line_near(samples: FloatArray, interval: float, shown: float, reach: float) -> FloatArray | None:
+    """Return the line within reach of a frequency [Hz] if it stands out of a record, else None."""
+    resolution = 1.0 / (len(samples) * interval)
+    if shown < 2.0 * resolution or shown > 0.5 / interval - 2.0 * resolution:
+        return None
+    line = _strongest_line(samples, interval, shown - reach, shown + reach)
+    # against the neighbourhood of the line, so that coloured noise is not taken for one
+    spectrum = np.abs(np.fft.rfft(samples - line)) ** 2
+    index = round(shown / resolution)
+    wide = 3 + ceil(reach / resolution)
+    near = np.r_[
+        spectrum[max(1, index - wide - 9) : max(1, index - wide + 1)],
+        spectrum[index + wide : index + wide + 10],
+    ]
+    level = near.mean() * 2.0 / len(samples)  # mean power that a line of noise alone takes from the sum
+    independent = 1.0 + 2.0 * reach / resolution
+    stands_out = level > 0.0 and line @ line > 0.5 * chi2.isf(LINE_LEVEL / independent, 2) * level
+    return line if stands_out else None
 
 
 def _strongest_line(samples: FloatArray, interval: float, low: float, high: float) -> FloatArray:

@@ -51,7 +51,7 @@ def pre_trigger_record(samples: FloatArray, interval: float | None, name: str, s
     if abs(mean) > 1e-12 * spread:
         samples = samples - mean
         spread = float(np.std(samples, ddof=1))
-    return NoiseRecord(spread, float(len(samples) - 1), samples, interval, "pre-trigger")
+    return NoiseRecord(spread, float(len(samples) - 1), samples, interval, "pre-trigger", source)
 
 
 def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | None:

@@ -223,15 +223,13 @@ def _trial(
         noise_factor=section.noise_factor,
         begins=section.begins or Start.SETTLED,
         inputs=inputs,
+        file=section.file,
         hold=section.hold,
     )
 
 
 def _inputs(
-    section: TrialSection,
-    table: TextTable,
-    campaign: CampaignSection,
-    user: str,
+    section: TrialSection, table: TextTable, campaign: CampaignSection, user: str
 ) -> tuple[RecordedInput, ...]:
     """Return the recorded inputs of a driven or static trial: those whose columns are there."""
     if section.kind not in (TrialKind.DRIVEN, TrialKind.STATIC):
@@ -242,7 +240,7 @@ def _inputs(
             continue
         values = _numbers(table, item, user)
         offset = si_value(repr(item.offset_deviation), item.quantity, item.unit)
-        found.append(RecordedInput(item.name, item.quantity, values, item.holds, offset))
+        found.append(RecordedInput(item.name, item.quantity, values, item.holds, offset, item.unit))
     return tuple(found)
 
 
@@ -405,6 +403,8 @@ def _channels(
             else si_value(str(raw.get("offset_deviation", 0.0)), item.quantity, item.unit),
             station=item.station,
             chord=item.chord,
+            column=item.table_column,
+            unit=item.unit,
         )
         stated = None
         if item.noise is not None:

@@ -101,6 +101,8 @@ class RecordedInput:
         Between them; None: nobody said it, and it is taken as linear.
     offset_deviation : float
         Prior standard deviation of a constant that the record lacks in this trial [SI]; zero: none.
+    unit : str
+        In which the file says it is; empty where there is no file.
     """
 
     name: str
@@ -108,6 +110,7 @@ class RecordedInput:
     values: FloatArray
     hold: Hold | None = None
     offset_deviation: float = 0.0
+    unit: str = field(default="", compare=False)
 
 
 class TrialKind(StrEnum):
@@ -136,6 +139,8 @@ class NoiseRecord:
         Sampling interval of `samples` [s].
     source : str
         "pre-trigger", "repeats" or "stated".
+    file : str
+        That holds `samples`; empty where there is none.
     """
 
     standard_deviation: float
@@ -143,6 +148,7 @@ class NoiseRecord:
     samples: FloatArray | None = None
     interval: float | None = None
     source: Literal["pre-trigger", "repeats", "stated"] = "stated"
+    file: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)
@@ -168,6 +174,8 @@ class Channel:
         Place along the span [m], for maps.
     chord : float or None
         Place along the chord [fraction], for maps.
+    column, unit : str
+        Of the files; empty where there are none.
     """
 
     name: str
@@ -178,6 +186,8 @@ class Channel:
     offset_deviation: float = 0.0
     station: float | None = None
     chord: float | None = None
+    column: str = field(default="", compare=False)
+    unit: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)
@@ -270,6 +280,8 @@ class Trial:
         trials: what was held in each row beside the force.
     hold : Hold or None
         Forced trials: as that of an input, for the force.
+    file : str
+        That holds it; empty where there is none.
     """
 
     name: str
@@ -292,6 +304,7 @@ class Trial:
     begins: Start = Start.SETTLED
     inputs: tuple[RecordedInput, ...] = ()
     hold: Hold | None = None
+    file: str = field(default="", compare=False)
 
     @property
     def input_names(self) -> tuple[str, ...]:

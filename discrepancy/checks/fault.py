@@ -5,20 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from discrepancy.campaign.records import Channel, Trial
+
 
 class FaultKind(StrEnum):
     """What is wrong."""
 
     NO_NOISE_RECORD = "no noise record"
     NOISE_LABEL = "noise label"  # the noise record contradicts repeats or the record itself
+    MOVES_AT_REST = "motion at rest"  # the noise record holds more than noise
     CLIPPED = "clipped"
     DEAD = "dead"  # a channel that shows nothing
+    FROZEN = "frozen"  # a value that is held while all else moves
+    COPIED = "copied"  # a channel that is another one
     OUTLIERS = "outliers"  # too many to be left out
     TOO_SHORT = "too short"
     UNDERSAMPLED = "undersampled"
     MISSING_OUTPUT = "missing output"
     WRONG_QUANTITY = "wrong quantity"
     UNIT_SLIP = "unit slip"
+    UNIT_DOUBT = "unit doubt"  # a factor between two units that physics may be as well
     INPUT_SLIP = "input slip"  # force or load factor of a trial in another unit
     SIGN = "sign"
     SWAPPED = "swapped"
@@ -30,6 +36,8 @@ HARMLESS = frozenset(
     {
         FaultKind.NO_NOISE_RECORD,
         FaultKind.NOISE_LABEL,
+        FaultKind.MOVES_AT_REST,
+        FaultKind.UNIT_DOUBT,
         FaultKind.BETWEEN_SAMPLES,
         FaultKind.UNOBSERVABLE,
     }
@@ -60,3 +68,13 @@ class DataFault:
     def fatal(self) -> bool:
         """Whether conclusions from these data would be wrong, not only limited."""
         return self.kind not in HARMLESS
+
+
+def place_of(channel: Channel, trial: Trial, start: int = 0, stop: int | None = None) -> str:
+    """Return where samples of a trial stand: column, file, trial and time span."""
+    time = trial.time[start:stop]
+    file = f" of {trial.file}" if trial.file else ""
+    return (
+        f"the column {(channel.column or channel.name)!r}{file} (the trial {trial.name!r}, {time[0]:.6g} to "
+        f"{time[-1]:.6g} s)"
+    )

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from math import log10, pi
+from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
-from discrepancy.campaign.units import si_value, units_of
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.holds import hold_sentence
 from discrepancy.checks.observability import unobservable
+from discrepancy.checks.rest import rest_faults
+from discrepancy.checks.unit_slips import unit_slips
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
 from discrepancy.models.wrapped import oscillates
@@ -25,22 +26,6 @@ FloatArray = NDArray[np.float64]
 LEAST_PERIODS = 3.0
 """Fewest periods of the first mode in a record in time."""
 LEAST_SAMPLES = 4.0
-_SLIPS = (
-    *((10.0**power, 3.0) for power in (3, 6, 9, -3, -6, -9)),
-    (100.0, 1.7), (0.01, 1.7), (9.80665, 1.35), (1.0 / 9.80665, 1.35),
-)  # fmt: skip
-"""Factors of a unit slip, and the factor by which physics may be off besides."""
-_INPUTS = {
-    TrialKind.STATIC: (Quantity.FORCE,), TrialKind.FORCED: (Quantity.FORCE,),
-    TrialKind.RINGDOWN: (Quantity.DISPLACEMENT,), TrialKind.FLIGHT: (Quantity.ACCELERATION,),
-}  # fmt: skip
-"""What drives a trial, as its quantity: the load factor may have been given in m/s2."""
-_UNLISTED = {
-    Quantity.FORCE: {9.80665, 1.0 / 9.80665}, Quantity.DISPLACEMENT: {100.0, 0.01},
-}  # fmt: skip
-"""Factors of units that files do not have: kilograms of force, centimetres."""
-SURE_SLIP = 500.0
-"""Slips beyond this factor are seen in a single trial of a channel; smaller ones need several trials."""
 _FROM_MOTION = {Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION}
 _VISIBLE = 0.01  # share of the largest prediction of its kind below which a channel tells nothing
 _ABOVE_NOISE = 5.0
@@ -52,17 +37,19 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
 
     For each channel and trial the data's scale is the robust slope of data over prediction where that is
     steady (static, flight), and the ratio of amplitudes in records in time, whose phase the model need not
-    know. A scale is a slip if it is near 10^3, 10^6, 10^9 (within a factor of 3), 100 (1.7) or 9.81 (1.35) or
-    one over them, in most trials of the channel; where all channels of some trials slip alike, the input of
-    those trials does. Negative slopes are reversed signs (of trials at rest, if the channel is in any).
-    Channels of one quantity are swapped if exchanging them leaves each less than half of its misfit and
-    explains 30 units of chi-square (with 2 % of the prediction as a floor of the noise). Signals of unknown
-    scale are left out of all this.
+    know. A scale is a slip if two units of the channel differ by it (within a factor of 3 from 200 on, of 2
+    from 20 on, of 1.35 from 7 on, of 1.1 below) in all its trials; where all channels of some trials slip
+    alike, the input of those trials does. A noise record with a line at the first mode is a limit. Negative
+    slopes are reversed signs (of trials at rest, if the channel is in any). Channels of one quantity are
+    swapped if exchanging them leaves each less than half of its misfit and explains 30 units of chi-square
+    (with 2 % of the prediction as a floor of the noise). Signals of unknown scale are left out of all this.
     """
     missing = tuple(_missing_outputs(campaign, model))
     if missing:
         return missing
     faults = list(_lengths(campaign, model))
+    if oscillates(model):
+        faults += rest_faults(campaign, model.scales(campaign).angular_frequency / (2.0 * pi))
     predictions = {
         trial.name: observe(model, campaign, trial, ModelPatch(), prior_mean(campaign, model, trial)).values
         for trial in campaign.trials
@@ -72,7 +59,7 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     exchanged = {name for pair, _ in swaps for name in pair}
     # What an exchange explains is no slip and no reversed sign.
     scales = {key: scale for key, scale in scales.items() if key[0] not in exchanged}
-    faults += _slips(campaign, scales)
+    faults += unit_slips(campaign, scales)
     faults += _signs(campaign, scales)
     for trial in campaign.trials:
         said = hold_sentence(campaign, model, trial, prior_mean(campaign, model, trial))
@@ -102,9 +89,8 @@ def _missing_outputs(campaign: Campaign, model: Model) -> Iterator[DataFault]:
         if quantity is None:
             yield DataFault(
                 FaultKind.MISSING_OUTPUT,
-                f"The channel {name!r} is compared with the output {channel.output!r}, which "
-                f"{model.name} does not "
-                "have: correct `output`, or leave the channel out.",
+                f"The channel {name!r} is compared with the output {channel.output!r}, which {model.name} "
+                "does not have: correct `output`, or leave the channel out.",
                 name,
             )
         elif channel.quantity is not Quantity.SIGNAL and not (
@@ -112,9 +98,8 @@ def _missing_outputs(campaign: Campaign, model: Model) -> Iterator[DataFault]:
         ):
             yield DataFault(
                 FaultKind.WRONG_QUANTITY,
-                f"The channel {name!r} measures {channel.quantity.value}, but the output "
-                f"{channel.output!r} of "
-                f"{model.name} is {quantity.value}: correct `quantity` or `output`.",
+                f"The channel {name!r} measures {channel.quantity.value}, but the output {channel.output!r} "
+                f"of {model.name} is {quantity.value}: correct `quantity` or `output`.",
                 name,
             )
 
@@ -130,9 +115,8 @@ def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
         if periods < LEAST_PERIODS:
             yield DataFault(
                 FaultKind.TOO_SHORT,
-                f"The trial {trial.name!r} holds {periods:.2g} periods of the first mode "
-                f"({frequency:.3g} Hz), and "
-                f"at least {LEAST_PERIODS:.0f} are needed: record longer.",
+                f"The trial {trial.name!r} holds {periods:.2g} periods of the first mode ({frequency:.3g} "
+                f"Hz), and at least {LEAST_PERIODS:.0f} are needed: record longer.",
                 trial=trial.name,
             )
         samples = 1.0 / (trial.interval * frequency)
@@ -216,105 +200,6 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: NDAr
     return ratio * (float(np.sign(np.median(centred[:until] * np.sign(model[0])))) or 1.0)
 
 
-def _plausible(campaign: Campaign, name: str, trial: str) -> tuple[tuple[float, float], ...]:
-    """Return the factors of unit slips that a channel can have, and by which factor physics may be off.
-
-    Those between two units of the channel, or of what drives the trial, and no others in a driven trial.
-    """
-    inputs = next(item for item in campaign.trials if item.name == trial)
-    driven = inputs.kind is TrialKind.DRIVEN or bool(inputs.inputs)
-    found = set()
-    own = campaign.channels[name].quantity
-    for quantity in (own, *_INPUTS.get(inputs.kind, ()), *(item.quantity for item in inputs.inputs)):
-        sizes = [si_value("1.0", quantity, unit) for unit in units_of(quantity)]
-        found |= {one / other for one in sizes for other in sizes if not 1.0 / 5.0 < one / other < 5.0}
-        found |= set() if driven else _UNLISTED.get(quantity, set())
-    if not driven:
-        return tuple(slip for slip in _SLIPS if any(abs(slip[0] / item - 1.0) < 1e-3 for item in found))
-    return tuple((factor, 3.0 if not 5e-3 < factor < 200.0 else 1.35) for factor in sorted(found))
-
-
-def _slip(scale: float, slips: tuple[tuple[float, float], ...] = _SLIPS) -> float | None:
-    """Return the factor of a unit slip nearest to a scale, None if it is none."""
-    for factor, wide in slips:
-        if abs(log10(abs(scale) / factor)) < log10(wide):
-            return factor
-    return None
-
-
-def _slips(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator[DataFault]:
-    found = {key: _slip(scale, _plausible(campaign, *key)) for key, scale in scales.items()}
-    by_trial: dict[str, list[float | None]] = defaultdict(list)
-    by_channel: dict[str, list[float | None]] = defaultdict(list)
-    for (name, trial), factor in found.items():
-        by_trial[trial].append(factor)
-        by_channel[name].append(factor)
-    # A channel that slips in all its trials is at fault itself; what slips in one trial only is its input's.
-    wrong_channels = {
-        name: factors[0]
-        for name, factors in by_channel.items()
-        if factors[0] is not None
-        and all(item == factors[0] for item in factors)
-        and (
-            campaign.channels[name].quantity is Quantity.ACCELERATION
-            or not 1.0 / SURE_SLIP < factors[0] < SURE_SLIP
-            or len(factors) > 1
-        )
-    }
-    shared = set(wrong_channels.values())
-    if set(wrong_channels) == set(by_channel) and len(by_channel) > 1 and len(shared) == 1:
-        yield DataFault(
-            FaultKind.INPUT_SLIP,
-            f"All channels of all trials are about {shared.pop():.6g} times what the model says: check the "
-            "units of forces (N), load factors (1) and release displacements.",
-        )
-        return
-    for name, factor in wrong_channels.items():
-        if factor is not None:
-            yield DataFault(FaultKind.UNIT_SLIP, _slip_sentence(campaign, name, factor), name)
-    for trial, factors in by_trial.items():
-        right = [
-            factor for (name, where), factor in found.items() if where == trial and name not in wrong_channels
-        ]
-        if right and right[0] is not None and all(factor == right[0] for factor in right):
-            yield DataFault(
-                FaultKind.INPUT_SLIP,
-                f"All channels of the trial {trial!r} are about {right[0]:.6g} times what the model "
-                "says, and those "
-                "of other trials are not: check the unit of its force, load factor or release displacement.",
-                trial=trial,
-            )
-        elif len(factors) > 0:
-            for (name, where), factor in found.items():
-                # a small factor in one trial alone may well be physics: lift that leaves the outer wing
-                plain = factor is not None and not 1.0 / SURE_SLIP < factor < SURE_SLIP
-                if where == trial and name not in wrong_channels and factor is not None and plain:
-                    yield DataFault(
-                        FaultKind.UNIT_SLIP,
-                        _slip_sentence(campaign, name, factor, f" in the trial {trial!r}"),
-                        name,
-                        trial,
-                    )
-
-
-def _slip_sentence(campaign: Campaign, name: str, factor: float, where: str = "") -> str:
-    quantity = campaign.channels[name].quantity
-    guess = {
-        (Quantity.STRAIN, 1e6): " (microstrain given as strain?)",
-        (Quantity.STRAIN, 1e-6): " (strain given as microstrain?)",
-        (Quantity.STRAIN, 100.0): " (percent given as strain?)",
-        (Quantity.DISPLACEMENT, 1e3): " (mm given as m?)",
-        (Quantity.DISPLACEMENT, 1e-3): " (m given as mm?)",
-        (Quantity.ACCELERATION, 1.0 / 9.80665): " (g given as m/s2?)",
-        (Quantity.ACCELERATION, 9.80665): " (m/s2 given as g?)",
-    }.get((quantity, factor), "")
-    return (
-        f"The channel {name!r} shows about {factor:.6g} times what the model says{where}{guess}: correct "
-        "its `unit`; "
-        "no physical effect is that large."
-    )
-
-
 # ---------------------------------------------------------------- signs
 
 
@@ -388,8 +273,7 @@ def _swaps_of(
                 fault = DataFault(
                     FaultKind.SWAPPED,
                     f"The channels {names[row]!r} and {names[place]!r} fit the model clearly better "
-                    "exchanged: check "
-                    "which wire or column is which, and exchange their `column` or `output`.",
+                    "exchanged: see which wire or column is which, and exchange their `column` or `output`.",
                     names[row],
                 )
                 yield (names[row], names[place]), fault

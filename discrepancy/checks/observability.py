@@ -7,6 +7,7 @@ from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.problem import Problem
+from discrepancy.judgement.separability import begun
 from discrepancy.models.interface import Model
 
 FloatArray = NDArray[np.float64]
@@ -18,11 +19,12 @@ LEFT = 0.9
 def prior_left(campaign: Campaign, model: Model) -> dict[str, float]:
     """Return the share of its prior deviation that the fitted records leave to each calibrated parameter.
 
-    From the information matrix at the prior mean; gains, zeros, initial states, constants of inputs and the
-    other parameters follow within their priors (what they can do as well is projected out).
+    From the information matrix at the prior mean. What begins in an unknown state begins as the records say:
+    of a model at rest no parameter shows. Gains, zeros, initial states, constants of inputs and the other
+    parameters follow within their priors (what they can do as well is projected out).
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    point = problem.start(Candidate())
+    point = begun(problem)
     count, known = problem.shared.size, len(problem.shared.parameter_mean)
     total = np.diag(problem.shared.precision)
     for number, data in enumerate(problem.trials):

@@ -1,4 +1,4 @@
-"""Faults that a campaign shows without a model: no noise record, clipping, dead channels, too many outliers.
+"""Faults that a campaign shows without a model: noise records, clipped, dead, frozen and copied channels.
 
 What makes a campaign unreadable (missing columns, uneven sampling, gaps, NaN) is refused by the reader at
 once; what only a model can tell (units, signs, swapped channels, length) is in
@@ -16,8 +16,10 @@ from scipy.stats import f as fisher
 from discrepancy.campaign.noise_records import repeat_record
 from discrepancy.campaign.records import Campaign, Channel, Trial
 from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.held_and_copied import copy_faults, held_faults, roughness
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers, mark_outliers
+from discrepancy.checks.rest import rest_faults
 from discrepancy.errors import CampaignDataError
 
 FloatArray = NDArray[np.float64]
@@ -35,8 +37,8 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     """Return the faults that a campaign shows by itself, by channel and trial.
 
     A channel without a noise record, or whose noise record contradicts repeats (F test at 0.1 %) or the
-    record itself (by a factor of two), is reported as a limit; a dead or clipped channel, or more than 3 %
-    of outliers in a record in time, as a fault of the data (`DataFault.fatal`).
+    record itself (by a factor of two) or moves, is reported as a limit; a dead, clipped, frozen or copied
+    channel, or more than 3 % of outliers in a record in time, as a fault of the data (`DataFault.fatal`).
     """
     faults: list[DataFault] = []
     for name, channel in campaign.channels.items():
@@ -45,8 +47,7 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
                 DataFault(
                     FaultKind.NO_NOISE_RECORD,
                     f"The channel {name!r} has no noise record, so whether a model explains it cannot be "
-                    "said: add "
-                    "samples at rest, repeats, or a standard deviation with its degrees of freedom.",
+                    "said: add samples at rest, repeats, or a standard deviation and its degrees of freedom.",
                     name,
                 )
             )
@@ -55,6 +56,10 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):
             faults += _record_faults(trial, name, trial.values[:, column], trial.used[:, column])
+        if trial.is_dynamic:
+            faults += held_faults(campaign, trial)
+    faults += copy_faults(campaign)
+    faults += rest_faults(campaign)
     for trial_name, name, found in find_outliers(campaign):
         trial = next(item for item in campaign.trials if item.name == trial_name)
         if trial.is_dynamic and found.sum() > LARGEST_SHARE * len(found):
@@ -62,10 +67,8 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
                 DataFault(
                     FaultKind.OUTLIERS,
                     f"{found.mean():.1%} of the readings of {name!r} in the trial {trial_name!r} are "
-                    "outliers, and "
-                    f"at most {LARGEST_SHARE:.0%} may be left out: mend the cause (loose wire, radio "
-                    "link) and "
-                    "repeat the trial, or leave the channel out of it.",
+                    f"outliers, and at most {LARGEST_SHARE:.0%} may be left out: mend the cause (loose wire, "
+                    "radio link) and repeat the trial, or leave the channel out of it.",
                     name,
                     trial_name,
                 )
@@ -122,16 +125,6 @@ def _noise_fault(channel: Channel, stated: float, found: float, what: str) -> Da
     )
 
 
-def roughness(values: FloatArray) -> float:
-    """Return the standard deviation of white noise that the sixth differences of a record would show.
-
-    Robust (median absolute deviation); differences of the sixth order take out motions of more than some
-    eight samples per period.
-    """
-    differences = np.diff(values, 6)
-    return float(1.4826 * np.median(np.abs(differences)) / np.sqrt(924.0))  # sum of squared binomials
-
-
 # ---------------------------------------------------------------- records
 
 
@@ -145,8 +138,7 @@ def _record_faults(trial: Trial, name: str, values: FloatArray, used: BoolArray)
         yield DataFault(
             FaultKind.DEAD,
             f"The channel {name!r} shows the same value throughout the trial {trial.name!r}: check its "
-            "wiring, or "
-            "leave it out of the trial.",
+            "wiring, or leave it out of the trial.",
             name,
             trial.name,
         )
@@ -158,11 +150,9 @@ def _record_faults(trial: Trial, name: str, values: FloatArray, used: BoolArray)
         if run:
             yield DataFault(
                 FaultKind.CLIPPED,
-                f"The channel {name!r} is clipped in the trial {trial.name!r}: {run} readings in a row "
-                "are at its "
-                f"{side} value {extreme:.6g} (SI), reached in a jump; widen the range of the amplifier "
-                "and repeat "
-                "the trial, or leave the channel out of it.",
+                f"The channel {name!r} is clipped in the trial {trial.name!r}: {run} readings in a row are "
+                f"at its {side} value {extreme:.6g} (SI), reached in a jump; widen the range of the "
+                "amplifier and repeat the trial, or leave the channel out of it.",
                 name,
                 trial.name,
             )

@@ -103,7 +103,7 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     from rest nothing would move, and nothing could be seen.
     """
     problem = Problem(campaign, model, setting)
-    point = _begun(problem)
+    point = begun(problem)
     trials: list[Trial] = []
     predicted = {}
     for number, data in enumerate(problem.trials):
@@ -124,13 +124,20 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     return replace(ideal, channels=channels)
 
 
-def _begun(problem: Problem) -> Point:
-    """Return the prior means, with the initial states that only the data tell."""
+def begun(problem: Problem) -> Point:
+    """Return the prior means, with the initial states that only the data tell, fitted with the model.
+
+    Raises
+    ------
+    FitError
+        As `fit`.
+    """
     start = problem.start(Candidate())
     unknown = [_unknown_begin(data.trial) for data in problem.trials]
     if not any(unknown):
         return start
-    found = fit(problem, Candidate(), start, local_only=True, evidence=False).point.local
+    # parameters follow: beside a frequency that is off, what begins would fade out of the record
+    found = fit(problem, Candidate(), start, evidence=False).point.local
     chosen = zip(unknown, found, start.local, strict=True)
     return replace(start, local=tuple(own if free else kept for free, own, kept in chosen))
 
@@ -159,7 +166,7 @@ def separability(
     """
     ideal = as_predicted(campaign, model, setting)
     problem = Problem(ideal, model, setting)
-    none = fit(problem, Candidate(), _begun(problem), iterations=1)
+    none = fit(problem, Candidate(), begun(problem), iterations=1)
     screen = Screen(problem, none)
     rows: list[Detectability] = []
     changes: dict[str, list[Change]] = {}

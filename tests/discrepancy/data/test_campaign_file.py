@@ -221,8 +221,9 @@ def same(one: object, other: object) -> bool:
         return isinstance(other, np.ndarray) and one.dtype == other.dtype and np.array_equal(one, other)
     if isinstance(one, Campaign | Trial | Channel | NoiseRecord):
         return all(
-            item.name == "data_hash" or same(getattr(one, item.name), getattr(other, item.name))
+            same(getattr(one, item.name), getattr(other, item.name))
             for item in fields(one)
+            if item.compare and item.name != "data_hash"
         )
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(map(same, one, other))

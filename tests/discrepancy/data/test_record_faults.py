@@ -1,0 +1,375 @@
+"""Records that no sensor made, in the files of a campaign: held, copied, in another unit, not at rest."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign, NoiseRecord, Quantity
+from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.held_and_copied import held_spans
+from discrepancy.checks.quality import check_against_model, check_data, require_sound
+from discrepancy.checks.rest import moves
+from discrepancy.checks.unit_slips import slip_between
+from discrepancy.errors import CampaignDataError
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.lumped_file import parse_lumped
+from discrepancy.sources.examples import example_campaign, plan_for
+
+FloatArray = NDArray[np.float64]
+
+MODEL = """
+format = 1
+name = "a mass on a spring"
+mass = 2.0
+stiffness = 800.0
+damping = { matrix = 0.8 }
+[[input]]
+name = "motor"
+vector = 1.0
+[[output]]
+name = "x"
+vector = 1.0
+quantity = "displacement"
+[[output]]
+name = "y"
+vector = -0.5
+quantity = "displacement"
+[[parameter]]
+name = "spring"
+terms = "stiffness"
+deviation = 0.1
+low = 0.3
+high = 3.0
+[[parameter]]
+name = "oil"
+terms = "damping"
+deviation = 0.3
+low = 0.1
+high = 3.0
+"""
+CHANNEL = """
+[[channel]]
+name = "{0}"
+column = "{0} [mm]"
+quantity = "displacement"
+unit = "mm"
+output = "{0}"
+"""
+TRIAL = """
+[[trial]]
+name = "ring {0}"
+kind = "driven"
+file = "{0}.csv"
+begins = "unknown"
+"""
+NOISE = '\n[noise]\nfile = "rest.csv"\n'
+TIME = 0.005 * np.arange(1600)
+Change = Callable[[FloatArray], None]
+
+
+def nothing(_: FloatArray) -> None:
+    """Leave a record as it is."""
+
+
+def campaign_of(
+    folder: Path, ring: Change = nothing, rest: Change = nothing, digit: float = 1e-6, trials: int = 2
+) -> Campaign:
+    """Write rings of x and y [mm] and a rest, changed in place, and return them as read."""
+    generator = np.random.default_rng(5)
+    folder.mkdir(exist_ok=True)
+    text = 'format = 1\nname = "rings"\n' + NOISE + CHANNEL.format("x") + CHANNEL.format("y")
+    tables = {"rest": 0.02 * generator.standard_normal((800, 2))}
+    rest(tables["rest"])
+    for number in range(trials):
+        # a tenth stiffer than the model has it: records in phase with it would say less
+        motion = (20.0 + number) * np.exp(-0.2 * TIME) * np.cos(np.sqrt(440.0) * TIME + number)
+        values = np.column_stack((motion, -0.5 * motion)) + 0.02 * generator.standard_normal((1600, 2))
+        ring(values)
+        tables[str(number)] = np.round(values / digit) * digit
+        text += TRIAL.format(number)
+    for name, values in tables.items():
+        table = np.column_stack((TIME[: len(values)], values))
+        np.savetxt(folder / f"{name}.csv", table, "%.7g", ",", header="time,x [mm],y [mm]", comments="")
+    (folder / "campaign.toml").write_text(text)
+    return read_campaign(folder)
+
+
+@pytest.fixture(scope="module")
+def model() -> LumpedModel:
+    return LumpedModel(parse_lumped(tomllib.loads(MODEL)))
+
+
+def only(faults: tuple[DataFault, ...], kind: FaultKind) -> DataFault:
+    """Return the one fault of a campaign, which is of a kind; what is held or scaled belies its noise too."""
+    (fault,) = (item for item in faults if item.kind is not FaultKind.NOISE_LABEL)
+    assert fault.kind is kind, fault.sentence
+    assert fault.sentence.count(". ") == 0
+    return fault
+
+
+def test_sound_rings_have_no_fault(tmp_path: Path, model: LumpedModel) -> None:
+    for digit in (1e-6, 0.5):
+        campaign = campaign_of(tmp_path, digit=digit)
+        assert [item for item in check_data(campaign) if item.kind is not FaultKind.NOISE_LABEL] == []
+        assert check_against_model(campaign, model) == ()
+
+
+# ---------------------------------------------------------------- held
+
+
+@pytest.mark.parametrize("digit", [1e-6, 0.1])
+@pytest.mark.parametrize("start", [310, 777])
+def test_a_sensor_that_freezes_for_half_a_second(tmp_path: Path, digit: float, start: int) -> None:
+    def freeze(values: FloatArray) -> None:
+        values[start : start + 100, 0] = values[start, 0]
+
+    fault = only(check_data(campaign_of(tmp_path, freeze, digit=digit, trials=1)), FaultKind.FROZEN)
+    assert (fault.channel, fault.trial, fault.fatal) == ("x", "ring 0", True)
+    assert "'x [mm]' of 0.csv" in fault.sentence
+    assert f"{TIME[start]:.6g} to {TIME[start + 99]:.6g} s" in fault.sentence
+
+
+def test_a_sensor_that_freezes_for_good_while_another_goes_on(tmp_path: Path) -> None:
+    def freeze(values: FloatArray) -> None:
+        values[1000:, 0] = values[1000, 0]
+
+    assert only(check_data(campaign_of(tmp_path, freeze, trials=1)), FaultKind.FROZEN).channel == "x"
+
+
+def _backlash(motion: FloatArray, gap: float) -> FloatArray:
+    seen = motion.copy()
+    for k in range(1, len(seen)):
+        seen[k] = min(max(seen[k - 1], motion[k] - gap), motion[k] + gap)
+    return seen
+
+
+def _sound(digit: float, pace: float, generator: np.random.Generator) -> dict[str, FloatArray]:
+    """Return records that stand still at times, each for a reason of its own."""
+    wave = np.sin(2.0 * np.pi * pace * TIME + 0.7)
+    ring = np.exp(-0.5 * pace * TIME) * wave
+    square = np.sign(wave)
+    pause = np.interp(TIME, [0.0, 1.0, 1.0 + 1 / pace, 2.0 + 1 / pace, 2.0 + 2 / pace], [0, 0, 1, 1, 0])
+    found = {
+        "ring": ring,
+        "noisy ring": ring + 0.5 * digit * generator.standard_normal(len(TIME)),
+        "warming": 5.0 * (1.0 - np.exp(-TIME * pace)),
+        "day": 3.0 * np.sin(0.3 * pace * TIME),
+        "rest": 0.4 * digit * generator.standard_normal(len(TIME)),
+        "square": square,
+        "filtered square": lfilter([0.05], [1.0, -0.95], square),
+        "telegraph": np.repeat(generator.choice([-1.0, 1.0], 40), 40),
+        "stairs": np.repeat(generator.standard_normal(40), 40),
+        "pauses": pause,
+        "backlash": _backlash(wave, 0.3),
+        "dead zone": np.sign(ring) * np.maximum(np.abs(ring) - 0.2, 0.0),
+        "bursts": np.where(TIME % 4.0 < 1.0, wave, 0.0),
+        "contact": np.maximum(wave - 0.9, 0.0),
+    }
+    return {name: np.round(values / digit) * digit for name, values in found.items()}
+
+
+@pytest.mark.parametrize("digit", [1e-3, 0.02, 0.2])
+@pytest.mark.parametrize("pace", [0.4, 1.3, 6.0])
+def test_what_rests_is_not_frozen(digit: float, pace: float) -> None:
+    used = np.ones(len(TIME), dtype=bool)
+    other = np.cos(5.0 * TIME)[:, np.newaxis]
+    for name, values in _sound(digit, pace, np.random.default_rng(2)).items():
+        assert held_spans(values, used, np.zeros((len(TIME), 0))) == [], name
+        if name in ("ring", "warming", "day", "backlash", "dead zone"):
+            assert held_spans(values, used, other) == [], name
+
+
+def test_a_pause_of_all_is_no_fault_and_a_held_value_is(tmp_path: Path) -> None:
+    """Where encoders show no noise, what the others do meanwhile tells a pause from a fault."""
+    clock = np.interp(TIME, [0.0, 3.0, 4.0, 8.0], [0.0, 3.0, 3.0, 7.0])
+    motion = clock + 0.1 * clock**2
+    used = np.ones(len(TIME), dtype=bool)
+    fine, coarse = np.round(motion, 3), np.round(motion, 2)
+    assert held_spans(fine, used, coarse[:, np.newaxis]) == []
+    going_on = np.round(np.sin(3.0 * TIME), 3)[:, np.newaxis]
+    assert held_spans(fine, used, going_on) == [(600, 801)]
+
+
+# ---------------------------------------------------------------- copied
+
+
+@pytest.mark.parametrize(
+    ("copy", "how"),
+    [
+        (lambda x: x.copy(), "digit for digit in"),
+        (lambda x: -0.3937 * x, "times -0.3937 in"),
+        (lambda x: 2.0 * x + 3.0, "times 2 in"),
+        (lambda x: np.roll(x, 7), "digit for digit, 7 samples later, in"),
+        (lambda x: 1.5 * np.roll(x, -40), "times 1.5, 40 samples earlier, in"),
+    ],
+)
+@pytest.mark.parametrize("digit", [1e-6, 0.05])
+def test_a_channel_that_is_another_one(
+    tmp_path: Path, copy: Callable[[FloatArray], FloatArray], how: str, digit: float
+) -> None:
+    def spoil(values: FloatArray) -> None:
+        values[:, 0] = np.round(values[:, 0] / digit) * digit
+        values[:, 1] = copy(values[:, 0])
+
+    fault = only(check_data(campaign_of(tmp_path, spoil)), FaultKind.COPIED)
+    assert fault.fatal
+    assert f"The channel 'y' is the channel 'x' {how} the column 'y [mm]' of 0.csv" in fault.sentence
+    assert "(the trial 'ring 0', 0 to 7.995 s), and so in 1 more of its trials" in fault.sentence
+
+
+def test_what_moves_alike_is_no_copy(tmp_path: Path) -> None:
+    def without_noise(values: FloatArray) -> None:
+        values[:, 0] = 20.0 * np.exp(-0.2 * TIME) * np.cos(21.0 * TIME)
+        values[:, 1] = -0.5 * values[:, 0]
+
+    def switched(values: FloatArray) -> None:
+        values[:, 0] = np.sign(np.cos(21.0 * TIME))
+        values[:, 1] = -0.5 * values[:, 0]
+
+    def warmed(values: FloatArray) -> None:
+        values[:, 0] = np.round(20.0 + TIME, 1)
+        values[:, 1] = np.round(18.0 + 1.1 * TIME, 1)
+
+    for change in (without_noise, switched, warmed):
+        assert FaultKind.COPIED not in {item.kind for item in check_data(campaign_of(tmp_path, change))}
+
+
+# ---------------------------------------------------------------- units
+
+
+@pytest.mark.parametrize(
+    ("scale", "quantity", "stated", "drive", "pair"),
+    [
+        (1.0 / 25.0, Quantity.DISPLACEMENT, "mm", False, "inch given as mm"),
+        (38.0, Quantity.DISPLACEMENT, "m", False, "inch given as m"),
+        (-1e3, Quantity.DISPLACEMENT, "m", False, "mm given as m"),
+        (0.102, Quantity.FORCE, "N", False, "kgf given as N"),
+        (9.6, Quantity.FORCE, "N", True, "kgf given as N"),
+        (4.5, Quantity.FORCE, "N", True, "lbf given as N"),
+        (60.0, Quantity.ANGLE, "rad", False, "deg given as rad"),
+        (1.0 / 57.0, Quantity.ANGLE, "deg", False, "rad given as deg"),
+        (1.0 / 6.25, Quantity.ANGULAR_VELOCITY, "rad/s", False, "Hz given as rad/s"),
+        (9.4, Quantity.ANGULAR_VELOCITY, "rad/s", False, "rpm given as rad/s"),
+        (62.0, Quantity.FLOW, "l/s", False, "l/min given as l/s"),
+        (0.1, Quantity.ACCELERATION, "m/s2", False, "g given as m/s2"),
+        (1.5, Quantity.FORCE, "N", False, ""),
+        (3.0, Quantity.FORCE, "N", True, ""),
+        (30.0, Quantity.STRAIN, "microstrain", False, ""),
+    ],
+)
+def test_a_factor_names_its_pair_of_units(
+    scale: float, quantity: Quantity, stated: str, drive: bool, pair: str
+) -> None:
+    assert str(slip_between(scale, quantity, stated, drive=drive) or "").strip("(?)") == pair
+
+
+@pytest.fixture(scope="module")
+def chain() -> tuple[Campaign, LumpedModel]:
+    model = LumpedModel.load("three_mass_chain")
+    plan = plan_for(model, ("x3", "x1", "base_strain"), "end")
+    campaign = example_campaign(model, "laboratory", 3, plan)
+    channels = {
+        name: replace(item, unit="mm" if item.quantity is Quantity.DISPLACEMENT else "microstrain")
+        for name, item in campaign.channels.items()
+    }
+    return replace(campaign, channels=channels), model
+
+
+def test_inches_stated_as_millimetres(chain: tuple[Campaign, LumpedModel]) -> None:
+    campaign, model = chain
+
+    def inches(campaign: Campaign) -> Campaign:
+        trials = []
+        for trial in campaign.trials:
+            scale = np.where(np.array(trial.channels) == "x3", 1.0 / 25.4, 1.0)
+            trials.append(replace(trial, values=trial.values * scale))
+        return replace(campaign, trials=tuple(trials))
+
+    assert check_against_model(campaign, model) == ()
+    faults = check_against_model(inches(campaign), model)
+    fault = only(faults, FaultKind.UNIT_SLIP)
+    assert "'x3' shows about 0.0393701 times what the model says (inch given as mm?)" in fault.sentence
+    with pytest.raises(CampaignDataError, match="inch given as mm"):
+        require_sound(faults)
+
+
+@pytest.mark.parametrize(("unit", "kind"), [(9.80665, FaultKind.INPUT_SLIP), (4.448, FaultKind.UNIT_DOUBT)])
+def test_loads_in_another_unit(chain: tuple[Campaign, LumpedModel], unit: float, kind: FaultKind) -> None:
+    """What four and a half times the load would do, a structure may do as well: no fault, but a limit."""
+    campaign, model = chain
+    trials = tuple(replace(trial, force=trial.force / unit) for trial in campaign.trials)
+    faults = check_against_model(replace(campaign, trials=trials), model)
+    static = [trial.name for trial in campaign.trials if not trial.is_dynamic]
+    assert [(fault.kind, fault.trial) for fault in faults] == [(kind, name) for name in static]
+    assert f"({'kgf' if unit > 9.0 else 'lbf'} given as N?)" in faults[0].sentence
+    assert faults[0].fatal is (kind is FaultKind.INPUT_SLIP)
+
+
+# ---------------------------------------------------------------- at rest
+
+
+def _record(samples: FloatArray) -> NoiseRecord:
+    return NoiseRecord(float(np.std(samples)), len(samples) - 1.0, samples - samples.mean(), 0.005)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_of_any_colour_is_at_rest(seed: int) -> None:
+    white = np.random.default_rng(seed).standard_normal(1300)
+    mains = np.sin(2.0 * np.pi * 50.0 * 0.005 * np.arange(800) + 0.3)
+    for samples in (
+        white[500:],
+        np.round(0.6 * white[500:]),
+        lfilter([1.0], [1.0, -0.8], white)[500:],
+        lfilter([1.0], [1.0, -1.6, 0.8], white)[500:],
+        white[500:] + 2.0 * mains,
+        np.random.default_rng(seed).standard_t(3, 800),
+    ):
+        assert moves(_record(samples)) is None
+        assert moves(_record(samples), 3.2) is None
+
+
+@pytest.mark.parametrize(
+    ("motion", "what"),
+    [
+        (lambda t: 0.03 * np.cos(20.5 * t), "a line near the model's 3.18 Hz with"),
+        (lambda t: 0.3 * np.exp(-2.0 * t) * np.cos(30.0 * t), "scatters "),
+        (lambda t: 0.03 * t, "drifts by 0.000121 (SI) over its length, "),
+    ],
+)
+def test_a_noise_record_that_moves_is_a_limit(
+    tmp_path: Path, model: LumpedModel, motion: Callable[[FloatArray], FloatArray], what: str
+) -> None:
+    def move(values: FloatArray) -> None:
+        values[:, 1] += motion(TIME[: len(values)])
+
+    campaign = campaign_of(tmp_path, rest=move)
+    faults = [
+        item
+        for item in (*check_data(campaign), *check_against_model(campaign, model))
+        if item.kind is FaultKind.MOVES_AT_REST
+    ]
+    assert {(item.channel, item.fatal) for item in faults} == {("y", False)}
+    assert any("the column 'y [mm]' of rest.csv, " in item.sentence for item in faults)
+    assert any(what in item.sentence for item in faults), [item.sentence for item in faults]
+
+
+# ---------------------------------------------------------------- what a motion of unknown begin tells
+
+
+def test_a_motion_that_begins_somehow_tells_its_parameters(tmp_path: Path, model: LumpedModel) -> None:
+    assert check_against_model(campaign_of(tmp_path), model) == ()
+
+    def still(values: FloatArray) -> None:
+        values[:] = 0.02 * np.random.default_rng(1).standard_normal(values.shape)
+
+    fault = only(check_against_model(campaign_of(tmp_path, still), model), FaultKind.UNOBSERVABLE)
+    assert "'oil'" in fault.sentence
