@@ -15,7 +15,7 @@ from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
 from .columns import Columns
-from .naming import ForceSearch, Seen, seen
+from .naming import ROUNDS, ForceSearch, Seen, seen
 from .view import Column
 
 FloatArray = NDArray[np.float64]
@@ -182,10 +182,16 @@ def _of_verdict(search: ForceSearch, fit: CandidateFit) -> list[_Drawn]:
     for port, one in search.at.items():
         forces = (item for item in patch if isinstance(item, PortForce))
         own = ModelPatch(tuple(item for item in forces if item.port == port))
-        column = columns.of_patch(one.view, one.motions, own, fit.candidate.acts_on) if len(own) else None
-        if column is not None:
-            view = replace(one.view, motions=one.motions, certain=(*one.view.certain, column))
-            found.append(_Drawn(seen(view, one.process), column, 1.0, named))
+        drawn, motions = None, one.motions
+        for _ in range(ROUNDS if len(own) else 0):  # along the motion that the law itself gives
+            column = columns.of_patch(one.view, motions, own, fit.candidate.acts_on)
+            if column is None:
+                break
+            view = replace(one.view, motions=motions, certain=(*one.view.certain, column))
+            drawn = _Drawn(seen(view, one.process), column, 1.0, named)
+            motions = drawn.seen.motions
+        if drawn is not None:
+            found.append(drawn)
     return found
 
 

@@ -1,6 +1,6 @@
 """Sections on what was found: verdict, next experiment, where the gap is."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite, isnan
 
 from discrepancy.judgement.conclusion import named_effects
@@ -35,13 +35,15 @@ LEAST_SHARE = 0.05
 SHOWN_FINDINGS = 8
 
 
-def add_verdict(page: Page, content: ReportInput) -> None:
-    """Add the verdict: its sentence, what is added, in what sizes."""
+def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | None = None) -> None:
+    """Add the verdict: its sentence and size, its `picture`, what is added, in what sizes."""
     investigation = content.investigation
     verdict = investigation.verdict
     page.add_notice(headline(verdict))
     if opening := " ".join(filter(None, (_sizes(content), closing_sentence(investigation)))):
         page.add_paragraph(opening)
+    if picture is not None:
+        picture()
     page.add_paragraph(meaning(verdict))
     if shares := shares_sentence(verdict):
         page.add_paragraph(f"{shares} {remainders_sentence(verdict)}".strip())

@@ -1,5 +1,7 @@
 """The page: verdict first, then where the gap is, why this name, the proof, and the limits."""
 
+from functools import partial
+
 from discrepancy.report.content import ReportFigure, ReportInput
 from discrepancy.report.findings import add_location, add_next, add_verdict
 from discrepancy.report.grounds import (
@@ -47,8 +49,7 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
                 page.add_figure(drawings[name], item.caption, title=item.title)
 
     page.add_section("Verdict")
-    show("missing_force")
-    add_verdict(page, content)
+    add_verdict(page, content, partial(show, "missing_force"))
     show("shares")
     if verdict.kind is VerdictKind.DATA_ERROR:
         add_data(page, investigation)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import pytest
@@ -77,7 +78,7 @@ def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path: Path) -> Non
     assert found.verdict.kind is VerdictKind.DATA_ERROR
     report = write_verdict_folder(tmp_path / "v", VerdictContent(found, ORIGIN))
     page = report.read_text(encoding="utf-8")
-    assert found.verdict.sentence.split(",")[0] in page
+    assert found.verdict.sentence.split(",")[0] in unescape(page)
     assert "Proof" not in page
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
 
