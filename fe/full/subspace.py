@@ -41,6 +41,10 @@ class Norm:
         """Return the representatives X^-1 functionals, (n, k) or (n,)."""
         return self._factorisation.raw_solve(functionals)
 
+    def whitened(self, functionals: FloatArray) -> FloatArray:
+        """Return L^-1 functionals, (n, k) or (n,), with X = L L': their lengths are the dual norms."""
+        return self._factorisation.whitened(functionals)
+
 
 def conjugate_gradients(
     matrix: Any,

@@ -22,9 +22,10 @@ from fe.full.subspace import (
     Norm,
     OrthonormalBasis,
     conjugate_gradients,
-    triangular_factors,
 )
 from fe.runtime.reduced_arrays import AffineArrays
+
+from .dual_solutions import DualData, DualProblem, beside
 
 FloatArray = npt.NDArray[np.float64]
 State = tuple[float, ...]
@@ -32,12 +33,8 @@ _Model = TypeVar("_Model", bound=AffineArrays)
 
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
-DUAL_TOLERANCE = 0.05
-"""Relative residual of the approximate dual solutions at their own anchors."""
 FIRST_TOLERANCE, SNAPSHOT_TOLERANCE = 1e-10, 1e-6
 """Relative residual of the first full solutions and of the others."""
-MOST_COLUMNS = 48
-"""Columns of approximate dual solutions that are iterated together."""
 ROUNDING_FACTOR, LEAST_ROUNDING = 8.0, 5e-6
 """Rounding allowance as a multiple of the difference seen at the first full solutions, and its least value:
 with condition numbers of 1e10, full solutions differ by 1e-6 among themselves."""
@@ -85,14 +82,6 @@ class Judgement(Generic[_Model]):
     bound: Callable[[_Model, State], float]
 
 
-@dataclass(frozen=True)
-class _DualData:
-    """Approximate dual solutions: products with X (A, n, O) and factors of their residuals."""
-
-    products: FloatArray
-    factors: FloatArray
-
-
 class StaticReduction:
     """State of the greedy search: the bases that full solutions have given.
 
@@ -104,8 +93,8 @@ class StaticReduction:
         Energy norm at `reference`.
     reference : (T - 1,) ndarray
         Coefficients of the stiffness terms of the norm, without the last.
-    anchors : list of (T,) ndarray
-        Coefficients at which the dual problems are solved.
+    duals : callable
+        Solves the dual problems.
     farthest : (T - 1,) ndarray
         Largest distance of each coefficient from its reference.
     advance : callable
@@ -122,7 +111,7 @@ class StaticReduction:
         problem: AffineProblem,
         norm: Norm,
         reference: FloatArray,
-        anchors: list[FloatArray],
+        duals: Callable[[DualProblem], DualData],
         farthest: FloatArray,
         advance: Callable[[int, str], object],
         least: FloatArray | None = None,
@@ -147,50 +136,15 @@ class StaticReduction:
         else:
             self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
             self.residual_basis.extend(problem.loads)
-        self.dual = self._approximate_duals(anchors)
+        self.dual = duals(
+            DualProblem(terms, problem.outputs, norm, reference, self.stiffness, batch, advance)
+        )
         self.snapshots: list[State] = []
-
-    def _approximate_duals(self, anchors: list[FloatArray]) -> _DualData:
-        """Solve the dual problems at the anchors, and prepare the norms of their residuals elsewhere."""
-        stiffness_terms, outputs = self.problem.stiffness_terms, self.problem.outputs
-        terms, (n, count) = len(stiffness_terms), outputs.shape
-        products = np.empty((len(anchors), n, count))
-        factors = np.empty((len(anchors), count, terms, terms))
-        at_reference = self.norm.riesz(outputs)
-        together = 1 if self.batch == 1 else max(1, MOST_COLUMNS // count)
-        for first in range(0, len(anchors), together):
-            chosen = anchors[first : first + together]
-            # a rough solution will do: the norm of what it leaves is computed, not assumed
-            duals = conjugate_gradients(
-                self._matrices(chosen),
-                self.norm,
-                _beside([outputs] * len(chosen)),
-                _beside([at_reference] * len(chosen)),
-                tolerance=DUAL_TOLERANCE,
-            )
-            for number, dual in enumerate(np.split(duals, len(chosen), axis=1), start=first):
-                images = [np.asarray(term @ dual) for term in stiffness_terms]
-                lifted = self._lifted(images[:-1])
-                # X^-1 K_base dual, since X is the sum of all terms at the reference
-                base = dual - sum(t * part for t, part in zip(self.reference, lifted, strict=True))
-                factors[number] = triangular_factors(
-                    np.stack((at_reference - base, *lifted), axis=2),
-                    np.stack((outputs - images[-1], *images[:-1]), axis=2),
-                )
-                products[number] = self.norm.product(dual)
-                self.advance(1, "dual solutions")
-        return _DualData(products, factors)
 
     def _matrices(self, thetas: list[FloatArray]) -> Any:
         """Return the stiffness at coefficients (T,), or those of several, each for its own columns."""
         matrices = [self.stiffness(theta) for theta in thetas]
         return matrices[0] if len(matrices) == 1 else BlockDiagonal(matrices)
-
-    def _lifted(self, images: list[FloatArray]) -> list[FloatArray]:
-        """Return the representatives of functionals, several (n, k) each."""
-        if self.batch == 1:
-            return [self.norm.riesz(image) for image in images]
-        return np.split(self.norm.riesz(np.concatenate(images, axis=1)), len(images), axis=1)
 
     def add_snapshots(self, states: list[State]) -> None:
         """Solve the full model for all loads at several states and extend the bases."""
@@ -200,8 +154,8 @@ class StaticReduction:
         solution = conjugate_gradients(
             self._matrices(thetas),
             self.norm,
-            _beside([loads] * len(states)),
-            _beside([self._galerkin(theta) for theta in thetas]),
+            beside([loads] * len(states)),
+            beside([self._galerkin(theta) for theta in thetas]),
             tolerance=tolerance,
         )
         before = self.basis.size
@@ -261,6 +215,8 @@ class StaticReduction:
             "rounding_allowance": max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
             "dual_correction": np.swapaxes(self.dual.products, 1, 2) @ residual,
             "dual_residual": self.dual.factors,
+            "dual_stiffness": self.dual.stiffness,
+            "dual_output": self.dual.output,
         }
 
     def cross_mass(self, modal_basis: FloatArray) -> FloatArray:
@@ -344,11 +300,6 @@ def greedy(
         present = model()
         bounds.append(max(judgement.bound(present, mu) for mu in states))
     return bounds
-
-
-def _beside(blocks: list[FloatArray]) -> FloatArray:
-    """Return blocks (n, k) beside each other; one alone as it is: its layout decides how sums round."""
-    return blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1)
 
 
 def _spread(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:

@@ -5,6 +5,7 @@ The method and what it reaches are in `docs/reduced_model.md`.
 
 import itertools
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,17 @@ from fe.runtime.reduced import ReducedModel
 from .certified_basis import AffineProblem, StaticReduction, greedy
 from .compression import WING_JUDGEMENT, compressed, fewest_directions
 from .modal_basis import ModalData, reduce_modes
-from .settings import ALONE, TOGETHER, ReductionSettings, loss_splits, remaining_levels, training_set
+from .dual_solutions import DualData, DualProblem
+from .settings import (
+    ALONE,
+    MOST_GRID_REGIONS,
+    TOGETHER,
+    ReductionSettings,
+    loss_splits,
+    remaining_levels,
+    star,
+    training_set,
+)
 from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -105,15 +116,13 @@ def reduce_model(
             together,
         )
     with stage_of(progress, "Reducing the statics") as stage:
-        counts = settings.anchors(regions)
-        levels = itertools.product(*(remaining_levels(settings.stiffness_loss, count) for count in counts))
         e, *losses = settings.validity_box(regions)[: len(reference)]
         ends = np.array((e, *(1.0 - z for z in losses)))
         static = StaticReduction(
             wing_problem(system),
             norm,
             reference,
-            anchors=[np.array((reference[0], *remaining, 1.0)) for remaining in levels],
+            duals=partial(_duals, settings=settings, reference=reference, ends=ends),
             farthest=np.abs(ends - reference[:, np.newaxis]).max(axis=1),
             advance=stage.advance,
             batch=together,
@@ -142,6 +151,18 @@ def reduce_model(
         tuple(static.snapshots),
         tuple(history),
     )
+
+
+def _duals(
+    problem: DualProblem, settings: ReductionSettings, reference: FloatArray, ends: FloatArray
+) -> DualData:
+    """Return the dual solutions at anchors or, of many regions, to be combined."""
+    regions = len(reference) - 1
+    if regions > MOST_GRID_REGIONS and not settings.dual_anchors:
+        return problem.combined([np.append(values, 1.0) for values in star(reference, ends)])
+    counts = settings.anchors(regions)
+    levels = itertools.product(*(remaining_levels(settings.stiffness_loss, count) for count in counts))
+    return problem.nearest([np.array((reference[0], *remaining, 1.0)) for remaining in levels])
 
 
 def _model(

@@ -106,9 +106,14 @@ class ReductionSettings:
 
 
 def default_anchors(regions: int) -> tuple[int, ...]:
-    """Return two approximate dual solutions along each loss, for as many regions as a model holds them."""
-    twice = MOST_ANCHORS.bit_length() - 1
-    return tuple(2 if number < twice else 1 for number in range(regions))
+    """Return two approximate dual solutions along each loss, or one where they are combined."""
+    return (2 if regions <= MOST_GRID_REGIONS else 1,) * regions
+
+
+def star(middle: FloatArray, ends: FloatArray) -> list[FloatArray]:
+    """Return the middle (V,), and each quantity alone at either of its ends (V, 2)."""
+    alone = np.eye(len(middle), dtype=bool)
+    return [middle, *(np.where(chosen, end, middle) for chosen, span in zip(alone, ends, strict=True) for end in span)]
 
 
 def remaining_levels(loss: Range, count: int) -> FloatArray:

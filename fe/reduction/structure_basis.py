@@ -20,8 +20,17 @@ from fe.structure.affine import AffineStructure
 
 from .certified_basis import AffineProblem, Judgement, State, StaticReduction, greedy
 from .compression import compressed, fewest_directions
+from .dual_solutions import DualData, DualProblem
 from .modal_basis import ModalState, loss_corners, modal_basis
-from .settings import TOGETHER, ModalSettings, default_anchors, loss_splits, remaining_levels
+from .settings import (
+    MOST_GRID_REGIONS,
+    TOGETHER,
+    ModalSettings,
+    default_anchors,
+    loss_splits,
+    remaining_levels,
+    star,
+)
 from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -120,11 +129,17 @@ class _Terms:
         values, count = np.array(state), len(self.parameters)
         return self._coefficients(values[:count], 1.0 - values[count:])
 
-    def anchors(self) -> list[FloatArray]:
-        """Coefficients at which the dual problems are solved."""
+    def duals(self, problem: DualProblem) -> DualData:
+        """Dual solutions at anchors or, of many regions, to be combined."""
         middle = np.array([np.mean(ends) for ends in self.parameters])
+        if len(self.losses) > MOST_GRID_REGIONS:
+            lost = [1.0 - remaining_levels(ends, 1)[0] for ends in self.losses]
+            states = star(np.array([*middle, *lost]), np.array([*self.parameters, *self.losses]))
+            return problem.combined([self.theta(tuple(state)) for state in states])
         levels = [remaining_levels(ends, count) for ends, count in zip(self.losses, self.counts, strict=True)]
-        return [self._coefficients(middle, np.array(kept)) for kept in itertools.product(*levels)]
+        return problem.nearest(
+            [self._coefficients(middle, np.array(kept)) for kept in itertools.product(*levels)]
+        )
 
     def corners(self) -> list[State]:
         """Corners of parameters and losses: all of a few, else those of `loss_corners`."""
@@ -230,7 +245,7 @@ def reduce_structure(
             terms.problem,
             norm,
             terms.reference[:-1],
-            terms.anchors(),
+            terms.duals,
             terms.farthest()[:-1],
             stage.advance,
             least := _least(terms.problem, norm),
