@@ -86,7 +86,8 @@ def _written(
     meshio.write(folder / f"{name}.vtu", mesh)
     file = folder / f"{name}.toml"
     damage = "".join(
-        f'\n[[damage]]\nname = "z{number}"\nset = "region={number}"\n' for number in range(1, region.max() + 1)
+        f'\n[[damage]]\nname = "z{number}"\nset = "region={number}"\n'
+        for number in range(1, region.max() + 1)
     )
     file.write_text(text + damage, encoding="utf-8")
     return file
@@ -100,7 +101,9 @@ def plate(folder: Path, regions: int, around: int = 32) -> Path:
     angle = 2.0 * np.pi * places[:, 1]
     circle = 20.0 * np.column_stack((np.cos(angle), np.sin(angle)))
     # along the sides of the plate by equal parts, so that its corners are nodes
-    corners = np.array([(100, 0), (100, 50), (0, 50), (-100, 50), (-100, 0), (-100, -50), (0, -50), (100, -50)])
+    corners = np.array(
+        [(100, 0), (100, 50), (0, 50), (-100, 50), (-100, 0), (-100, -50), (0, -50), (100, -50)]
+    )
     eighth = np.column_stack(
         [np.interp(8.0 * places[:, 1], np.arange(9), np.append(corners[:, k], corners[0, k])) for k in (0, 1)]
     )
@@ -135,7 +138,9 @@ def bracket(folder: Path, regions: int) -> Path:
     mesh = meshio.read(file.with_suffix(".inp"))
     cells = mesh.cells[0].data
     centre = mesh.points[cells[:, :8]].mean(axis=1)
-    way = np.where(centre[:, 0] < 6.0, 60.0 - centre[:, 2], 60.0 + centre[:, 0])  # down the back, along the arm
+    way = np.where(
+        centre[:, 0] < 6.0, 60.0 - centre[:, 2], 60.0 + centre[:, 0]
+    )  # down the back, along the arm
     number = np.searchsorted(np.quantile(way, np.arange(1, regions + 1) / (regions + 1)), way, side="right")
     text = file.read_text(encoding="utf-8")
     text = text[: text.index("[[damage]]")] + text[text.index("[[gauge]]") :]
@@ -146,8 +151,6 @@ def bracket(folder: Path, regions: int) -> Path:
     mesh.write(folder / "bracket.inp")
     deck = (folder / "bracket.inp").read_text(encoding="utf-8")
     (folder / "bracket.inp").write_text(deck.replace("C3D20RH", "C3D20"), encoding="utf-8")
-    damage = "".join(
-        f'\n[[damage]]\nname = "z{one}"\nset = "R{one}"\n' for one in range(1, regions + 1)
-    )
+    damage = "".join(f'\n[[damage]]\nname = "z{one}"\nset = "R{one}"\n' for one in range(1, regions + 1))
     (folder / "bracket.toml").write_text(text + damage, encoding="utf-8")
     return folder / "bracket.toml"

@@ -125,20 +125,13 @@ class StaticReduction:
         self.farthest = farthest
         n = len(problem.loads)
         self.basis = OrthonormalBasis(n, norm, drop=1e-7)
-        self.images = [
-            np.empty((n, 0)) for _ in problem.stiffness_terms
-        ]  # stiffness terms times basis vectors
+        self.in_basis = np.empty((len(terms), 0, 0))  # stiffness terms in the basis
         self.rounding = 0.0
-        self.residual_basis: OrthonormalBasis | FunctionalBasis
-        if batch == 1:
-            self.residual_basis = OrthonormalBasis(n, norm, drop=1e-8, functionals=True)
-            self.residual_basis.extend(norm.riesz(problem.loads), problem.loads)
-        else:
-            self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
-            self.residual_basis.extend(problem.loads)
-        self.dual = duals(
-            DualProblem(terms, problem.outputs, norm, reference, self.stiffness, batch, advance)
-        )
+        self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
+        self.residual_load = self.residual_basis.extend(problem.loads)
+        self.residual_stiffness = np.empty((len(self.residual_load), len(terms), 0))
+        self.dual = duals(DualProblem(terms, problem.outputs, norm, self.stiffness, advance))
+        self.correction = np.swapaxes(self.dual.products, 1, 2) @ self.residual_basis.vectors
         self.snapshots: list[State] = []
 
     def _matrices(self, thetas: list[FloatArray]) -> Any:
@@ -163,32 +156,37 @@ class StaticReduction:
         new = self.basis.vectors[:, before:]
         if not new.shape[1]:
             raise ExtensionError  # rounding is reached; what the search reached is judged after it
-        images = [np.asarray(term @ new) for term in self.problem.stiffness_terms]
-        self.images = [np.concatenate(pair, axis=1) for pair in zip(self.images, images, strict=True)]
-        varying = np.concatenate(images[:-1], axis=1)
-        functionals = np.concatenate((self.basis.products[:, before:], varying), axis=1)
-        if isinstance(self.residual_basis, FunctionalBasis):
-            self.residual_basis.extend(functionals)
-        else:
-            self.residual_basis.extend(np.concatenate((new, self.norm.riesz(varying)), axis=1), functionals)
+        self._take_images([np.asarray(term @ new) for term in self.problem.stiffness_terms])
         if not self.snapshots:
             self.rounding = self._rounding(thetas[0], self.problem.outputs.T @ solution)
         self.snapshots.extend(states)
+
+    def _take_images(self, images: list[FloatArray]) -> None:
+        """Take the stiffness terms times the last basis vectors, (n, k) each, into what is kept of all."""
+        before, known = self.in_basis.shape[-1], self.residual_basis.vectors.shape[1]
+        new = np.stack([self.basis.vectors.T @ image for image in images])
+        older = np.swapaxes(new[:, :before], 1, 2)
+        self.in_basis = np.concatenate((np.concatenate((self.in_basis, older), axis=1), new), axis=2)
+        found = self.residual_basis.extend(np.concatenate(images, axis=1))
+        # what was there lies in the basis that was there
+        self.residual_load = _with_rows(self.residual_load, len(found))
+        self.residual_stiffness = np.concatenate(
+            (_with_rows(self.residual_stiffness, len(found)), found.reshape(len(found), len(images), -1)),
+            axis=2,
+        )
+        added = np.swapaxes(self.dual.products, 1, 2) @ self.residual_basis.vectors[:, known:]
+        self.correction = np.concatenate((self.correction, added), axis=2)
 
     def _galerkin(self, theta: FloatArray) -> FloatArray:
         """Return the solutions (n, L) in the present basis."""
         if not self.basis.size:
             return np.zeros_like(self.problem.loads)
-        image = sum(t * k for t, k in zip(theta, self.images, strict=True))
-        basis = self.basis.vectors
-        return np.asarray(basis @ np.linalg.solve(basis.T @ image, basis.T @ self.problem.loads))
+        stiffness, basis = np.tensordot(theta, self.in_basis, 1), self.basis.vectors
+        return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.problem.loads))
 
     def _rounding(self, theta: FloatArray, wanted: FloatArray) -> float:
         """Return the relative difference of outputs between full solutions and the basis that holds them."""
-        basis = self.basis.vectors
-        image = sum(t * k for t, k in zip(theta, self.images, strict=True))
-        coordinates = np.linalg.solve(basis.T @ image, basis.T @ self.problem.loads)
-        difference = np.abs(self.problem.outputs.T @ (basis @ coordinates) - wanted)
+        difference = np.abs(self.problem.outputs.T @ self._galerkin(theta) - wanted)
         return max(
             float(np.divide(largest, size, out=np.zeros_like(size), where=size > 0.0).max())
             for rows, least in zip(self.problem.groups, self.least, strict=True)
@@ -199,21 +197,20 @@ class StaticReduction:
 
     def arrays(self) -> dict[str, Any]:
         """Return the static fields of `AffineArrays`, and `cross_mass` with the static basis alone."""
-        problem, basis, residual = self.problem, self.basis.vectors, self.residual_basis.vectors
-        stiffness = np.stack([basis.T @ image for image in self.images])
+        problem, basis = self.problem, self.basis.vectors
         return {
-            "static_stiffness": 0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
+            "static_stiffness": 0.5 * (self.in_basis + self.in_basis.transpose(0, 2, 1)),
             "static_load": problem.loads.T @ basis,
             "static_output": problem.outputs.T @ basis,
             "bound_reference": self.reference,
-            "residual_load": residual.T @ problem.loads,
-            "residual_stiffness": np.stack([residual.T @ image for image in self.images], axis=1),
+            "residual_load": self.residual_load,
+            "residual_stiffness": self.residual_stiffness,
             # |sum c_q a_j d_qj| <= |c| |a| |d|; plus rounding
             "residual_allowance": self._largest_coefficients()
             * float(np.sqrt(self.residual_basis.dropped_square))
             + 1e-7,
             "rounding_allowance": max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
-            "dual_correction": np.swapaxes(self.dual.products, 1, 2) @ residual,
+            "dual_correction": self.correction,
             "dual_residual": self.dual.factors,
             "dual_stiffness": self.dual.stiffness,
             "dual_output": self.dual.output,
@@ -225,11 +222,9 @@ class StaticReduction:
         return np.stack([modal_basis.T @ image for image in images])
 
     def _largest_coefficients(self) -> float:
-        """Return the largest length of (1, theta - reference), by which parts of a residual are multiplied.
-
-        The residual is f - X u - sum (theta_q - reference_q) K_q u, and the basis was offered X u and K_q u.
-        """
-        return float(np.sqrt(1.0 + self.farthest @ self.farthest))
+        """Return the largest length of (1, theta), by which the load and the terms of a residual are multiplied."""
+        largest = self.reference + self.farthest
+        return float(np.sqrt(2.0 + largest @ largest))
 
 
 def greedy(
@@ -300,6 +295,11 @@ def greedy(
         present = model()
         bounds.append(max(judgement.bound(present, mu) for mu in states))
     return bounds
+
+
+def _with_rows(array: FloatArray, count: int) -> FloatArray:
+    """Return an array with zeros below, so that it has so many rows."""
+    return np.concatenate((array, np.zeros((count - len(array), *array.shape[1:]))))
 
 
 def _spread(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:

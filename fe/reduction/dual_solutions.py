@@ -4,7 +4,7 @@ Either the solution at the nearest of several anchors is taken, or those at a fe
 state, as a reduced basis of each output (Rozza, Huynh and Patera 2008, section 11).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from fe.full.subspace import BlockDiagonal, Norm, conjugate_gradients, triangular_factors
+from fe.full.subspace import BlockDiagonal, Norm, conjugate_gradients
+from fe.runtime.errors import ReductionError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -26,7 +27,7 @@ MOST_COLUMNS = 48
 
 @dataclass(frozen=True)
 class DualData:
-    """Approximate dual solutions: products with X (A or M, n, O), and as `AffineArrays` has them, the rest."""
+    """Approximate dual solutions: whitened products with X (A or M, n, O); the rest as `AffineArrays` has it."""
 
     products: FloatArray
     factors: FloatArray
@@ -45,13 +46,9 @@ class DualProblem:
     outputs : (n, O) ndarray
         Outputs.
     norm : Norm
-        Energy norm at `reference`.
-    reference : (T - 1,) ndarray
-        Coefficients of the stiffness terms of the norm, without the last.
+        Energy norm of one stiffness.
     stiffness : callable
         The stiffness at coefficients (T,).
-    together : int
-        How many states are solved at once.
     advance : callable
         Told one more part, and of what.
     """
@@ -59,35 +56,27 @@ class DualProblem:
     terms: tuple[sparse.csr_array, ...]
     outputs: FloatArray
     norm: Norm
-    reference: FloatArray
     stiffness: Callable[[FloatArray], Any]
-    together: int
     advance: Callable[[int, str], object]
 
     def nearest(self, anchors: list[FloatArray]) -> DualData:
         """Return the solutions at anchors (T,), with the norms of their residuals elsewhere."""
-        terms, (n, count) = len(self.terms), self.outputs.shape
-        at_reference = self.norm.riesz(self.outputs)
-        products = np.empty((len(anchors), n, count))
-        factors = np.empty((len(anchors), count, terms, terms))
+        count, terms = self.outputs.shape[1], len(self.terms)
         # a rough solution will do: the norm of what it leaves is computed, not assumed
-        for number, dual in enumerate(self._solutions(anchors, at_reference, DUAL_TOLERANCE)):
+        duals = np.stack(list(self._solutions(anchors, DUAL_TOLERANCE)))
+        factors = np.empty((len(anchors), count, terms, terms))
+        for number, dual in enumerate(duals):
             images = [np.asarray(term @ dual) for term in self.terms]
-            lifted = self._lifted(images[:-1])
-            # X^-1 K_base dual, since X is the sum of all terms at the reference
-            base = dual - sum(t * part for t, part in zip(self.reference, lifted, strict=True))
-            factors[number] = triangular_factors(
-                np.stack((at_reference - base, *lifted), axis=2),
-                np.stack((self.outputs - images[-1], *images[:-1]), axis=2),
-            )
-            products[number] = self.norm.product(dual)
-        return DualData(products, factors, np.empty((count, terms, 0, 0)), np.empty((count, 0)))
+            for output, *columns in zip(
+                range(count), (self.outputs - images[-1]).T, *(image.T for image in images[:-1]), strict=True
+            ):
+                factors[number, output] = self._factor(np.column_stack(columns))
+        return DualData(self._whitened(duals), factors, np.empty((count, terms, 0, 0)), np.empty((count, 0)))
 
     def combined(self, states: list[FloatArray]) -> DualData:
         """Return the solutions at coefficients (T,), made orthonormal for each output, to be combined."""
-        solutions = self._solutions(states, self.norm.riesz(self.outputs), COMBINED_TOLERANCE)
-        duals = np.stack(list(solutions), axis=2)  # (n, O, M)
-        terms, (n, count, functions) = len(self.terms), duals.shape
+        duals = np.stack(list(self._solutions(states, COMBINED_TOLERANCE)), axis=2)  # (n, O, M)
+        terms, count = len(self.terms), self.outputs.shape[1]
         kept = 0
         for dual in duals.transpose(1, 0, 2):
             square, turn = np.linalg.eigh(dual.T @ self.norm.product(dual))
@@ -102,16 +91,31 @@ class DualProblem:
         for number, (dual, output) in enumerate(zip(duals.transpose(1, 0, 2), self.outputs.T, strict=True)):
             images = [np.asarray(term @ dual) for term in self.terms]
             stiffness[number] = [dual.T @ image for image in images]
-            functionals = np.column_stack((output, *images))
-            factors[0, number] = np.linalg.qr(self.norm.whitened(functionals), mode="r")
+            factors[0, number] = self._factor(np.column_stack((output, *images)))
         absent = ~duals.any(axis=0)
-        stiffness[:, -1] += absent[:, :, np.newaxis] * np.eye(kept)  # a function that is not there gets no part
-        products = np.stack([self.norm.product(duals[:, :, number]) for number in range(kept)])
-        return DualData(products, factors, stiffness, np.einsum("no,nom->om", self.outputs, duals))
+        stiffness[:, -1] += absent[:, :, np.newaxis] * np.eye(
+            kept
+        )  # a function that is not there gets no part
+        output = np.einsum("no,nom->om", self.outputs, duals)
+        return DualData(self._whitened(duals.transpose(2, 0, 1)), factors, stiffness, output)
 
-    def _solutions(self, states: list[FloatArray], start: FloatArray, tolerance: float) -> Any:
+    def _factor(self, functionals: FloatArray) -> FloatArray:
+        """Return R (k, k) with |functionals (n, k) @ c| = |R @ c| in the dual norm."""
+        found = np.asarray(np.linalg.qr(self.norm.whitened(functionals), mode="r"))
+        if not np.isfinite(found).all():
+            raise ReductionError(
+                "The dual residuals are not finite; the full model holds a value that is not."
+            )
+        return found
+
+    def _whitened(self, duals: FloatArray) -> FloatArray:
+        """Return X times dual functions (M, n, O), whitened."""
+        return np.stack([self.norm.whitened(self.norm.product(dual)) for dual in duals])
+
+    def _solutions(self, states: list[FloatArray], tolerance: float) -> Iterator[FloatArray]:
         """Yield the solutions (n, O) at coefficients (T,), one state after another."""
-        at_once = 1 if self.together == 1 else max(1, MOST_COLUMNS // self.outputs.shape[1])
+        at_once = max(1, MOST_COLUMNS // self.outputs.shape[1])
+        start = self.norm.riesz(self.outputs)
         for first in range(0, len(states), at_once):
             chosen = states[first : first + at_once]
             matrices = [self.stiffness(theta) for theta in chosen]
@@ -125,12 +129,6 @@ class DualProblem:
             for dual in np.split(duals, len(chosen), axis=1):
                 yield dual
                 self.advance(1, "dual solutions")
-
-    def _lifted(self, images: list[FloatArray]) -> list[FloatArray]:
-        """Return the representatives of functionals, several (n, k) each."""
-        if self.together == 1:
-            return [self.norm.riesz(image) for image in images]
-        return np.split(self.norm.riesz(np.concatenate(images, axis=1)), len(images), axis=1)
 
 
 def beside(blocks: list[FloatArray]) -> FloatArray:

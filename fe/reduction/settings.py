@@ -113,7 +113,10 @@ def default_anchors(regions: int) -> tuple[int, ...]:
 def star(middle: FloatArray, ends: FloatArray) -> list[FloatArray]:
     """Return the middle (V,), and each quantity alone at either of its ends (V, 2)."""
     alone = np.eye(len(middle), dtype=bool)
-    return [middle, *(np.where(chosen, end, middle) for chosen, span in zip(alone, ends, strict=True) for end in span)]
+    return [
+        middle,
+        *(np.where(chosen, end, middle) for chosen, span in zip(alone, ends, strict=True) for end in span),
+    ]
 
 
 def remaining_levels(loss: Range, count: int) -> FloatArray:
