@@ -127,7 +127,8 @@ def tube(folder: Path, regions: int, along: int = 24) -> Path:
     centre = places[cells[:, :8]].mean(axis=1)
     region = 1 + (centre[:, 2] / 400.0 * regions).astype(np.int64)
     region[centre[:, 1] > 0.5] = 0  # half of each ring
-    at = np.column_stack((np.zeros(8), np.full(8, 20.0), 25.0 + 50.0 * np.arange(8)))
+    turn = 0.5 * np.pi * (np.arange(8) % 2)
+    at = np.column_stack((20.0 * np.cos(turn), 20.0 * np.sin(turn), 25.0 + 50.0 * np.arange(8)))
     gauges = _gauges(at, np.tile((0.0, 0.0, 1.0), (8, 1)))
     return _written(folder, TUBE + COMMON + gauges, points, cells, region)
 

@@ -33,6 +33,8 @@ _Model = TypeVar("_Model", bound=AffineArrays)
 
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
+LOOKED_AT = 6
+"""One of so many states is looked at in each round, that where the bound was largest; all of them at the end."""
 FIRST_TOLERANCE, SNAPSHOT_TOLERANCE = 1e-10, 1e-6
 """Relative residual of the first full solutions and of the others."""
 ROUNDING_FACTOR, LEAST_ROUNDING = 8.0, 5e-6
@@ -126,6 +128,7 @@ class StaticReduction:
         n = len(problem.loads)
         self.basis = OrthonormalBasis(n, norm, drop=1e-7)
         self.in_basis = np.empty((len(terms), 0, 0))  # stiffness terms in the basis
+        self.images = [np.empty((n, 0)) for _ in terms]  # times its vectors, if the batch is one
         self.rounding = 0.0
         self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
         self.residual_load = self.residual_basis.extend(problem.loads)
@@ -164,9 +167,14 @@ class StaticReduction:
     def _take_images(self, images: list[FloatArray]) -> None:
         """Take the stiffness terms times the last basis vectors, (n, k) each, into what is kept of all."""
         before, known = self.in_basis.shape[-1], self.residual_basis.vectors.shape[1]
-        new = np.stack([self.basis.vectors.T @ image for image in images])
-        older = np.swapaxes(new[:, :before], 1, 2)
-        self.in_basis = np.concatenate((np.concatenate((self.in_basis, older), axis=1), new), axis=2)
+        basis = self.basis.vectors
+        if self.batch == 1:  # sums round as they always did
+            self.images = [np.concatenate(pair, axis=1) for pair in zip(self.images, images, strict=True)]
+            self.in_basis = np.stack([basis.T @ image for image in self.images])
+        else:
+            new = np.stack([basis.T @ image for image in images])
+            older = np.swapaxes(new[:, :before], 1, 2)
+            self.in_basis = np.concatenate((np.concatenate((self.in_basis, older), axis=1), new), axis=2)
         found = self.residual_basis.extend(np.concatenate(images, axis=1))
         # what was there lies in the basis that was there
         self.residual_load = _with_rows(self.residual_load, len(found))
@@ -181,7 +189,11 @@ class StaticReduction:
         """Return the solutions (n, L) in the present basis."""
         if not self.basis.size:
             return np.zeros_like(self.problem.loads)
-        stiffness, basis = np.tensordot(theta, self.in_basis, 1), self.basis.vectors
+        basis = self.basis.vectors
+        if self.batch == 1:
+            stiffness = basis.T @ sum(t * k for t, k in zip(theta, self.images, strict=True))
+        else:
+            stiffness = np.tensordot(theta, self.in_basis, 1)
         return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.problem.loads))
 
     def _rounding(self, theta: FloatArray, wanted: FloatArray) -> float:
@@ -270,13 +282,23 @@ def greedy(
             if not static.basis.size:  # nothing to bound yet: begin in the middle
                 bounds = np.array([-sum((np.array(mu) - np.mean(mus, axis=0)) ** 2) for mu in mus]) + 1e3
             else:
-                present = model()
-                bounds = np.array([judgement.bound(present, mu) for mu in mus])
+                bounds = self._bounds(model(), mus)
             if return_all_values:
                 return bounds
             self.bounds, self.asked = bounds, np.array(mus)
             worst = int(bounds.argmax())
             return float(bounds[worst]), mus[worst]
+
+        def _bounds(self, present: _Model, mus: list[Any]) -> FloatArray:
+            """Return the bounds; of many states those where they were large, until these are small."""
+            bounds, first = np.array(self.bounds), 0
+            for count in (len(mus) // LOOKED_AT if self.rounds > 1 and static.batch > 1 else 0, len(mus)):
+                for number in np.argsort(-self.bounds, kind="stable")[first:count]:
+                    bounds[number] = judgement.bound(present, mus[number])
+                first = count
+                if count and bounds.max() > SEARCH_MARGIN * tolerance:
+                    break
+            return bounds
 
         def extend(self, mu: State) -> None:
             """Add the full solutions at the worst state, and at others of large bounds away from it."""

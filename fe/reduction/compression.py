@@ -79,7 +79,7 @@ def fewest_directions(
     while low < high:
         middle = (low + high) // 2
         smaller = compressed(model, directions[:, :middle])
-        if max(judgement.bound(smaller, state) for state in states) <= tolerance:
+        if all(judgement.bound(smaller, state) <= tolerance for state in states):
             high = middle
         else:
             low = middle + 1

@@ -38,10 +38,12 @@ FloatArray = npt.NDArray[np.float64]
 LEAST_COSINE = 1e-3
 """A load whose outputs are smaller than this part of what its energy could do to them is judged by that part:
 nothing of the structure sees it there."""
+UNSEEN_SHARE = 0.1
+"""Where another load is seen, one that is not is judged by this part of what that does, each at its largest."""
 SAMPLED_INSIDE = 10
 """States inside the box at which the modes are refined."""
-CHOSEN_STATES = 128
-"""States inside the box on the training set, beside corners."""
+CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024
+"""States inside the box on the training set, beside corners; of more regions than a grid would take."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,8 @@ class _Terms:
 
     def training(self) -> list[State]:
         """States on which the greedy search looks for the largest bound: corners, and points between them."""
-        points = qmc.Halton(len(self.parameters) + len(self.losses), scramble=False).random(CHOSEN_STATES)
+        count = CHOSEN_STATES if len(self.losses) <= MOST_GRID_REGIONS else CHOSEN_OF_MANY
+        points = qmc.Halton(len(self.parameters) + len(self.losses), scramble=False).random(count)
         return [*self.corners(), *self.inside(points)]
 
     def inside(self, shares: FloatArray) -> list[State]:
@@ -193,6 +196,14 @@ class _Terms:
             (self.theta(state), np.array((1.0, *chosen)))
             for state, chosen in zip(self.inside(points[:, :varied]), masses, strict=True)
         ]
+
+    def largest_loads(self) -> FloatArray:
+        """Largest coefficient (L,) of each load."""
+        controls, masses = (
+            np.abs([(1.0, 1.0), *(self.structure.ranges[name] for name in names)]).max(axis=1)
+            for names in (self.structure.controls, self.structure.masses)
+        )
+        return np.asarray(controls[self.load_factors[:, 0]] * masses[self.load_factors[:, 1]])
 
     def farthest(self) -> FloatArray:
         """Largest distance (T,) of each coefficient from its reference."""
@@ -248,7 +259,7 @@ def reduce_structure(
             terms.duals,
             terms.farthest()[:-1],
             stage.advance,
-            least := _least(terms.problem, norm),
+            least := _least(terms, norm),
             TOGETHER,
         )
         judgement, states = _judgement(terms, least), terms.training()
@@ -350,15 +361,19 @@ def _model(
     )
 
 
-def _least(problem: AffineProblem, norm: Norm) -> FloatArray:
+def _least(terms: _Terms, norm: Norm) -> FloatArray:
     """Return the outputs (groups, L) below which a load is not seen; see `LEAST_COSINE`."""
-
-    def length(functionals: FloatArray) -> FloatArray:
-        squares = np.einsum("ik,ik->k", functionals, norm.riesz(functionals))
-        return np.asarray(np.sqrt(np.maximum(squares, 0.0)), dtype=np.float64)
-
-    loads, outputs = length(problem.loads), length(problem.outputs)
-    return LEAST_COSINE * np.array([loads * outputs[part].max() for part in problem.groups])
+    problem, largest = terms.problem, terms.largest_loads()
+    solutions = norm.riesz(problem.loads)
+    loads = np.linalg.norm(norm.whitened(problem.loads), axis=0)
+    outputs = np.linalg.norm(norm.whitened(problem.outputs), axis=0)
+    seen = np.abs(problem.outputs.T @ solutions)
+    found = []
+    for part in problem.groups:
+        least, size = LEAST_COSINE * loads * outputs[part].max(), seen[part].max(axis=0)
+        of_others = UNSEEN_SHARE * (size * largest).max() / largest
+        found.append(np.where(size < least, np.maximum(least, of_others), least))
+    return np.array(found)
 
 
 def _judgement(terms: _Terms, least: FloatArray) -> Judgement[StructureModel]:
