@@ -1,19 +1,12 @@
 """Structures with up to eight damage regions: what their reduction takes, and how well it holds.
 
-`python -m benchmarks.study_regions plate --regions 6` makes a plate with a hole, a tube, the shipped bracket or
-the wing with so many regions, reduces it in this process and compares it with its full model at random states.
+`python -m benchmarks.study_regions plate --regions 6` makes a plate with a hole, a tube, the shipped bracket
+or the wing with so many regions, packs it as an FMU in this process, and compares it with its full model at
+random states.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import resource
-import shutil
-import sys
-import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import meshio
@@ -93,9 +86,9 @@ def _written(
     return file
 
 
-def plate(folder: Path, regions: int, around: int = 32) -> Path:
+def plate(folder: Path, regions: int, around: int = 32, across: int = 8) -> Path:
     """Write a plate of 200 x 100 x 4 mm with a hole of 40 mm; its regions are sectors around the hole."""
-    flat = np.linspace(0.0, 1.0, 9) ** 1.5
+    flat = np.linspace(0.0, 1.0, across + 1) ** 1.5
     turns = np.linspace(0.0, 1.0, around + 1)
     places, cells = hexahedra((flat, turns, [0.0, 2.0, 4.0]), lambda *_: True)
     angle = 2.0 * np.pi * places[:, 1]
@@ -109,7 +102,7 @@ def plate(folder: Path, regions: int, around: int = 32) -> Path:
     )
     plane = circle + places[:, :1] * (eighth - circle)
     centre = places[cells[:, :8]].mean(axis=1)
-    near = centre[:, 0] < flat[5]
+    near = centre[:, 0] < 0.5
     region = np.where(near, 1 + (centre[:, 1] * regions).astype(np.int64), 0)
     middle = 2.0 * np.pi * (np.arange(8) + 0.5) / 8
     at, along = np.array((np.cos(middle), np.sin(middle))).T, np.array((-np.sin(middle), np.cos(middle))).T

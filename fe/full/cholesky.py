@@ -241,7 +241,7 @@ class Cholesky:
         return solution
 
     def whitened(self, right_hand_side: FloatArray) -> FloatArray:
-        """L^-1 f (n,) or (n, k), in the order of elimination, whose length is that of f dual to the matrix."""
+        """L^-1 f (n,) or (n, k), in the order of elimination; its length is the dual norm of f."""
         found = np.array(right_hand_side[self._order], dtype=np.float64, order="C")
         values = found.reshape(len(found), -1)
         with _threads().limit(limits=1):

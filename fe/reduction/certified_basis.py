@@ -34,7 +34,7 @@ _Model = TypeVar("_Model", bound=AffineArrays)
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
 LOOKED_AT = 6
-"""One of so many states is looked at in each round, that where the bound was largest; all of them at the end."""
+"""One of so many states is looked at in each round, where the bound was largest; all of them at the end."""
 FIRST_TOLERANCE, SNAPSHOT_TOLERANCE = 1e-10, 1e-6
 """Relative residual of the first full solutions and of the others."""
 ROUNDING_FACTOR, LEAST_ROUNDING = 8.0, 5e-6
@@ -234,7 +234,7 @@ class StaticReduction:
         return np.stack([modal_basis.T @ image for image in images])
 
     def _largest_coefficients(self) -> float:
-        """Return the largest length of (1, theta), by which the load and the terms of a residual are multiplied."""
+        """Return the largest length of (1, theta), by which load and terms of a residual are multiplied."""
         largest = self.reference + self.farthest
         return float(np.sqrt(2.0 + largest @ largest))
 

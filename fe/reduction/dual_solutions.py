@@ -20,14 +20,14 @@ FloatArray = npt.NDArray[np.float64]
 DUAL_TOLERANCE, COMBINED_TOLERANCE = 0.05, 0.01
 """Relative residual of approximate dual solutions at their own states, taken alone and combined."""
 DEPENDENT = 1e-3
-"""Combinations of the dual solutions of an output that are shorter than this part of the longest are left out."""
+"""Combinations of the dual solutions of an output that are shorter, relative to the longest, are left out."""
 MOST_COLUMNS = 48
 """Columns of approximate dual solutions that are iterated together."""
 
 
 @dataclass(frozen=True)
 class DualData:
-    """Approximate dual solutions: whitened products with X (A or M, n, O); the rest as `AffineArrays` has it."""
+    """Approximate dual solutions: whitened products with X (A or M, n, O), the rest as in `AffineArrays`."""
 
     products: FloatArray
     factors: FloatArray

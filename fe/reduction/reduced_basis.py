@@ -17,8 +17,8 @@ from fe.runtime.reduced import ReducedModel
 
 from .certified_basis import AffineProblem, StaticReduction, greedy
 from .compression import WING_JUDGEMENT, compressed, fewest_directions
-from .modal_basis import ModalData, reduce_modes
 from .dual_solutions import DualData, DualProblem
+from .modal_basis import ModalData, reduce_modes
 from .settings import (
     ALONE,
     MOST_GRID_REGIONS,

@@ -72,7 +72,7 @@ class ReductionSettings:
     pitot_mass: Range = (0.0, 0.30)
     nominal_masses: tuple[float, float] = (0.169, 0.134)
     bound_tolerance: float = 6e-4
-    most_snapshots: int = 60
+    most_snapshots: int = 401
     dual_anchors: tuple[int, ...] = ()
     modal: ModalSettings = field(default_factory=ModalSettings)
 

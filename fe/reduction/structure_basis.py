@@ -17,6 +17,7 @@ from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
 from fe.runtime.structure_model import StructureModel
 from fe.structure.affine import AffineStructure
+from fe.structure.design import ReductionLimits, StructureDesign
 
 from .certified_basis import AffineProblem, Judgement, State, StaticReduction, greedy
 from .compression import compressed, fewest_directions
@@ -39,7 +40,7 @@ LEAST_COSINE = 1e-3
 """A load whose outputs are smaller than this part of what its energy could do to them is judged by that part:
 nothing of the structure sees it there."""
 UNSEEN_SHARE = 0.1
-"""Where another load is seen, one that is not is judged by this part of what that does, each at its largest."""
+"""Where another load is seen, one that is not is judged by this part of what that does, both at their most."""
 SAMPLED_INSIDE = 10
 """States inside the box at which the modes are refined."""
 CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024
@@ -48,7 +49,7 @@ CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024
 
 @dataclass(frozen=True)
 class StructureSettings:
-    """How well the reduced model of a structure is to hold; where is said in the structure file.
+    """How well the reduced model of a structure is to hold; where, and both limits, the structure file says.
 
     Attributes
     ----------
@@ -61,9 +62,14 @@ class StructureSettings:
         Accuracy and number of modes.
     """
 
-    bound_tolerance: float = 6e-4
-    most_snapshots: int = 61
+    bound_tolerance: float = ReductionLimits().tolerance
+    most_snapshots: int = ReductionLimits().most_solutions
     modal: ModalSettings = field(default_factory=ModalSettings)
+
+    @classmethod
+    def of(cls, design: StructureDesign) -> "StructureSettings":
+        """Return what the table `[reduction]` of a structure file says."""
+        return cls(design.reduction.tolerance, design.reduction.most_solutions)
 
 
 @dataclass(frozen=True)
@@ -274,8 +280,9 @@ def reduce_structure(
     if history[-1] > settings.bound_tolerance:
         raise ReductionError(
             f"After {len(static.snapshots)} full solutions the error bound of {name} is {history[-1]:.2g} of "
-            f"the largest output, but {settings.bound_tolerance:.2g} was asked for; narrow the ranges of "
-            "parameters and losses, or allow a looser tolerance."
+            f"the largest output, but {settings.bound_tolerance:.2g} was asked for; raise "
+            f"most_solutions (now {settings.most_snapshots}) or tolerance in the table [reduction] of the "
+            "structure file, or narrow the ranges of parameters and losses."
         )
     model = _model(static, terms, name, modes, settings.modal.mode_count)
     directions = fewest_directions(model, judgement, states, settings.bound_tolerance)

@@ -49,7 +49,7 @@ class CombinedDual:
     factor: FloatArray
 
     def at(self, theta: FloatArray) -> DualArrays:
-        """Return the dual solutions at the coefficients (T,) of the stiffness, with their residuals (O, F)."""
+        """Return the dual solutions at the coefficients (T,) of the stiffness, with the residuals (O, F)."""
         outputs, functions, _ = self.output.shape
         stiffness = (theta @ self.stiffness).reshape(outputs, functions, functions)
         weights = solve(stiffness, self.output)
