@@ -7,12 +7,31 @@ random states.
 
 from __future__ import annotations
 
+import argparse
+import json
+import resource
+import sys
+import tempfile
+import time
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
+from fe.full.operators import AffineOperators, assemble
+from fe.full.statics import solve_static
+from fe.reduction.reduced_basis import reduce_model
+from fe.reduction.structure_basis import reduce_structure
+from fe.reduction.structure_errors import MeasuredErrors, measured_errors
+from fe.runtime.reduced import ReducedModel
+from fe.structure.operators import load_and_assemble
+from fe.wing.design import WingDesign, load_design
+from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.structures.build import build_structure_fmu
 from scenarios import structure_files
 from scenarios.structures.make_meshes import hexahedra
 
@@ -148,3 +167,72 @@ def bracket(folder: Path, regions: int) -> Path:
     damage = "".join(f'\n[[damage]]\nname = "z{one}"\nset = "R{one}"\n' for one in range(1, regions + 1))
     (folder / "bracket.toml").write_text(text + damage, encoding="utf-8")
     return folder / "bracket.toml"
+
+
+def wing(regions: int) -> WingDesign:
+    """Return the wing with so many patches of its upper skin, up to two beside each other in three spans."""
+    first, second = load_design(None).model_dump(mode="python")["defects"][:2]
+    spans = [(patch["span_start"], patch["span_end"]) for patch in (first, second)]
+    spans.insert(1, (0.45, 0.95))
+    chords = [(first["chord_start"], first["chord_end"]), (0.66, 0.86)]
+    places = [
+        {"span_start": span[0], "span_end": span[1], "chord_start": chord[0], "chord_end": chord[1]}
+        for chord in chords
+        for span in spans
+    ]
+    return load_design(None).changed(defects=tuple(places[:regions]))
+
+
+def _wing_errors(operators: AffineOperators, model: ReducedModel, states: int) -> MeasuredErrors:
+    """Compare a reduced wing with its full model at random states under lift."""
+    rng, strain, bound, broken = np.random.default_rng(2021), 0.0, 0.0, 0
+    for _ in range(states):
+        e, *losses = rng.uniform(*model.validity_box[: 1 + len(model.regions)].T).tolist()
+        wanted = solve_static(operators, e, tuple(losses), 3.0).strain
+        found = model.static_response(e, tuple(losses), 3.0)
+        missed, size = float(np.abs(found.strain - wanted).max()), float(np.abs(wanted).max())
+        strain, bound = max(strain, missed / size), max(bound, found.strain_error_bound / size)
+        broken += missed > found.strain_error_bound
+    return MeasuredErrors(strain, np.nan, bound, np.nan, states, broken)
+
+
+def measured(name: str, regions: int, states: int, folder: Path) -> dict[str, float]:
+    """Return what it takes from mesh to FMU, and the errors at random states."""
+    begin, clock = time.process_time(), time.monotonic()
+    if name == "wing":
+        design = wing(regions)
+        full: Any = assemble(design)
+        reduction: Any = reduce_model(full)
+        build_fmu(reduction.model, folder / "wing.fmu")
+    else:
+        full = load_and_assemble({"plate": plate, "tube": tube, "bracket": bracket}[name](folder, regions))
+        reduction = reduce_structure(full, name)
+        build_structure_fmu(reduction.model, folder / f"{name}.fmu")
+    found = {
+        "regions": regions,
+        "unknowns": full.unknowns,
+        "solutions": len(reduction.snapshots),
+        "vectors": len(reduction.model.static_load.T),
+        "processor_seconds": time.process_time() - begin,
+        "seconds": time.monotonic() - clock,
+        "gibibytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }
+    compared = _wing_errors if name == "wing" else measured_errors
+    return found | asdict(compared(full, reduction.model, states))
+
+
+def main() -> int:
+    """Print the figures as JSON; exit code 1 if an error exceeds its bound or a bound 1e-3."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name", choices=("plate", "tube", "bracket", "wing"))
+    parser.add_argument("--regions", type=int, default=6)
+    parser.add_argument("--states", type=int, default=60)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
+        found = measured(given.name, given.regions, given.states, Path(folder))
+    print(json.dumps({"name": given.name} | found))
+    return int(found["broken"] > 0 or found["bound"] > 1e-3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

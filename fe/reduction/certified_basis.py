@@ -275,7 +275,7 @@ def greedy(
     class Surrogate(WeakGreedySurrogate):  # type: ignore[misc]
         """The reduced model's own bound, as pyMOR's search wants it."""
 
-        bounds, asked, rounds = np.empty(0), np.empty((0, 0)), 0
+        bounds, known, asked, rounds = np.empty(0), np.empty(0), np.empty((0, 0)), 0
 
         def evaluate(self, mus: list[Any], return_all_values: bool = False) -> Any:
             """Return the largest bound and where it is, or all bounds."""
@@ -290,13 +290,16 @@ def greedy(
             return float(bounds[worst]), mus[worst]
 
         def _bounds(self, present: _Model, mus: list[Any]) -> FloatArray:
-            """Return the bounds; of many states those where they were large, until these are small."""
-            bounds, first = np.array(self.bounds), 0
+            """Return the bounds; of many states, where they were largest, and zeros, until they are small."""
+            bounds, first = np.zeros(len(mus)), 0
+            if self.rounds == 1:
+                self.known = np.full(len(mus), np.inf)
+            order = np.argsort(-self.known, kind="stable")
             for count in (len(mus) // LOOKED_AT if self.rounds > 1 and static.batch > 1 else 0, len(mus)):
-                for number in np.argsort(-self.bounds, kind="stable")[first:count]:
-                    bounds[number] = judgement.bound(present, mus[number])
+                for number in order[first:count]:
+                    bounds[number] = self.known[number] = judgement.bound(present, mus[number])
                 first = count
-                if count and bounds.max() > SEARCH_MARGIN * tolerance:
+                if bounds.max() > SEARCH_MARGIN * tolerance:
                     break
             return bounds
 
@@ -313,7 +316,7 @@ def greedy(
     surrogate, most_rounds = Surrogate(), 1 + (most_snapshots - 1) // static.batch
     result = weak_greedy(surrogate, states, atol=SEARCH_MARGIN * tolerance, max_extensions=most_rounds)
     bounds = [float(value) for value in result["max_errs"][1:]]
-    if len(bounds) < surrogate.rounds:  # stopped by the limit: the last bound was not evaluated
+    if len(bounds) < surrogate.rounds or bounds[-1] > SEARCH_MARGIN * tolerance:  # not all were looked at
         present = model()
         bounds.append(max(judgement.bound(present, mu) for mu in states))
     return bounds

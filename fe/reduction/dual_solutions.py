@@ -92,7 +92,7 @@ class DualProblem:
             images = [np.asarray(term @ dual) for term in self.terms]
             stiffness[number] = [dual.T @ image for image in images]
             factors[0, number] = self._factor(np.column_stack((output, *images)))
-        absent = ~duals.any(axis=0)
+        absent = np.asarray(~duals.any(axis=0))
         stiffness[:, -1] += absent[:, :, np.newaxis] * np.eye(
             kept
         )  # a function that is not there gets no part

@@ -40,7 +40,7 @@ LEAST_COSINE = 1e-3
 """A load whose outputs are smaller than this part of what its energy could do to them is judged by that part:
 nothing of the structure sees it there."""
 UNSEEN_SHARE = 0.1
-"""Where another load is seen, one that is not is judged by this part of what that does, both at their most."""
+"""Where another load is seen, one that is not is judged by this part of what that does, each at its most."""
 SAMPLED_INSIDE = 10
 """States inside the box at which the modes are refined."""
 CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -78,11 +79,12 @@ def test_the_file_says_how_well_and_the_structure_stays_the_same(plate_file: Pat
     assert structure_hash(load_structure(other), mesh) == structure_hash(design, mesh)
 
 
-def test_a_bound_that_is_not_reached_names_the_keys(tmp_path: Path) -> None:
-    file = plate(tmp_path, 4, around=8, across=3)
-    text = file.read_text(encoding="utf-8") + "\n[reduction]\nmost_solutions = 5\n"
-    file.write_text(text, encoding="utf-8")
+def test_a_bound_that_is_not_reached_names_the_keys(write_beam: Callable[..., Path], tmp_path: Path) -> None:
+    file = write_beam(tmp_path, cells=2)
+    file.write_text(
+        file.read_text(encoding="utf-8") + "\n[reduction]\nmost_solutions = 2\n", encoding="utf-8"
+    )
     with pytest.raises(
-        ReductionError, match=r"After 5 full solutions .* raise most_solutions \(now 5\) or tolerance .*\[red"
+        ReductionError, match=r"After 1 full solutions .* raise most_solutions \(now 2\) or tolerance .*\[red"
     ):
         reduced_structure(file)
