@@ -1,7 +1,7 @@
 """Offline: approximate dual solutions, on which the sharpness of the error bound rests.
 
 Either the solution at the nearest of several anchors is taken, or those at a few states are combined for each
-state, as a reduced basis of each output (Rozza, Huynh and Patera 2008, section 11).
+state, as a reduced basis of each output (Rozza, Huynh and Patera 2008).
 """
 
 from collections.abc import Callable, Iterator
