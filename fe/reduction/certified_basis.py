@@ -295,10 +295,8 @@ def greedy(
             if self.rounds == 1:
                 self.known = np.full(len(mus), np.inf)
             order = np.argsort(-self.known, kind="stable")
-            for count in (
-                len(mus) // LOOKED_AT if self.rounds > 1 and static.dual.output.size else 0,
-                len(mus),
-            ):
+            few = len(mus) // LOOKED_AT if self.rounds > 1 and static.dual.output.size else 0
+            for count in (few, len(mus)):
                 for number in order[first:count]:
                     bounds[number] = self.known[number] = judgement.bound(present, mus[number])
                 first = count

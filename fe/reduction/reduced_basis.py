@@ -3,9 +3,7 @@
 The method and what it reaches are in `docs/reduced_model.md`.
 """
 
-import itertools
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -17,18 +15,8 @@ from fe.runtime.reduced import ReducedModel
 
 from .certified_basis import AffineProblem, StaticReduction, greedy
 from .compression import WING_JUDGEMENT, compressed, fewest_directions
-from .dual_solutions import DualData, DualProblem
 from .modal_basis import ModalData, reduce_modes
-from .settings import (
-    ALONE,
-    MOST_GRID_REGIONS,
-    TOGETHER,
-    ReductionSettings,
-    loss_splits,
-    remaining_levels,
-    star,
-    training_set,
-)
+from .settings import ALONE, TOGETHER, ReductionSettings, loss_splits, training_set
 from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -122,7 +110,9 @@ def reduce_model(
             wing_problem(system),
             norm,
             reference,
-            duals=partial(_duals, settings=settings, reference=reference, ends=ends),
+            duals=lambda problem: problem.solved(
+                lambda values: np.append(values, 1.0), reference, ends, settings.anchors(regions)
+            ),
             farthest=np.abs(ends - reference[:, np.newaxis]).max(axis=1),
             advance=stage.advance,
             batch=together,
@@ -151,18 +141,6 @@ def reduce_model(
         tuple(static.snapshots),
         tuple(history),
     )
-
-
-def _duals(
-    problem: DualProblem, settings: ReductionSettings, reference: FloatArray, ends: FloatArray
-) -> DualData:
-    """Return the dual solutions at anchors or, of many regions, to be combined."""
-    regions = len(reference) - 1
-    if regions > MOST_GRID_REGIONS and not settings.dual_anchors:
-        return problem.combined([np.append(values, 1.0) for values in star(reference, ends)])
-    counts = settings.anchors(regions)
-    levels = itertools.product(*(remaining_levels(settings.stiffness_loss, count) for count in counts))
-    return problem.nearest([np.array((reference[0], *remaining, 1.0)) for remaining in levels])
 
 
 def _model(

@@ -110,15 +110,6 @@ def default_anchors(regions: int) -> tuple[int, ...]:
     return (2 if regions <= MOST_GRID_REGIONS else 1,) * regions
 
 
-def star(middle: FloatArray, ends: FloatArray) -> list[FloatArray]:
-    """Return the middle (V,), and each quantity alone at either of its ends (V, 2)."""
-    alone = np.eye(len(middle), dtype=bool)
-    return [
-        middle,
-        *(np.where(chosen, end, middle) for chosen, span in zip(alone, ends, strict=True) for end in span),
-    ]
-
-
 def remaining_levels(loss: Range, count: int) -> FloatArray:
     """Return `count` values of 1 - z in the middle of equal ratios over a range of z, ascending in z."""
     high, low = 1.0 - loss[0], 1.0 - loss[1]

@@ -30,7 +30,6 @@ from .settings import (
     default_anchors,
     loss_splits,
     remaining_levels,
-    star,
 )
 from .stages import Progress, stage_of
 
@@ -138,15 +137,12 @@ class _Terms:
         return self._coefficients(values[:count], 1.0 - values[count:])
 
     def duals(self, problem: DualProblem) -> DualData:
-        """Dual solutions at anchors or, of many regions, to be combined."""
-        middle = np.array([np.mean(ends) for ends in self.parameters])
-        if len(self.losses) > MOST_GRID_REGIONS:
-            lost = [1.0 - remaining_levels(ends, 1)[0] for ends in self.losses]
-            states = star(np.array([*middle, *lost]), np.array([*self.parameters, *self.losses]))
-            return problem.combined([self.theta(tuple(state)) for state in states])
-        levels = [remaining_levels(ends, count) for ends, count in zip(self.losses, self.counts, strict=True)]
-        return problem.nearest(
-            [self._coefficients(middle, np.array(kept)) for kept in itertools.product(*levels)]
+        """Dual solutions, at parameters and what the regions have kept."""
+        split, kept = len(self.parameters), [remaining_levels(ends, 1)[0] for ends in self.losses]
+        middle = np.array([*(np.mean(ends) for ends in self.parameters), *kept])
+        ends = np.array([*self.parameters, *(1.0 - np.array(self.losses))])
+        return problem.solved(
+            lambda values: self._coefficients(values[:split], values[split:]), middle, ends, self.counts
         )
 
     def corners(self) -> list[State]:
