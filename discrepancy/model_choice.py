@@ -1,4 +1,4 @@
-"""Which model a campaign is compared with: a wing (shipped, calibrated, designed), a lumped model, an FMU."""
+"""Which model a campaign is compared with: a wing, a structure, a lumped model, an FMU, or one patched."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -6,12 +6,16 @@ from pathlib import Path
 
 from calibration.errors import CalibrationError
 from calibration.wing.result_file import load_calibration
-from discrepancy.errors import ModelError
+from discrepancy.errors import ModelError, VerdictFileError
+from discrepancy.files.document import Origin
+from discrepancy.files.patch import StoredPatch, read_patch
 from discrepancy.models.fmu import FmuModel
+from discrepancy.models.fmu_file import parse_fmu_model
 from discrepancy.models.fmu_runs import binding_file
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
+from discrepancy.models.patched import PatchedModel
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
 from discrepancy.sources.from_run import (
     CALIBRATION_FILE,
@@ -20,12 +24,19 @@ from discrepancy.sources.from_run import (
     patch_of_run,
     run_model,
 )
+from fe.reduction.built_once import cache_folder
 from fe.reduction.stages import Progress
+from fe.reduction.structure_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
+from fe.structure.design import load_structure
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from fmu_asset.archive.design_record import packed_design_hash
+from fmu_asset.errors import FmuError
+from fmu_asset.structures.build import structure_fmu_bytes
+from fmu_asset.structures.rig import rig_text
+from reporting.files import atomic_write_bytes
 from reporting.provenance import hash_file, hash_record
-from reporting.toml_file import read_toml
+from reporting.toml_file import parse_toml, read_toml
 from scenarios import structure_files
 
 
@@ -36,6 +47,7 @@ class ModelKind(StrEnum):
     CALIBRATION = "calibrated wing"
     LUMPED = "lumped model"
     FMU = "FMU"
+    STRUCTURE = "structure"
 
 
 @dataclass(frozen=True)
@@ -59,6 +71,10 @@ class ModelChoice:
         Of its file; None for what is shipped.
     design_hash : str
         SHA-256 of the design or structure that it was made of; empty where that is not known.
+    file : str
+        As `Origin.model_file`.
+    built_in : StoredPatch or None
+        The patch that was built into the model of `kind`.
     """
 
     model: Model
@@ -68,6 +84,8 @@ class ModelChoice:
     design: WingDesign | None = None
     path: Path | None = None
     design_hash: str = ""
+    file: str = ""
+    built_in: StoredPatch | None = None
 
 
 def choose_model(name: str | Path | None, progress: Progress | None = None) -> ModelChoice:
@@ -76,19 +94,27 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
     Parameters
     ----------
     name : str or Path, optional
-        A calibration (.nc), a wing design, a lumped model or the description of an FMU (.toml), or the name
-        of a shipped lumped model; the shipped wing if left out.
+        A calibration (.nc); a wing design, a structure, a lumped model or the description of an FMU (.toml);
+        any of these with a patch (.json); the name of a shipped lumped model or structure; the folder of a
+        mission whose twin's model is meant. The shipped wing if left out.
     progress : Progress, optional
-        Where the modelling of a wing reports.
+        Where the modelling of a wing or a structure reports.
 
     Raises
     ------
-    ModelError
+    ModelError, VerdictFileError, CampaignFileError
         If there is no such model, or its file cannot be used.
     """
     if name is None:
         return _wing(None, progress)
     path = Path(name)
+    file = str(path.resolve() if path.exists() else name)
+    return replace(_chosen(path, progress), file=file)
+
+
+def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
+    if path.is_dir():
+        return choice_of_run(path)
     if path.suffix == ".fmu":
         raise ModelError(
             f"{path} is an FMU: give a TOML file that says which of its variables are load, outputs and "
@@ -99,10 +125,12 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
         raise ModelError(f"There is no model file {path}; give a calibration (.nc) or a model (.toml).")
     if path.suffix == ".nc":
         return _calibrated(path, progress)
+    if path.suffix == ".json":
+        return _patched(path, progress)
     if path.suffix not in ("", ".toml"):
         raise ModelError(
-            f"{path} is no model: a calibration (.nc), a wing design or a lumped model (.toml), or the "
-            "name of a "
+            f"{path} is no model: a calibration (.nc), a wing design, a structure or a lumped model (.toml), "
+            "a patch (.json), or the name of a "
             f"shipped lumped model ({', '.join(shipped_lumped_models())}) is expected."
         )
     if path.suffix == ".toml":
@@ -110,11 +138,11 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
         if content.get("kind") == "fmu":
             return _fmu(path)
         if "mesh" in content:  # neither a wing design nor a lumped model has one
-            raise _structure_error(str(path), path.name)
+            return _structure(path, progress)
         if "format" not in content:  # a wing design has none
             return _wing(path, progress)
     if not path.exists() and str(path) in structure_files():
-        raise _structure_error(str(path), str(path))
+        return _structure(structure_files()[str(path)], progress)
     model = LumpedModel.load(path)
     shipped = not path.suffix and not path.exists()
     file = SHIPPED_MODELS / f"{path}.toml" if shipped else path
@@ -127,20 +155,55 @@ def load_model(name: str | Path | None = None, progress: Progress | None = None)
     Parameters
     ----------
     name : str or Path, optional
-        A calibration (.nc), a wing design, a lumped model or the description of an FMU (.toml), the name of a
-        shipped lumped model, or the folder of a mission whose twin's model is meant; the shipped wing if left
-        out.
+        As `choose_model` takes it.
     progress : Progress, optional
-        Where the modelling of a wing reports.
+        Where the modelling of a wing or a structure reports.
 
     Raises
     ------
-    ModelError, CampaignFileError
+    ModelError, VerdictFileError, CampaignFileError
         If there is no such model, or its file cannot be used.
     """
-    if name is not None and Path(name).is_dir():
-        return run_model(name)
     return choose_model(name, progress).model
+
+
+def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> ModelChoice:
+    """Return the model that a verdict or a patch rests on.
+
+    Parameters
+    ----------
+    origin : Origin
+        What it was reached from.
+    file : Path
+        It; a model's file that is not where it was is looked for beside it.
+    progress : Progress, optional
+        Where the modelling reports.
+
+    Raises
+    ------
+    ModelError, VerdictFileError, CampaignFileError
+        If the model is gone, has changed since, or is not known.
+    """
+    if origin.model_file is None:
+        raise VerdictFileError(
+            f"{file} was left by an earlier version, which did not record where its model is: run "
+            "`uav-twin discrepancy run` again."
+        )
+    place = Path(origin.model_file)
+    if place.is_absolute() and not place.exists():
+        place = Path(file).parent / place.name
+        if not place.exists():
+            raise ModelError(
+                f"The model {origin.model_file}, on which {file} rests, is gone: put it back there, or "
+                f"beside {Path(file).name}."
+            )
+    choice = choose_model(place if origin.model_file else None, progress)
+    if choice.source_hash != origin.model_hash:
+        raise ModelError(
+            f"The model {choice.file or 'of the shipped wing'} has changed since {file} was written (SHA-256 "
+            f"{choice.source_hash[:12]}, not {origin.model_hash[:12]}): run `uav-twin discrepancy run` again."
+        )
+    return choice
 
 
 def choice_of_run(folder: Path) -> ModelChoice:
@@ -167,11 +230,33 @@ def shipped_lumped_models() -> tuple[str, ...]:
     return tuple(sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml")))
 
 
-def _structure_error(name: str, file: str) -> ModelError:
-    return ModelError(
-        f"{name} is a structure, and a model file is expected: `uav-twin structure fmu {file} --rig "
-        "MODEL.toml` writes one of it, beside its FMU."
+def _patched(path: Path, progress: Progress | None) -> ModelChoice:
+    stored = read_patch(path)
+    base = model_of(stored.origin, path, progress)
+    calibrated = {item.name: (item.mean, item.deviation) for item in stored.parameters}
+    return replace(
+        base,
+        model=PatchedModel(base.model, stored.patch, calibrated),
+        label=path.name,
+        source_hash=hash_record({"model": base.source_hash, "patch": hash_file(path)}),
+        built_in=stored.upon(base.built_in),
     )
+
+
+def _structure(path: Path, progress: Progress | None) -> ModelChoice:
+    """Return a structure by its FMU, which is kept beside the reduced models."""
+    try:
+        reduced = reduced_structure(path, progress=progress)
+        content, content_hash = structure_fmu_bytes(reduced)
+        fmu = cache_folder() / f"structure_{content_hash[:32]}.fmu"
+        text = rig_text(load_structure(path), str(fmu))
+    except (FiniteElementError, FmuError) as cause:
+        raise ModelError(str(cause)) from cause
+    if not fmu.is_file():
+        atomic_write_bytes(fmu, content)
+    model = FmuModel(parse_fmu_model(parse_toml(text, str(path), ModelError), str(path)))
+    source = reduced.design_hash
+    return ModelChoice(model, ModelKind.STRUCTURE, path.name, source, path=path, design_hash=source)
 
 
 def _fmu(path: Path) -> ModelChoice:

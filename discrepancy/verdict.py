@@ -48,6 +48,16 @@ class NamedEffect:
 
 
 @dataclass(frozen=True)
+class CalibratedParameter:
+    """A calibrated parameter as a hypothesis has it: posterior mean and standard deviation, in `unit`."""
+
+    name: str
+    mean: Number
+    deviation: Number
+    unit: str
+
+
+@dataclass(frozen=True)
 class Hypothesis:
     """A fitted hypothesis.
 
@@ -61,6 +71,8 @@ class Hypothesis:
         Posterior probability among the hypotheses compared.
     chi_square, degrees_of_freedom : float
         Of the fitted trials against the noise records.
+    parameters : tuple of CalibratedParameter
+        Of the model, beside these effects.
     """
 
     effects: tuple[NamedEffect, ...]
@@ -68,6 +80,7 @@ class Hypothesis:
     probability: Number
     chi_square: Number
     degrees_of_freedom: Number
+    parameters: tuple[CalibratedParameter, ...] = ()
 
     @property
     def identifiers(self) -> tuple[str, ...]:
@@ -267,6 +280,8 @@ class Verdict:
     windows : tuple of GapWindow
         Since when and until when there is a gap in each record: of the model as it was, and of what the best
         hypothesis leaves.
+    parameters : tuple of CalibratedParameter
+        Of the model, in the hypothesis that stands for the verdict.
     """
 
     kind: VerdictKind
@@ -286,3 +301,4 @@ class Verdict:
     remainders: tuple[RemainderEstimate, ...] = ()
     not_fitted: tuple[NotFitted, ...] = ()
     windows: tuple[GapWindow, ...] = ()
+    parameters: tuple[CalibratedParameter, ...] = ()

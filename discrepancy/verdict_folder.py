@@ -150,7 +150,7 @@ def _write(folder: Path, content: VerdictContent, *, report: bool) -> None:
             )
             write_patch(
                 folder / PATCH_NAME, effects, origin, draws, fmu_outputs(found.campaign),
-                verdict=verdict.kind, sentence=verdict.sentence,
+                verdict=verdict.kind, sentence=verdict.sentence, parameters=verdict.parameters,
             )  # fmt: skip
         if verdict.kind is VerdictKind.NAMED and content.pack is not None:
             page = replace(page, fmu=content.pack(folder / PATCH_NAME, folder / FMU_NAME))

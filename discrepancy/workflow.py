@@ -25,6 +25,7 @@ from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
+from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
@@ -36,6 +37,7 @@ from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.force import MissingForce, missing_force
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.wrapped import innermost
 from discrepancy.search.strategy import Search, solver_share
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from fe.runtime.patch import ModelPatch
@@ -221,6 +223,7 @@ def investigate(
     verdict = replace(
         verdict, sentence=_dated(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
         not_fitted=not_fitted(problem.setting, catalogue, search), windows=windows,
+        parameters=calibrated_parameters(problem, fit),
     )  # fmt: skip
     return Investigation(
         campaign,
@@ -362,8 +365,9 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
     if not names:
         return []
     what = "a [[port]] in the model's file"
-    if isinstance(setting.model, LumpedModel):
-        first = setting.model.description.input[0]
+    model = innermost(setting.model)
+    if isinstance(model, LumpedModel) and model.description.input:
+        first = model.description.input[0]
         vector = ", ".join(f"{value:g}" for value in first.vector)
         what += f", such as vector = [{vector}] between the ground and {first.name!r}"
     listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,5 +1,6 @@
 """The one reader of TOML: whatever is wrong with a file becomes one sentence of the caller's exception."""
 
+import json
 import re
 import tomllib
 from collections.abc import Callable
@@ -96,3 +97,37 @@ def _check_integers(
                 "what TOML allows."
             )
         _check_integers(item, here, subject, error)
+
+
+def toml_text(content: dict[str, Any]) -> str:
+    """Return plain data as TOML, of which `parse_toml` makes the same again; tables of tables in one line."""
+    tables = {key: item for key, item in content.items() if isinstance(item, dict)}
+    arrays = {
+        key: item
+        for key, item in content.items()
+        if isinstance(item, list) and item and all(isinstance(row, dict) for row in item)
+    }
+    parts = [_lines({key: item for key, item in content.items() if key not in (*tables, *arrays)})]
+    parts += [f"[{_key(key)}]\n{_lines(item)}" for key, item in tables.items()]
+    parts += [f"[[{_key(key)}]]\n{_lines(row)}" for key, rows in arrays.items() for row in rows]
+    return "\n".join(part for part in parts if part)
+
+
+def _lines(table: dict[str, Any]) -> str:
+    return "".join(f"{_key(key)} = {_shown(item)}\n" for key, item in table.items())
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _shown(name)
+
+
+def _shown(item: Any) -> str:
+    if isinstance(item, str):  # the escapes of JSON are TOML's, but for DEL
+        return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(item, bool):
+        return str(item).lower()
+    if isinstance(item, list | tuple):
+        return f"[{', '.join(map(_shown, item))}]"
+    if isinstance(item, dict):
+        return f"{{ {', '.join(f'{_key(key)} = {_shown(value)}' for key, value in item.items())} }}"
+    return repr(item)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from calibration.wing.result import CalibrationResult
     from fe.reduction.structure_basis import StructureReduction
     from fe.runtime.patch_arrays import PatchArrays
+    from fe.runtime.structure_model import StructureModel
     from fe.structure.operators import Structure
 
 LEVELS = (0, 20, 40, 60, 80)
@@ -37,7 +38,7 @@ settings.register_profile("developer", deadline=None)
 settings.load_profile("ci" if os.environ.get("CI") else "developer")
 
 
-SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_reduction")
+SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_reduction", "plate_model")
 """Fixtures of several files that take three to ten seconds each."""
 
 LARGEST, COMPILING = "wing", "compiling"
@@ -373,3 +374,30 @@ def beam_reduction(beam: Structure) -> StructureReduction:
     from fe.reduction.structure_basis import reduce_structure
 
     return reduce_structure(beam, "beam")
+
+
+@pytest.fixture(scope="session")
+def plate_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A coarse plate with a hole, four regions around it, its reduced model good to half a per cent."""
+    from benchmarks.study_regions import plate
+
+    file = plate(tmp_path_factory.mktemp("plate"), 4, around=8, across=3)
+    with file.open("a", encoding="utf-8") as text:
+        text.write("\n[reduction]\ntolerance = 5e-3\n")
+    return file
+
+
+@pytest.fixture(scope="session")
+def coarse_plate(plate_file: Path) -> Structure:
+    """Its full model."""
+    from fe.structure.operators import load_and_assemble
+
+    return load_and_assemble(plate_file)
+
+
+@pytest.fixture(scope="session")
+def plate_model(coarse_plate: Structure) -> StructureModel:
+    """Its reduced model."""
+    from fe.reduction.structure_cache import reduced
+
+    return kept("coarse-plate", lambda: reduced(coarse_plate), FE, coarse_plate.design_hash)

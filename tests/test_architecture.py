@@ -53,8 +53,9 @@ ROOMS = {
     ),
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",
-        "search_settings", "fits", "missing_force", "search", "judgement", "checks", "sources", "model_choice", "workflow",
-        "parameters", "files", "self_calibration", "report", "verdict_folder",
+        "files", "search_settings", "fits", "missing_force", "search", "judgement", "checks", "sources",
+        "model_choice", "workflow", "parameters", "application", "self_calibration", "report",
+        "verdict_folder",
     ),
 }  # fmt: skip
 

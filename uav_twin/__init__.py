@@ -11,6 +11,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from calibration.dynamics.modal_identification import identify_modes
     from calibration.reading import load_calibration
     from calibration.wing.three_steps import calibrate_wing as calibrate
+    from discrepancy.application import apply_verdict
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.files.verdict import read_verdict_folder as read_verdict
     from discrepancy.model_choice import load_model
@@ -55,6 +56,7 @@ __all__ = [
     "ScenarioEnvironment",
     "Twin",
     "WatchfulEstimator",
+    "apply_verdict",
     "assemble",
     "assemble_structure",
     "build_fmu",
@@ -98,6 +100,7 @@ _HOMES = {
     "ScenarioEnvironment": "twin_master.environment",
     "Twin": "twin_master.network.twin",
     "WatchfulEstimator": "twin_master.learning.monitor",
+    "apply_verdict": "discrepancy.application",
     "assemble": "fe.full.operators",
     "assemble_structure": "fe.structure.operators:load_and_assemble",
     "build_fmu": "fmu_asset.packing.wing_fmu",

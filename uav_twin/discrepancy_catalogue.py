@@ -13,7 +13,6 @@ from uav_twin.console_table import console_table
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
     from discrepancy.catalogue.entry import Effect
-    from discrepancy.model_choice import ModelChoice
     from discrepancy.models.interface import Model
     from discrepancy.sources.examples import ExamplePlan
     from fe.runtime.patch import ModelPatch
@@ -96,14 +95,14 @@ def example(
 ) -> None:
     """Write a simulated campaign, with an effect hidden in it if asked for."""
     from discrepancy.model_choice import choose_model
-    from discrepancy.sources.examples import write_example
+    from discrepancy.sources.examples import plan_of, write_example
     from fe.runtime.patch import ModelPatch
     from reporting.errors import FileNotWrittenError
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileNotWrittenError(f"{out} exists and is not empty: choose another folder.")
     choice = choose_model(model, terminal.progress())
-    plan = _plan(choice)
+    plan = plan_of(choice.model)
     patch = ModelPatch()
     if effect:
         bare = _bare(choice.model, kind, seed, plan)
@@ -118,18 +117,6 @@ def example(
     )
     terminal.say(f"Next: uav-twin discrepancy check {shlex.quote(str(out))}{named}")
     terminal.say(f"Then: uav-twin discrepancy run {shlex.quote(str(out))}{named}")
-
-
-def _plan(choice: "ModelChoice") -> "ExamplePlan":
-    """Return what an example measures: gauges and tip of a wing, every output of a lumped model."""
-    from discrepancy.models.lumped import LumpedModel
-    from discrepancy.sources.examples import plan_for, wing_plan
-
-    if not isinstance(choice.model, LumpedModel):
-        return wing_plan()
-    description = choice.model.description
-    outputs = tuple(item.name for item in description.output)
-    return plan_for(choice.model, outputs, description.input[0].name)
 
 
 def _bare(model: "Model", kind: str, seed: int, plan: "ExamplePlan") -> "Campaign":

@@ -1,5 +1,6 @@
 """`uav-twin discrepancy run`: from a campaign to a verdict, with report, patch and patched FMU."""
 
+import dataclasses
 import shlex
 from math import isfinite
 from pathlib import Path
@@ -27,15 +28,15 @@ SHOWN_EXPERIMENTS = 3
 CampaignOption = Annotated[Path | None, typer.Argument(help="Folder with campaign.toml.", show_default=False)]
 FromRun = Annotated[
     Path | None,
-    typer.Option(help="Folder of a mission (uav-twin run): its flight and its twin's model are compared."),
+    typer.Option(help="Folder of a mission (uav-twin run): its flight, and by default its twin's model."),
 ]
 FromTurn = Annotated[int | None, typer.Option(min=0, help="First turn of --from-run that is compared.")]
 ToTurn = Annotated[int | None, typer.Option(min=0, help="Last turn of --from-run that is compared.")]
 Model = Annotated[
     str | None,
     typer.Option(
-        help="A calibration.nc, a wing design, a lumped model or a description of an FMU (.toml), or "
-        "the name of a shipped lumped model.",
+        help="A calibration.nc, a wing design, a structure, a lumped model or a description of an FMU "
+        "(.toml), one of them patched (.json), or the name of a shipped lumped model.",
         show_default="the shipped wing",
     ),
 ]
@@ -83,8 +84,6 @@ def run(
         raise CampaignFileError("--from-turn and --to-turn belong to --from-run.")
     if from_turn is not None and to_turn is not None and to_turn < from_turn:
         raise CampaignFileError(f"--to-turn {to_turn} lies before --from-turn {from_turn}: no turn is left.")
-    if from_run is not None and model is not None:
-        raise CampaignFileError("--from-run takes the model that the twin believed; leave --model out.")
     source = campaign if from_run is None else from_run
     assert source is not None
     folder = out if out is not None else Path("verdicts") / source.resolve().name
@@ -100,7 +99,7 @@ def run(
         if calibrate is not None:
             tried = _calibrated(found, choice, catalogue, calibrate, seed, progress)
     command = _command(
-        source, model, seed, effects or [], calibrate,
+        source, None if model is None else choice.file, seed, effects or [], calibrate,
         turns=None if from_run is None else (from_turn, to_turn),
     )  # fmt: skip
     pack = None if choice.design is None else _packing(choice, progress)
@@ -131,7 +130,9 @@ def _compared(
     with flown(from_run, first, last, progress) as folder:
         try:
             data = run_campaign(folder, RunPlan(first_turn=first, last_turn=last))
-            return data, choice_of_run(folder)
+            if model is not None:
+                return data, choose_model(model, progress)
+            return data, dataclasses.replace(choice_of_run(folder), file=str(from_run.resolve()))
         except DiscrepancyError as error:  # a watch was read from a copy, which is nothing to its user
             raise type(error)(str(error).replace(str(folder), str(from_run))) from error
 
@@ -161,6 +162,7 @@ def _origin(
         choice.source_hash,
         command,
         collect_provenance(seed, input_hashes=_inputs(data.data_hash, choice, effects)),
+        choice.file,
     )
 
 
@@ -178,6 +180,7 @@ def _conclude(
     found: "Investigation", tried: "SelfCalibration | None", folder: Path, place: str, *, silent: bool
 ) -> None:
     """Print the conclusion; data at fault end the command with 1."""
+    from discrepancy.application import gives
     from discrepancy.verdict import VerdictKind
 
     console = terminal.console(silent=silent)
@@ -191,6 +194,8 @@ def _conclude(
     if tried is not None:
         _show_trials(tried, console)
     console.print(place, soft_wrap=True)
+    if gives(found.verdict):
+        console.print(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}", soft_wrap=True)
 
 
 def _calibrated(
@@ -215,21 +220,21 @@ def _command(
     source: Path, model: str | None, seed: int, effects: list[Path], calibrate: int | None, *,
     turns: tuple[int | None, int | None] | None,
 ) -> str:  # fmt: skip
-    """Return the command without the folders of this machine."""
+    """Return the command that does the same in any folder: with absolute paths."""
     words = [
         "uav-twin",
         "discrepancy",
         "run",
         *([] if turns is None else ["--from-run"]),
-        source.resolve().name,
+        str(source.resolve()),
     ]
     for option, turn in zip(("--from-turn", "--to-turn"), turns or (), strict=False):
         words += [] if turn is None else [option, str(turn)]
     if model is not None:
-        words += ["--model", Path(model).name]
+        words += ["--model", model]
     words += ["--seed", str(seed)]
     for path in effects:
-        words += ["--effects", path.name]
+        words += ["--effects", str(path.resolve())]
     if calibrate is not None:
         words += ["--calibrate", str(calibrate)]
     return shlex.join(words)
@@ -246,25 +251,16 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
     """Return what makes the FMU of a wing that carries a patch, its effects off."""
 
     def pack(patch_file: Path, target: Path) -> str:
-        from calibration.wing.result_file import load_calibration
-        from calibration.wing.wing_record import tailoring
-        from discrepancy.model_choice import ModelKind
+        from discrepancy.application import pack_patched
+        from discrepancy.files.patch import read_patch
         from fmu_asset.errors import PatchFileError
-        from fmu_asset.packing.patch_file import load_patch
-        from fmu_asset.packing.wing_packing import pack_wing
 
+        patch = read_patch(patch_file).upon(choice.built_in)
         try:
-            patch = load_patch(patch_file)
-            tailored = None
-            if choice.kind is ModelKind.CALIBRATION:
-                assert choice.path is not None
-                tailored = tailoring(load_calibration(choice.path))
-            assert choice.design is not None  # a patch of the wing's FMU comes from a wing
-            pack_wing(choice.design, target, tailoring=tailored, patch=patch, progress=progress)
+            switches = pack_patched(choice, patch, target, progress=progress)
         except PatchFileError as cause:
-            return f"There is no patched FMU: {str(cause).replace(str(patch_file), patch_file.name)}"
-        names = ", ".join(f"effect.{effect.id}.active" for effect in patch.effects)
-        return f"{target.name} carries it, off until {names} is set to 1."
+            return f"There is no patched FMU: {cause}"
+        return f"{target.name} carries it, off until {', '.join(switches)} is set to 1."
 
     return pack
 

@@ -75,3 +75,4 @@ def _errors(errors: "MeasuredErrors") -> Iterator[tuple[str, str]]:
     ):
         if value == value:  # not where there are no such outputs
             yield what, f"{value:.2g}"
+    yield "states in which an error exceeds its bound", f"{errors.broken}"

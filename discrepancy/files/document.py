@@ -5,6 +5,7 @@ docs/verdict.md.
 """
 
 import json
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
@@ -37,9 +38,12 @@ class Origin:
     data_hash, model_hash : str
         SHA-256 of the campaign's files and of the model.
     command : str
-        The command that repeats it, without absolute paths.
+        The command that repeats it in any folder: its paths are absolute.
     provenance : Provenance
         Seed, versions, hashes of the sources.
+    model_file : str or None
+        Absolute path of the model's file, or of the mission whose twin's model it is; the name of a shipped
+        model, empty for the shipped wing. None: not known, as of files before it was recorded.
     """
 
     campaign: str
@@ -48,6 +52,13 @@ class Origin:
     model_hash: str
     command: str
     provenance: Provenance
+    model_file: str | None = None
+
+    @property
+    def short_command(self) -> str:
+        """The command with the names of files alone, for pages that are handed on."""
+        words = shlex.split(self.command)
+        return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
 
 def shipped_schema(name: str) -> dict[str, Any]:
@@ -147,11 +158,12 @@ def read_document(
             f"{path} is {f'of the schema {came!r}' if came else 'no file of this kind'}, but {schema!r} is "
             "needed."
         )
+    content = older.get(str(came), dict)(content)
     of_origin = {item.name for item in fields(Origin)}
     before, after = f"{path} does not fit its schema: ", "; write it again."
     origin = _checked(Origin, {k: v for k, v in content.items() if k in of_origin}, before, after)
     own = {k: v for k, v in content.items() if k not in of_origin}
-    return _checked(kind, older.get(str(came), dict)(own), before, after), origin
+    return _checked(kind, own, before, after), origin
 
 
 def _checked(kind: type[_Record], content: dict[str, Any], before: str, after: str) -> _Record:

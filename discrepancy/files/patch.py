@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from math import nan
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,12 +14,15 @@ from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.document_types import PRIMITIVE_UNITS, Number
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.document import Origin, read_document, write_document
-from discrepancy.verdict import NamedEffect, VerdictKind
+from discrepancy.verdict import CalibratedParameter, NamedEffect, VerdictKind
 from fe.runtime.patch import ModelPatch
+from fmu_asset.packing.patch_file import FIRST_SCHEMA
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 
 PATCHED = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY, VerdictKind.GROUP)
 """Verdicts that leave a patch."""
+APPLIED = (*PATCHED, VerdictKind.UNEXPLAINED)
+"""What a patch may rest on; on an unexplained gap where its best hypothesis is applied."""
 PATCH_NAME = "patch.json"
 
 _INTERVAL = (0.05, 0.95)
@@ -50,8 +53,8 @@ class PatchEffect(NamedEffect):
 
 
 def _patched(kind: VerdictKind) -> VerdictKind:
-    if kind not in PATCHED:
-        raise ValueError(f"a patch rests on a name, a family or a group, and {kind.value!r} came")
+    if kind not in APPLIED:
+        raise ValueError(f"a patch rests on a name, a family, a group or a hypothesis, not on {kind.value!r}")
     return kind
 
 
@@ -62,37 +65,57 @@ class PatchDocument:
     Attributes
     ----------
     verdict : VerdictKind
-        What the patch rests on; of a group it is the most probable member, which is no name.
+        What the patch rests on; of a group it is one member, mostly the most probable, and of an unexplained
+        gap the best hypothesis: these are no names.
     sentence : str
         The verdict in words.
     effects : tuple of PatchEffect
         In order.
     channels : mapping of str to str
         Outputs of the wing FMU by the names of channels.
+    parameters : tuple of CalibratedParameter
+        Of the model, beside these effects.
     """
 
     verdict: Annotated[
-        VerdictKind, AfterValidator(_patched), WithJsonSchema({"enum": [kind.value for kind in PATCHED]})
+        VerdictKind, AfterValidator(_patched), WithJsonSchema({"enum": [kind.value for kind in APPLIED]})
     ]
     sentence: str
     effects: tuple[PatchEffect, ...]
     channels: Mapping[str, str]
+    parameters: tuple[CalibratedParameter, ...]
 
 
 @dataclass(frozen=True)
 class StoredPatch:
-    """Content of patch.json: effects, intervals of their primitives, origin, outputs by channel, verdict."""
+    """Content of patch.json, as `PatchDocument`: effects, intervals of their primitives, origin, the rest."""
 
     effects: tuple[NamedEffect, ...]
     intervals: tuple[tuple[PrimitiveInterval, ...], ...]
     origin: Origin
     channels: Mapping[str, str] = field(default_factory=dict)
     verdict: VerdictKind = VerdictKind.NAMED
+    sentence: str = ""
+    parameters: tuple[CalibratedParameter, ...] = ()
 
     @property
     def patch(self) -> ModelPatch:
         """The whole patch: that of all effects, in order."""
         return sum((effect.patch for effect in self.effects), ModelPatch())
+
+    def upon(self, earlier: "StoredPatch | None") -> "StoredPatch":
+        """Return this patch and the one that was built into its model, for the model that had neither."""
+        if earlier is None:
+            return self
+        return replace(
+            self,
+            effects=earlier.effects + self.effects,
+            intervals=earlier.intervals + self.intervals,
+            origin=replace(
+                self.origin, model_file=earlier.origin.model_file, model_hash=earlier.origin.model_hash
+            ),
+            channels={**earlier.channels, **self.channels},
+        )
 
 
 def primitive_intervals(patch: ModelPatch, draws: Sequence[ModelPatch] = ()) -> tuple[PrimitiveInterval, ...]:
@@ -136,6 +159,7 @@ def write_patch(
     *,
     verdict: VerdictKind = VerdictKind.NAMED,
     sentence: str = "",
+    parameters: tuple[CalibratedParameter, ...] = (),
 ) -> Path:
     """Write patch.json, whole or not at all.
 
@@ -156,6 +180,8 @@ def write_patch(
         On what the patch rests: a name, a family, or a group of which it is the most probable member.
     sentence : str
         The verdict in words.
+    parameters : tuple of CalibratedParameter
+        Of the model, beside these effects.
 
     Raises
     ------
@@ -166,16 +192,24 @@ def write_patch(
         raise VerdictFileError(
             f"Draws are needed for each of {len(effects)} effects, or none, but came for {len(draws)}."
         )
-    rows = tuple(
-        PatchEffect(
-            **_fields(effect),
-            intervals=primitive_intervals(effect.patch, draws[place] if draws else ()),
-        )
+    intervals = tuple(
+        primitive_intervals(effect.patch, draws[place] if draws else ())
         for place, effect in enumerate(effects)
     )
-    return write_document(
-        path, PATCH_SCHEMA, origin, PatchDocument(verdict, sentence, rows, dict(channels or {}))
+    stored = StoredPatch(
+        tuple(effects), intervals, origin, dict(channels or {}), verdict, sentence, parameters
     )
+    return store_patch(path, stored)
+
+
+def store_patch(path: Path, stored: StoredPatch) -> Path:
+    """Write the file of a patch, whole or not at all; raises as `write_patch`."""
+    rows = tuple(
+        PatchEffect(**_fields(effect), intervals=own)
+        for effect, own in zip(stored.effects, stored.intervals, strict=True)
+    )
+    content = PatchDocument(stored.verdict, stored.sentence, rows, stored.channels, stored.parameters)
+    return write_document(path, PATCH_SCHEMA, stored.origin, content)
 
 
 def _fields(effect: NamedEffect) -> dict[str, Any]:
@@ -216,11 +250,14 @@ def read_patch(path: Path) -> StoredPatch:
     VerdictFileError
         As `read_verdict`.
     """
-    found, origin = read_document(path, PATCH_SCHEMA, PatchDocument)
+    older = {FIRST_SCHEMA: lambda content: {**content, "model_file": None, "parameters": []}}
+    found, origin = read_document(path, PATCH_SCHEMA, PatchDocument, older)
     return StoredPatch(
         tuple(NamedEffect(**_fields(effect)) for effect in found.effects),
         tuple(effect.intervals for effect in found.effects),
         origin,
         found.channels,
         found.verdict,
+        found.sentence,
+        found.parameters,
     )

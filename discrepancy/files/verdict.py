@@ -1,6 +1,7 @@
 """`verdict.json`: what was concluded, what it rests on, and the proof."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,13 @@ from discrepancy.verdict import Proof, Verdict
 from fe.runtime.patch import ModelPatch
 from reporting.folders import restore_folder
 
-VERDICT_SCHEMA = "uav-twin verdict 2"
-"""Value of the key `schema`; files of number 1 are read too."""
-FIRST_SCHEMA = "uav-twin verdict 1"
+VERDICT_SCHEMA = "uav-twin verdict 3"
+"""Value of the key `schema`; files of numbers 1 and 2 are read too."""
 VERDICT_NAME = "verdict.json"
-LATER_KEYS: dict[str, Any] = {"explained": None, "remainders": [], "not_fitted": [], "windows": []}
-"""Keys of the verdict that files of number 1 lack."""
+_SECOND: dict[str, Any] = {"explained": None, "remainders": [], "not_fitted": [], "windows": []}
+_THIRD: dict[str, Any] = {"parameters": []}
+LATER_KEYS = {"uav-twin verdict 1": {**_SECOND, **_THIRD}, "uav-twin verdict 2": _THIRD}
+"""Keys of the verdict that older files lack, by their schema."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +80,20 @@ def read_verdict(path: Path) -> StoredVerdict:
     VerdictFileError
         If the file is missing, damaged, of another schema, or holds something else than it should.
     """
-    found, origin = read_document(path, VERDICT_SCHEMA, VerdictDocument, {FIRST_SCHEMA: _with_later_keys})
+    older = {schema: partial(_with_later_keys, keys) for schema, keys in LATER_KEYS.items()}
+    found, origin = read_document(path, VERDICT_SCHEMA, VerdictDocument, older)
     return StoredVerdict(found.verdict, found.proof, origin)
 
 
-def _with_later_keys(content: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of a file of number 1 with the keys of number 2, empty."""
+def _with_later_keys(keys: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of an older file with the keys that it lacks, empty."""
     verdict = content.get("verdict")
-    return {**content, "verdict": {**verdict, **LATER_KEYS}} if isinstance(verdict, dict) else content
+    if not isinstance(verdict, dict):
+        return content
+    hypotheses = verdict.get("hypotheses")
+    if isinstance(hypotheses, list) and all(isinstance(row, dict) for row in hypotheses):
+        verdict = {**verdict, "hypotheses": [{"parameters": [], **row} for row in hypotheses]}
+    return {"model_file": None, **content, "verdict": {**keys, **verdict}}
 
 
 def read_verdict_folder(folder: Path | str) -> VerdictFolder:

@@ -11,7 +11,15 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.posterior import with_draws
 from discrepancy.fits.problem import Problem
 from discrepancy.search.strategy import Search
-from discrepancy.verdict import Estimate, Gate, Hypothesis, NamedEffect, Verdict, VerdictKind
+from discrepancy.verdict import (
+    CalibratedParameter,
+    Estimate,
+    Gate,
+    Hypothesis,
+    NamedEffect,
+    Verdict,
+    VerdictKind,
+)
 
 
 @dataclass(frozen=True)
@@ -139,6 +147,17 @@ def named_effects(problem: Problem, found: CandidateFit) -> tuple[NamedEffect, .
     return tuple(named)
 
 
+def calibrated_parameters(problem: Problem, found: CandidateFit) -> tuple[CalibratedParameter, ...]:
+    """Return the calibrated parameters of the model as a fit has them, within the model's range."""
+    layout = problem.shared
+    values = layout.parameters(found.point.shared)
+    spread = layout.parameter_scale * np.sqrt(np.maximum(np.diag(found.covariance)[: len(values)], 0.0))
+    return tuple(
+        CalibratedParameter(item.name, float(value), float(deviation), item.unit)
+        for item, value, deviation in zip(problem.model.parameters, values, spread, strict=True)
+    )
+
+
 def compared(
     problem: Problem, found: Search, probabilities: dict[tuple[str, ...], float]
 ) -> tuple[Hypothesis, ...]:
@@ -154,6 +173,7 @@ def compared(
                 probability,
                 best.chi_square,
                 float(problem.counts.sum() - best.spent.sum()),
+                calibrated_parameters(problem, best),
             )
         )
     return tuple(rows)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
-from fe.runtime.errors import InvalidPatchError
-from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from discrepancy.models.patch_parts import LoadChange, laws_at
+from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.patch import (
     INTERNAL_FORCES,
     SENSORS,
@@ -27,21 +27,16 @@ class SortedPatch:
         Internal forces at ports.
     settings : tuple of (str, float)
         Parameters that the FMU itself has for primitives, sorted by name.
-    gain, tare : float
-        The acting force is (1 + gain) times the recorded one, plus the tare [N] where it is not zero.
-    along_span, along_chord : float
-        How far the acting force is moved [m].
+    load : LoadChange
+        Of the recorded force.
     """
 
     laws: Laws
     settings: tuple[tuple[str, float], ...]
-    gain: float
-    tare: float
-    along_span: float
-    along_chord: float
+    load: LoadChange
 
 
-NO_PATCH = SortedPatch(NO_LAWS, (), 0.0, 0.0, 0.0, 0.0)
+NO_PATCH = SortedPatch(NO_LAWS, (), LoadChange())
 """The empty patch, sorted."""
 
 
@@ -67,8 +62,8 @@ def sorted_patch(patch: ModelPatch, description: FmuModelDescription) -> SortedP
     """
     ports = tuple(port.name for port in description.port)
     forces: list[Primitive] = []
+    loads: list[Primitive] = []
     settings: dict[str, float] = {}
-    gain, tare, along_span, along_chord = 0.0, 0.0, 0.0, 0.0
     effects = description.effects
     for item in patch:
         if isinstance(item, SENSORS):
@@ -89,19 +84,13 @@ def sorted_patch(patch: ModelPatch, description: FmuModelDescription) -> SortedP
             raise ModelError(
                 f"The FMU model {description.name!r} cannot carry the primitive {item.kind!r}{port}."
             )
-        elif isinstance(item, LoadGain):
-            gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare * (1.0 + item.gain) + item.tare
-        elif isinstance(item, LoadPlace):
-            along_span, along_chord = along_span + item.along_span, along_chord + item.along_chord
         else:
-            forces.append(item)
-    if along_chord and description.inputs.torque is None:
+            (loads if isinstance(item, LoadGain | LoadPlace) else forces).append(item)
+    load = LoadChange.of(loads)
+    if load.along_chord and description.inputs.torque is None:
         raise ModelError(
             f"The FMU model {description.name!r} names no torque in [inputs], so a load cannot move along "
             f"the chord."
         )
-    try:
-        laws = laws_of(ModelPatch(tuple(forces)), ports) if forces else NO_LAWS
-    except InvalidPatchError as cause:
-        raise ModelError(str(cause)) from cause
-    return SortedPatch(laws, tuple(sorted(settings.items())), gain, tare, along_span, along_chord)
+    laws = laws_at(ModelPatch(tuple(forces)), ports, in_windows=False)
+    return SortedPatch(laws, tuple(sorted(settings.items())), load)

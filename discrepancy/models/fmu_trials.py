@@ -90,16 +90,17 @@ class FmuTrials:
         held, first = 0.5 * (begins + ends), float(trial.force[0])
         on = ((begins != 0.0) | (ends != 0.0)).astype(float)
         loads = []
+        gain, tare, *_ = patch.load
         for variable, lever in self._pushed(trial, patch):
-            loads.append((Excitation("input", variable, held, first), (1.0 + patch.gain) * lever))
-            if patch.tare:
-                loads.append((Excitation("input", variable, on, float(first != 0.0)), patch.tare * lever))
+            loads.append((Excitation("input", variable, held, first), (1.0 + gain) * lever))
+            if tare:
+                loads.append((Excitation("input", variable, on, float(first != 0.0)), tare * lever))
         return loads
 
     def _pushed(self, trial: Trial, patch: SortedPatch) -> list[tuple[str, float]]:
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""
         inputs = self._description.inputs
-        moments = ((inputs.bending_moment, patch.along_span), (inputs.torque, patch.along_chord))
+        moments = ((inputs.bending_moment, patch.load.along_span), (inputs.torque, patch.load.along_chord))
         return [
             (self._input_of(trial), 1.0),
             *((self._runs.variable(name), lever) for name, lever in moments if name is not None and lever),
@@ -123,7 +124,7 @@ class FmuTrials:
                 f"load_factor in [inputs]; leave it out."
             )
         count = len(trial.force)
-        held, acting = self._held(trial, conditions), acting_force(trial, patch.gain, patch.tare)
+        held, acting = self._held(trial, conditions), acting_force(trial, patch.load.gain, patch.load.tare)
         loads: list[dict[str, float]] = []
         for row in range(count):
             if flight:

@@ -20,11 +20,11 @@ from discrepancy.models.interface import (
     check_lumped,
 )
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped, matrix_of
-from discrepancy.models.lumped_patch import laws_at, sorted_lumped
 from discrepancy.models.lumped_rig import LumpedRig
 from discrepancy.models.lumped_scales import rig_scales, state_sizes
 from discrepancy.models.lumped_sections import Damping
 from discrepancy.models.memory import Memory
+from discrepancy.models.patch_parts import laws_at, sorted_lumped
 from discrepancy.models.ported_lumped import PortedLumped
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.runtime.laws import LAWS
@@ -145,8 +145,7 @@ class LumpedModel(PortedLumped):
                 campaign,
                 self.stations(),
             )
-        values = [campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in self._parameters]
-        conditions = Conditions(np.array(values))
+        conditions = Conditions(self._prior_mean(campaign))
         system = self._system(conditions.parameters, (), 0.0)
         loaded = [trial.load_place for trial in campaign.trials if trial.kind is not TrialKind.FLIGHT]
         row = self._input_row(loaded[0]) if loaded else np.array(self.description.input[0].vector)
@@ -206,22 +205,20 @@ class LumpedModel(PortedLumped):
         """
         check_lumped(trial, f"the lumped model {self.name!r}")
         self._check_outputs(outputs)
-        quantities = [quantity for _, quantity in outputs]
         own = patch.in_trial(trial.name)
-        structure, forces, gain, tare, along_span, along_chord, loads = sorted_lumped(own, self)
+        structure, forces, (gain, tare, along_span, along_chord), loads = sorted_lumped(own, self)
+        forces = self.description.own_laws(self._factors(conditions.parameters)) + forces
         laws = laws_at(forces, self._ports)
         acting = acting_force(trial, gain, tare)
         switched = bool(laws.spans) and trial.kind is not TrialKind.RINGDOWN
         if self._as_rig(trial) or loads or switched:
             lumped = self._rig(conditions.parameters, structure, float(trial.temperature[0]))
-            if len(lumped.own_laws):
-                laws = laws_at(lumped.own_laws + forces, self._ports)
             place = self._moved_place(lumped, trial, along_span, along_chord)
             return lumped.response(trial, outputs, laws, conditions, (gain, tare, place, loads), refinement)
         rows = np.array([self._outputs[output] for output, _ in outputs]).reshape(-1, self.description.size)
         row = self._input_row(trial.load_place)
         if trial.kind is TrialKind.STATIC:
-            if any(quantity.is_rate for quantity in quantities):
+            if any(quantity.is_rate for _, quantity in outputs):
                 raise ModelError(
                     f"The trial {trial.name!r} is static, but a channel measures velocity or acceleration."
                 )
@@ -250,15 +247,13 @@ class LumpedModel(PortedLumped):
                 row, Course.of_force(trial, gain, tare), trial.time, laws, clock=conditions.clock,
                 refinement=refinement,
             )  # fmt: skip
-        return motion.response(rows, quantities)
+        return motion.response(rows, [quantity for _, quantity in outputs])
 
     @property
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
-        mean = np.array([item.mean for item in self._parameters])
-        return self.description.is_plain or bool(
-            np.any(self._rig(mean, (), 0.0).rig().angular_frequency > 0.0)
-        )
+        rig = self._rig(self._mean, (), 0.0).rig()
+        return self.description.is_plain or bool(np.any(rig.angular_frequency > 0.0))
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
@@ -354,20 +349,24 @@ class LumpedModel(PortedLumped):
 
         return self._systems.get(("rig", parameters.tobytes(), structure, softening), make)
 
-    def _matrices(
-        self, parameters: FloatArray, structure: tuple[Primitive, ...], softening: float
-    ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
-        """Return mass and stiffness (n, n), patched, and the factors of the terms."""
-        description = self.description
+    def _factors(self, parameters: FloatArray) -> dict[str, float]:
+        """Return the factors of the terms at values of the parameters."""
         if parameters.shape != (len(self._parameters),):
             raise ModelError(
                 f"The lumped model {self.name!r} has {counted(len(self._parameters), 'parameter')}, but "
                 f"{parameters.size} came."
             )
         factors: dict[str, float] = {}
-        for item, value in zip(description.parameter, parameters, strict=True):
+        for item, value in zip(self.description.parameter, parameters, strict=True):
             for term in item.scaled:
                 factors[term] = factors.get(term, 1.0) * float(value)
+        return factors
+
+    def _matrices(
+        self, parameters: FloatArray, structure: tuple[Primitive, ...], softening: float
+    ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
+        """Return mass and stiffness (n, n), patched, and the factors of the terms."""
+        description, factors = self.description, self._factors(parameters)
         if 1.0 - softening < LEAST_STIFFNESS:
             raise ModelError(
                 f"The temperature leaves {1.0 - softening:.2g} of the stiffness, which no structure has."

@@ -27,6 +27,7 @@ from discrepancy.models.lumped_sections import (
     ScaledParameter,
 )
 from discrepancy.models.model_file import ModelDescription, Positive, check_unique
+from fe.runtime.patch import ModelPatch
 from reporting.section import checked
 from reporting.toml_file import read_toml
 from reporting.words import counted
@@ -97,7 +98,7 @@ class LumpedDescription(ModelDescription):
     def is_plain(self) -> bool:
         """Whether it is a structure at rest on springs under one force at a time."""
         motion = any(item.quantity.moving or item.through for item in self.input)
-        parts = self.states or self.free or self.load or self.damping_part or self.law or self.controller
+        parts = self.states or self.free or self.load or self.damping_part or self.controller
         acts = any(item.acts for item in self.port)
         reads = any(item.reaction or item.constant for item in self.output)
         return not (parts or motion or acts or reads)
@@ -171,6 +172,10 @@ class LumpedDescription(ModelDescription):
         for part in getattr(self, f"{name}_part"):
             whole = whole + factors.get(part.name, 1.0) * matrix_of(part.matrix)
         return np.asarray(whole * factors.get(name, 1.0))
+
+    def own_laws(self, factors: Mapping[str, float]) -> ModelPatch:
+        """Return the laws of ports that the model has as it is, each times its factor."""
+        return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in self.law))
 
     def _check_vectors(
         self,
@@ -280,12 +285,10 @@ class LumpedDescription(ModelDescription):
         check_unique("part", [*parts, "mass", "stiffness", "damping", "capacity", "conductance"])
         check_unique("parameter", [item.name for item in self.parameter])
         known = list(self.terms)
-        named = (self.input, self.load, self.law, self.controller)
+        named = (self.law,) if self.is_plain else (self.input, self.load, self.law, self.controller)
         more = [item.name for items in named for item in items]
         more += [f"{item.name}.{gain}" for item in self.controller for gain in GAINS]
         known += [name for name in more if name not in known]
-        if self.is_plain:
-            known = list(self.terms)
         for parameter in self.parameter:
             for term in parameter.scaled:
                 if term not in known:

@@ -18,7 +18,7 @@ from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.rig import Rig, RigMotion, order_of
 from discrepancy.models.rig_records import Acting, Shown
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
-from fe.runtime.patch import ModelPatch, PortLoad, course_of
+from fe.runtime.patch import PortLoad, course_of
 
 FloatArray = NDArray[np.float64]
 
@@ -59,8 +59,7 @@ class LumpedRig:
             (self._vector(item.vector, item.through, item.name) for item in description.load),
             np.zeros(self.width),
         )
-        own = ModelPatch(tuple(item.scaled(factors.get(item.name, 1.0)) for item in description.law))
-        self.own_laws = own
+        own = description.own_laws(factors)
         self._laws = laws_of(own, {item.name for item in description.port}) if len(own) else NO_LAWS
 
     @property

@@ -1,9 +1,13 @@
 """A model with a patch built in: a known addition, or an effect that was found."""
 
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
 from discrepancy.campaign.records import Quantity, Trial
 from fe.runtime.patch import SENSORS, ModelPatch
 
-from .interface import Conditions, Model, Response
+from .interface import Conditions, Model, ModelParameter, Response
 from .wrapped import WrappedModel
 
 
@@ -18,12 +22,29 @@ class PatchedModel(WrappedModel):
     model : Model
         The model.
     patch : ModelPatch
-        What is added; its sensors name outputs of the model as their channels.
+        What is added; its sensors name channels of a campaign, or outputs of the model.
+    calibrated : mapping of str to (float, float)
+        Mean and standard deviation of calibrated parameters, where they are not those of the model.
     """
 
-    def __init__(self, model: Model, patch: ModelPatch) -> None:
+    def __init__(
+        self,
+        model: Model,
+        patch: ModelPatch,
+        calibrated: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    ) -> None:
         super().__init__(model)
         self.patch = patch
+        self._parameters = tuple(
+            replace(item, mean=mean, deviation=deviation)
+            for item in model.parameters
+            for mean, deviation in [calibrated.get(item.name, (item.mean, item.deviation))]
+        )
+
+    @property
+    def parameters(self) -> tuple[ModelParameter, ...]:
+        """Calibrated parameters."""
+        return self._parameters
 
     @property
     def sensors(self) -> ModelPatch:

@@ -43,6 +43,9 @@ class PortedLumped(ABC):
     @abstractmethod
     def _input_row(self, place: str | tuple[float, float]) -> FloatArray: ...
 
+    @abstractmethod
+    def _factors(self, parameters: FloatArray) -> dict[str, float]: ...
+
     @property
     def _mean(self) -> FloatArray:
         return np.array([item.mean for item in self.parameters])
@@ -81,7 +84,7 @@ class PortedLumped(ABC):
         if not self.description.law:
             return self, ModelPatch()
         linear = self.description.model_copy(update={"law": []})
-        return type(self)(linear), self._rig(self._mean, (), 0.0).own_laws  # type: ignore[call-arg]
+        return type(self)(linear), self.description.own_laws(self._factors(self._mean))  # type: ignore[call-arg]
 
 
 def rig_system(rig: Rig, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:

@@ -176,11 +176,11 @@ def _logged(
 
 
 def _by_channels(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
-    """Return sensor primitives for the channels that measure the outputs which they name."""
+    """Return sensor primitives for the channels of their name, else those that measure the output of it."""
     found: list[Primitive] = []
     for item in sensors:
         output = getattr(item, "channel", EVERY_CHANNEL)
-        if output == EVERY_CHANNEL:
+        if output == EVERY_CHANNEL or output in campaign.channels:
             found.append(item)
             continue
         found += [

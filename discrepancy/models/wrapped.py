@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial
-from fe.runtime.patch import ModelPatch, Primitive
+from fe.runtime.patch import ModelPatch, PortForce, Primitive
 
 from .interface import Model, ModelParameter, Scales
 
@@ -30,7 +30,7 @@ class WrappedModel:
 
     @property
     def sensors(self) -> ModelPatch:
-        """Sensor primitives that are built in, their channels named by outputs; see `built_in_sensors`."""
+        """Sensor primitives that are built in; see `built_in_sensors`."""
         return built_in_sensors(self.inner)
 
     @property
@@ -63,6 +63,13 @@ class WrappedModel:
         return self.inner.scales(campaign)
 
 
+def innermost(model: Model) -> Model:
+    """Return the model that others are wrapped around."""
+    while isinstance(model, WrappedModel):
+        model = model.inner
+    return model
+
+
 def initial_sizes(model: Model, campaign: Campaign, trial: Trial) -> FloatArray:
     """Return natural sizes (L,) of a model's state at the begin of a trial; empty: it is never unknown."""
     sizes = getattr(model, "initial_sizes", None)
@@ -71,20 +78,25 @@ def initial_sizes(model: Model, campaign: Campaign, trial: Trial) -> FloatArray:
 
 def oscillates(model: Model) -> bool:
     """Whether a model has a mode that vibrates; models that do not say it have one."""
-    while isinstance(model, WrappedModel):
-        model = model.inner
-    return bool(getattr(model, "oscillates", True))
+    return bool(getattr(innermost(model), "oscillates", True))
 
 
 def follows_windows(model: Model) -> bool:
     """Whether a model can follow laws that act in windows only; models that do not say it cannot."""
+    return bool(getattr(innermost(model), "follows_windows", False))
+
+
+def has_law(model: Model) -> bool:
+    """Whether a model has a law of a port of its own, such as one that was found."""
     while isinstance(model, WrappedModel):
+        if len(getattr(model, "patch", ModelPatch()).of(PortForce)):
+            return True
         model = model.inner
-    return bool(getattr(model, "follows_windows", False))
+    return bool(getattr(getattr(model, "description", None), "law", ()))
 
 
 def built_in_sensors(model: Model) -> ModelPatch:
-    """Return the sensor primitives that a model has built in, their channels named by its outputs.
+    """Return the sensor primitives that a model has built in, for channels or for outputs of those names.
 
     They are no part of its responses: `discrepancy.models.sensing.observe` applies them, since what sensors
     show of a response depends on all of them together.

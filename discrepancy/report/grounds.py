@@ -232,7 +232,7 @@ def add_origin(page: Page, origin: Origin) -> None:
     rows = [
         ("campaign", f"{origin.campaign}, SHA-256 {origin.data_hash}"),
         ("model", f"{origin.model}, SHA-256 {origin.model_hash}"),
-        ("command", origin.command),
+        ("command", origin.short_command),
         ("seed", str(provenance.seed)),
         *((f"input {name}", f"SHA-256 {value}") for name, value in provenance.input_hashes.items()),
         ("software", ", ".join(f"{name} {version}" for name, version in provenance.versions.items())),

@@ -37,7 +37,7 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
         origin.campaign,
         f"What the model “{origin.model}” lacks beside these data: located, named, added, proved",
         footer=(
-            f"Repeat it: {origin.command}",
+            f"Repeat it: {origin.short_command}",
             f"Data {origin.data_hash[:16]}, model {origin.model_hash[:16]}, seed {origin.provenance.seed}.",
         ),
     )

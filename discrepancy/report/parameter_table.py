@@ -1,7 +1,6 @@
 """Calibrated parameters: what the calibration believed, and what each model makes of the data."""
 
-import numpy as np
-
+from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.report.text import added_label, rounded, unit_text
 from discrepancy.workflow import Investigation
 from reporting.page import Column, Page, Table
@@ -21,13 +20,10 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
     layout = problem.shared
     fits = [search.none] + ([fit] if fit.candidate.terms else [])
     rows = []
-    for number, item in enumerate(investigation.model.parameters):
-        mean, scale = float(layout.parameter_mean[number]), float(layout.parameter_scale[number])
-        cells = [_beside(mean, scale)]
-        for one in fits:
-            deviation = scale * float(np.sqrt(max(one.covariance[number, number], 0.0)))
-            cells.append(_beside(float(layout.parameters(one.point.shared)[number]), deviation))
-        rows.append((item.name.replace("_", " "), unit_text(item.unit), *cells))
+    stated = zip(layout.parameter_mean.tolist(), layout.parameter_scale.tolist(), strict=True)
+    for prior, *found in zip(stated, *(calibrated_parameters(problem, one) for one in fits), strict=True):
+        cells = [_beside(*prior), *(_beside(item.mean, item.deviation) for item in found)]
+        rows.append((found[0].name.replace("_", " "), unit_text(found[0].unit), *cells))
     return rows
 
 

@@ -12,6 +12,7 @@ from discrepancy.files.patch import PrimitiveInterval
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wing import WingModel
+from discrepancy.models.wrapped import innermost
 from discrepancy.report.text import NAMING, rounded, unit_text
 from discrepancy.verdict import NamedEffect
 from discrepancy.workflow import Investigation
@@ -123,6 +124,7 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
 
 def _unit_of_state(port: str, model: Model) -> str:
     """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
+    model = innermost(model)
     if not isinstance(model, LumpedModel):
         return ""
     first = model.description.size
@@ -137,6 +139,7 @@ def _turns(port: str, model: Model) -> bool | None:
 
     A port of a lumped model moves if it is a sum or difference of unknowns measured as displacements.
     """
+    model = innermost(model)
     if isinstance(model, WingModel):
         return port == ROTATING_PORT
     if not isinstance(model, LumpedModel):

@@ -129,6 +129,17 @@ class Beginnings:
         except DiscrepancyError:
             return None
 
+    def again(self, found: CandidateFit) -> CandidateFit | None:
+        """Fit the effects of a fit once more, beginnings first; None where that leads nowhere better.
+
+        A model that has a law of its own, as dry friction that ends a motion, has many optima.
+        """
+        screen = self.screen(found)
+        begun = None if screen is None else self._fitted(found.candidate, screen.fit.point)
+        whole = None if begun is None else attempt(self.problem, found.candidate, begun.point)
+        better = whole is not None and whole.objective < found.objective - SEARCH.worth_fitting
+        return whole if better else None
+
     def shortly(
         self, near: CandidateFit, candidate: Candidate, added: FloatArray, give_up: float | None = None
     ) -> CandidateFit | None:

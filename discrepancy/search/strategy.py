@@ -15,6 +15,7 @@ from discrepancy.fits.linearisation import Point
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
+from discrepancy.models.wrapped import has_law
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import MicroSlip, ModelPatch
 
@@ -394,6 +395,9 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     """
     tell("fitting the model as it is")
     none = fit(problem, Candidate(), problem.start(Candidate()))
+    if has_law(problem.model) and absolute_gate(problem, none).passed is False:
+        again = Beginnings(problem, tell, none.residuals).again(none)
+        none = none if again is None else again
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
     usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)

@@ -15,8 +15,11 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.checks.model_check import prior_mean
 from discrepancy.errors import CampaignFileError, ModelError
+from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Conditions, Model
+from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
+from discrepancy.models.wrapped import innermost
 from fe.runtime.patch import ModelPatch
 
 ExampleKind = Literal["static", "ringdown", "flight", "laboratory", "complete"]
@@ -85,7 +88,39 @@ def wing_plan(gauges: tuple[int, ...] = (1, 5, 9, 13, 18, 22)) -> ExamplePlan:
     return ExamplePlan((*channels, tip), flight_channels=names)
 
 
-def plan_for(model: Model, outputs: tuple[str, ...], load_place: str | tuple[float, float]) -> ExamplePlan:
+def plan_of(model: Model) -> ExamplePlan:
+    """Return what an example measures: gauges and tip of a wing, every output of another model at rest.
+
+    Raises
+    ------
+    ModelError
+        If no force can act on the model.
+    """
+    bare, largest = innermost(model), np.inf
+    if isinstance(bare, LumpedModel):
+        places = [item.name for item in bare.description.input]
+        outputs = [item.name for item in bare.description.output]
+    elif isinstance(bare, FmuModel):
+        forces = bare.description.inputs.forces
+        places, outputs = [*forces], [name for name, item in bare.runs.quantities.items() if not item.is_rate]
+        known = [bare.runs.asset.description.variable(bare.runs.variable(name)) for name in forces.values()]
+        limits = [item.maximum for item in known if item is not None and item.maximum is not None]
+        largest = 0.5 * min(limits, default=np.inf)
+    else:
+        return wing_plan()
+    if not places:
+        raise ModelError(
+            f"{model.name} has no force, and an example is made by forces: write a campaign of it."
+        )
+    return plan_for(model, tuple(outputs), places[0], largest)
+
+
+def plan_for(
+    model: Model,
+    outputs: tuple[str, ...],
+    load_place: str | tuple[float, float],
+    largest_force: float = np.inf,
+) -> ExamplePlan:
     """Return a plan for any model: loads that move it by 2 % of its length, noise of 0.1 % of what they show.
 
     Parameters
@@ -96,6 +131,8 @@ def plan_for(model: Model, outputs: tuple[str, ...], load_place: str | tuple[flo
         What is measured, one channel of the same name each.
     load_place : str or tuple of float
         Where the force acts.
+    largest_force : float
+        Which the model can take [N]; it may ask for less motion.
 
     Raises
     ------
@@ -113,10 +150,11 @@ def plan_for(model: Model, outputs: tuple[str, ...], load_place: str | tuple[flo
         if quantity is not None
     )
     period = 2.0 * np.pi / scales.angular_frequency
+    motion = min(0.02 * scales.length, largest_force / scales.tip_stiffness)
     plan = ExamplePlan(
         channels,
-        force=0.02 * scales.length * scales.tip_stiffness,
-        release=0.02 * scales.length,
+        force=motion * scales.tip_stiffness,
+        release=motion,
         duration=20.0 * period,
         interval=period / 50.0,
         load_place=load_place,

@@ -228,13 +228,9 @@ class Cholesky:
 
     def solve(self, right_hand_side: FloatArray) -> FloatArray:
         """Solution (n,) or (n, k)."""
-        found = np.array(right_hand_side[self._order], dtype=np.float64, order="C")
+        found = self.whitened(right_hand_side)
         values = found.reshape(len(found), -1)
         with _threads().limit(limits=1):
-            for front, (lower, below) in zip(self._fronts, self._factors, strict=True):
-                own = _substitute(lower, values[front.start : front.end], transposed=False)
-                if len(front.boundary):
-                    values[front.boundary] -= below @ own
             for front, (lower, below) in zip(self._fronts[::-1], self._factors[::-1], strict=True):
                 own = values[front.start : front.end]
                 if len(front.boundary):
@@ -243,6 +239,17 @@ class Cholesky:
         solution = np.empty_like(found)
         solution[self._order] = found
         return solution
+
+    def whitened(self, right_hand_side: FloatArray) -> FloatArray:
+        """L^-1 f (n,) or (n, k), in the order of elimination; its length is the dual norm of f."""
+        found = np.array(right_hand_side[self._order], dtype=np.float64, order="C")
+        values = found.reshape(len(found), -1)
+        with _threads().limit(limits=1):
+            for front, (lower, below) in zip(self._fronts, self._factors, strict=True):
+                own = _substitute(lower, values[front.start : front.end], transposed=False)
+                if len(front.boundary):
+                    values[front.boundary] -= below @ own
+        return found
 
 
 def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> FloatArray:

@@ -53,6 +53,10 @@ class Factorisation:
         """Solution (n,) or (n, k) without the residual check, for iterations that check their own."""
         return self._factors.solve(right_hand_side)
 
+    def whitened(self, right_hand_side: FloatArray) -> FloatArray:
+        """Vectors (n,) or (n, k) of the length that functionals have in the norm dual to the matrix."""
+        return self._factors.whitened(right_hand_side)
+
     def solve(self, right_hand_side: FloatArray) -> FloatArray:
         """Solution (n,) or (n, k), refined once, its backward error and its accuracy checked.
 

@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import qr
 
-from fe.runtime.errors import ReductionError, SolutionError
+from fe.runtime.errors import SolutionError
 
 from .statics import Factorisation
 
@@ -40,6 +41,10 @@ class Norm:
     def riesz(self, functionals: FloatArray) -> FloatArray:
         """Return the representatives X^-1 functionals, (n, k) or (n,)."""
         return self._factorisation.raw_solve(functionals)
+
+    def whitened(self, functionals: FloatArray) -> FloatArray:
+        """Return L^-1 functionals, (n, k) or (n,), with X = L L': their lengths are the dual norms."""
+        return self._factorisation.whitened(functionals)
 
 
 def conjugate_gradients(
@@ -124,11 +129,10 @@ class BlockDiagonal:
 
 
 class FunctionalBasis:
-    """A growing basis of functionals, orthonormal in the norm dual to X, with their representatives.
+    """A growing basis of functionals, orthonormal in the norm dual to X.
 
-    As `OrthonormalBasis` with `functionals`, but a block at a time, so that the factors of X are applied to
-    many columns at once: the Gram matrix of a block gives its orthonormal combinations, and those that are
-    small get representatives of their own before they are judged.
+    Functionals are whitened first: with X = L L' the dual norm of f is the length of L^-1 f, and QR with
+    pivots finds what is new in a block of them.
 
     Parameters
     ----------
@@ -141,55 +145,34 @@ class FunctionalBasis:
 
     Attributes
     ----------
-    vectors, products : (n, k) ndarray
-        The representatives, and the functionals.
+    vectors : (n, k) ndarray
+        The whitened basis.
     dropped_square : float
         Bound of the sum of squared norms of all that was dropped.
     """
 
     def __init__(self, unknowns: int, norm: Norm, *, drop: float) -> None:
-        self.vectors, self.products = np.empty((unknowns, 0)), np.empty((unknowns, 0))
+        self.vectors = np.empty((unknowns, 0))
         self.dropped_square = 0.0
         self._norm, self._drop = norm, drop
 
-    def extend(self, functionals: FloatArray) -> None:
-        """Add functionals (n, k)."""
-        rest = np.array(functionals)
-        inside = self._project(rest)
-        representatives = self._norm.riesz(rest)
-        outside = np.maximum(np.einsum("ik,ik->k", rest, representatives), 0.0)
-        scale = np.sqrt(inside + outside)
-        used = np.flatnonzero(scale > 0.0)
-        rest, representatives = rest[:, used] / scale[used], representatives[:, used] / scale[used]
-        mix = np.eye(len(used))  # the functionals, of unit length, in terms of what is left of them
-        while rest.shape[1]:
-            gram = representatives.T @ rest
-            square, rotation = np.linalg.eigh(0.5 * (gram + gram.T))
-            square = np.maximum(square, 0.0)
-            mix = mix @ rotation
-            part = np.sqrt(square) * np.abs(mix).max(axis=0, initial=0.0)
-            new = part > self._drop
-            strong = new & (square > NEARLY_DEPENDENT**2)
-            self.dropped_square += float(np.sum((mix[:, ~new] * scale[used, None]) ** 2 @ square[~new]))
-            length = np.sqrt(square)
-            if strong.any():
-                turned = rotation[:, strong] / length[strong]
-                self.vectors = np.concatenate((self.vectors, representatives @ turned), axis=1)
-                self.products = np.concatenate((self.products, rest @ turned), axis=1)
-            weak = new & ~strong
-            rest = rest @ (rotation[:, weak] / length[weak])
-            mix = mix[:, weak] * length[weak]
-            self._project(rest)
-            representatives = self._norm.riesz(rest) if weak.any() else rest
-
-    def _project(self, functionals: FloatArray) -> FloatArray:
-        """Take what the basis holds out of functionals, in place; return the squared norms of that."""
-        inside = np.zeros(functionals.shape[1])
+    def extend(self, functionals: FloatArray) -> FloatArray:
+        """Add functionals (n, m); return their coordinates (k, m) in the basis."""
+        rest = self._norm.whitened(functionals)
+        scale = np.linalg.norm(rest, axis=0)
+        rest /= np.where(scale > 0.0, scale, 1.0)
+        inside = np.zeros((self.vectors.shape[1], len(scale)))
         for _ in range(2):
-            share = self.vectors.T @ functionals
-            functionals -= self.products @ share
-            inside += np.einsum("ik,ik->k", share, share)
-        return inside
+            share = self.vectors.T @ rest
+            rest -= self.vectors @ share
+            inside += share
+        directions, triangle, order = qr(rest, mode="economic", pivoting=True, overwrite_a=True)
+        new = np.linalg.norm(triangle, axis=1) > self._drop
+        outside = np.empty_like(triangle)
+        outside[:, order] = triangle * scale[order]
+        self.dropped_square += float(np.sum(outside[~new] ** 2))
+        self.vectors = np.concatenate((self.vectors, directions[:, new]), axis=1)
+        return np.concatenate((inside * scale, outside[new]))
 
 
 class OrthonormalBasis:
@@ -197,8 +180,7 @@ class OrthonormalBasis:
 
     Gram-Schmidt in blocks, repeated, on pairs of vectors v and their products p = X v. With a condition
     number of 1e10 either follows from the other to about 1e-6 only, so that what is left of both after a
-    projection no longer fits together. Therefore one of the two is what is meant, and the other is taken
-    anew from it.
+    projection no longer fits together. Therefore the products are taken anew from the vectors.
 
     Parameters
     ----------
@@ -208,22 +190,17 @@ class OrthonormalBasis:
         The norm of X.
     drop : float
         A new vector is dropped if less than this fraction of it is new.
-    functionals : bool
-        Whether the products are what is meant (a basis of functionals), or the vectors.
 
     Attributes
     ----------
     vectors, products : (n, k) ndarray
         The basis, and X times the basis.
-    dropped_square : float
-        Bound of the sum of squared norms of all that was dropped.
     """
 
-    def __init__(self, unknowns: int, norm: Norm, *, drop: float, functionals: bool = False) -> None:
+    def __init__(self, unknowns: int, norm: Norm, *, drop: float) -> None:
         self.vectors = np.empty((unknowns, 0))
         self.products = np.empty((unknowns, 0))
-        self.dropped_square = 0.0
-        self._norm, self._drop, self._functionals = norm, drop, functionals
+        self._norm, self._drop = norm, drop
 
     @property
     def size(self) -> int:
@@ -239,30 +216,23 @@ class OrthonormalBasis:
             share = self.products.T @ vectors
             vectors, products = vectors - self.vectors @ share, products - self.products @ share
             if number == 0 and self.size:
-                vectors, products = self._refreshed(vectors, products)
+                products = self._norm.product(vectors)
         kept: list[tuple[FloatArray, FloatArray]] = []
-        for vector, product, scale in zip(vectors.T, products.T, length[used], strict=True):
+        for vector, product in zip(vectors.T, products.T, strict=True):
             vector, product = self._without(kept, *self._without(kept, vector, product))
             size = float(vector @ product)
             if size < NEARLY_DEPENDENT**2:
-                vector, product = self._refreshed(vector, product)
+                product = self._norm.product(vector)
                 share = self.products.T @ vector
                 vector, product = vector - self.vectors @ share, product - self.products @ share
                 vector, product = self._without(kept, vector, product)
                 size = float(vector @ product)
             if size > self._drop**2:
                 kept.append((vector / np.sqrt(size), product / np.sqrt(size)))
-            else:
-                self.dropped_square += (self._drop * scale) ** 2
         if kept:
             self.vectors = np.column_stack((self.vectors, *(vector for vector, _ in kept)))
             self.products = np.column_stack((self.products, *(product for _, product in kept)))
         return len(kept)
-
-    def _refreshed(self, vectors: FloatArray, products: FloatArray) -> tuple[FloatArray, FloatArray]:
-        if self._functionals:
-            return self._norm.riesz(products), products
-        return vectors, self._norm.product(vectors)
 
     @staticmethod
     def _without(
@@ -272,37 +242,3 @@ class OrthonormalBasis:
             part = other_product @ vector
             vector, product = vector - part * other, product - part * other_product
         return vector, product
-
-
-def triangular_factors(representatives: FloatArray, functionals: FloatArray) -> FloatArray:
-    """Return small factors that give dual norms of linear combinations without cancellation.
-
-    Parameters
-    ----------
-    representatives, functionals : (n, g, k) ndarray
-        g families of k functionals, with their Riesz representatives.
-
-    Returns
-    -------
-    (g, k, k) ndarray
-        Upper triangular R with |functionals[:, i] @ c| = |R[i] @ c| in the dual norm.
-    """
-    vectors, products = np.array(representatives), np.array(functionals)
-    _, families, count = vectors.shape
-    factors = np.zeros((families, count, count))
-    for j in range(count):
-        for _ in range(2):
-            for i in range(j):
-                part = np.einsum("ng,ng->g", products[:, :, i], vectors[:, :, j])
-                factors[:, i, j] += part
-                vectors[:, :, j] -= part * vectors[:, :, i]
-                products[:, :, j] -= part * products[:, :, i]
-        size = np.einsum("ng,ng->g", vectors[:, :, j], products[:, :, j])
-        length = np.sqrt(np.maximum(size, 0.0))
-        factors[:, j, j] = length
-        scale = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0.0)
-        vectors[:, :, j] *= scale
-        products[:, :, j] *= scale
-    if not np.isfinite(factors).all():
-        raise ReductionError("The dual residuals are not finite; the full model holds a value that is not.")
-    return factors

@@ -22,9 +22,10 @@ from fe.full.subspace import (
     Norm,
     OrthonormalBasis,
     conjugate_gradients,
-    triangular_factors,
 )
 from fe.runtime.reduced_arrays import AffineArrays
+
+from .dual_solutions import DualData, DualProblem, beside
 
 FloatArray = npt.NDArray[np.float64]
 State = tuple[float, ...]
@@ -32,12 +33,10 @@ _Model = TypeVar("_Model", bound=AffineArrays)
 
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
-DUAL_TOLERANCE = 0.05
-"""Relative residual of the approximate dual solutions at their own anchors."""
+LOOKED_AT = 6
+"""One of so many states is looked at in each round, where the bound was largest; all of them at the end."""
 FIRST_TOLERANCE, SNAPSHOT_TOLERANCE = 1e-10, 1e-6
 """Relative residual of the first full solutions and of the others."""
-MOST_COLUMNS = 48
-"""Columns of approximate dual solutions that are iterated together."""
 ROUNDING_FACTOR, LEAST_ROUNDING = 8.0, 5e-6
 """Rounding allowance as a multiple of the difference seen at the first full solutions, and its least value:
 with condition numbers of 1e10, full solutions differ by 1e-6 among themselves."""
@@ -85,14 +84,6 @@ class Judgement(Generic[_Model]):
     bound: Callable[[_Model, State], float]
 
 
-@dataclass(frozen=True)
-class _DualData:
-    """Approximate dual solutions: products with X (A, n, O) and factors of their residuals."""
-
-    products: FloatArray
-    factors: FloatArray
-
-
 class StaticReduction:
     """State of the greedy search: the bases that full solutions have given.
 
@@ -104,8 +95,8 @@ class StaticReduction:
         Energy norm at `reference`.
     reference : (T - 1,) ndarray
         Coefficients of the stiffness terms of the norm, without the last.
-    anchors : list of (T,) ndarray
-        Coefficients at which the dual problems are solved.
+    duals : callable
+        Solves the dual problems.
     farthest : (T - 1,) ndarray
         Largest distance of each coefficient from its reference.
     advance : callable
@@ -122,7 +113,7 @@ class StaticReduction:
         problem: AffineProblem,
         norm: Norm,
         reference: FloatArray,
-        anchors: list[FloatArray],
+        duals: Callable[[DualProblem], DualData],
         farthest: FloatArray,
         advance: Callable[[int, str], object],
         least: FloatArray | None = None,
@@ -136,61 +127,20 @@ class StaticReduction:
         self.farthest = farthest
         n = len(problem.loads)
         self.basis = OrthonormalBasis(n, norm, drop=1e-7)
-        self.images = [
-            np.empty((n, 0)) for _ in problem.stiffness_terms
-        ]  # stiffness terms times basis vectors
+        self.in_basis = np.empty((len(terms), 0, 0))  # stiffness terms in the basis
+        self.images = [np.empty((n, 0)) for _ in terms]  # times its vectors, if the batch is one
         self.rounding = 0.0
-        self.residual_basis: OrthonormalBasis | FunctionalBasis
-        if batch == 1:
-            self.residual_basis = OrthonormalBasis(n, norm, drop=1e-8, functionals=True)
-            self.residual_basis.extend(norm.riesz(problem.loads), problem.loads)
-        else:
-            self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
-            self.residual_basis.extend(problem.loads)
-        self.dual = self._approximate_duals(anchors)
+        self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
+        self.residual_load = self.residual_basis.extend(problem.loads)
+        self.residual_stiffness = np.empty((len(self.residual_load), len(terms), 0))
+        self.dual = duals(DualProblem(terms, problem.outputs, norm, self.stiffness, advance))
+        self.correction = np.swapaxes(self.dual.products, 1, 2) @ self.residual_basis.vectors
         self.snapshots: list[State] = []
-
-    def _approximate_duals(self, anchors: list[FloatArray]) -> _DualData:
-        """Solve the dual problems at the anchors, and prepare the norms of their residuals elsewhere."""
-        stiffness_terms, outputs = self.problem.stiffness_terms, self.problem.outputs
-        terms, (n, count) = len(stiffness_terms), outputs.shape
-        products = np.empty((len(anchors), n, count))
-        factors = np.empty((len(anchors), count, terms, terms))
-        at_reference = self.norm.riesz(outputs)
-        together = 1 if self.batch == 1 else max(1, MOST_COLUMNS // count)
-        for first in range(0, len(anchors), together):
-            chosen = anchors[first : first + together]
-            # a rough solution will do: the norm of what it leaves is computed, not assumed
-            duals = conjugate_gradients(
-                self._matrices(chosen),
-                self.norm,
-                _beside([outputs] * len(chosen)),
-                _beside([at_reference] * len(chosen)),
-                tolerance=DUAL_TOLERANCE,
-            )
-            for number, dual in enumerate(np.split(duals, len(chosen), axis=1), start=first):
-                images = [np.asarray(term @ dual) for term in stiffness_terms]
-                lifted = self._lifted(images[:-1])
-                # X^-1 K_base dual, since X is the sum of all terms at the reference
-                base = dual - sum(t * part for t, part in zip(self.reference, lifted, strict=True))
-                factors[number] = triangular_factors(
-                    np.stack((at_reference - base, *lifted), axis=2),
-                    np.stack((outputs - images[-1], *images[:-1]), axis=2),
-                )
-                products[number] = self.norm.product(dual)
-                self.advance(1, "dual solutions")
-        return _DualData(products, factors)
 
     def _matrices(self, thetas: list[FloatArray]) -> Any:
         """Return the stiffness at coefficients (T,), or those of several, each for its own columns."""
         matrices = [self.stiffness(theta) for theta in thetas]
         return matrices[0] if len(matrices) == 1 else BlockDiagonal(matrices)
-
-    def _lifted(self, images: list[FloatArray]) -> list[FloatArray]:
-        """Return the representatives of functionals, several (n, k) each."""
-        if self.batch == 1:
-            return [self.norm.riesz(image) for image in images]
-        return np.split(self.norm.riesz(np.concatenate(images, axis=1)), len(images), axis=1)
 
     def add_snapshots(self, states: list[State]) -> None:
         """Solve the full model for all loads at several states and extend the bases."""
@@ -200,8 +150,8 @@ class StaticReduction:
         solution = conjugate_gradients(
             self._matrices(thetas),
             self.norm,
-            _beside([loads] * len(states)),
-            _beside([self._galerkin(theta) for theta in thetas]),
+            beside([loads] * len(states)),
+            beside([self._galerkin(theta) for theta in thetas]),
             tolerance=tolerance,
         )
         before = self.basis.size
@@ -209,32 +159,46 @@ class StaticReduction:
         new = self.basis.vectors[:, before:]
         if not new.shape[1]:
             raise ExtensionError  # rounding is reached; what the search reached is judged after it
-        images = [np.asarray(term @ new) for term in self.problem.stiffness_terms]
-        self.images = [np.concatenate(pair, axis=1) for pair in zip(self.images, images, strict=True)]
-        varying = np.concatenate(images[:-1], axis=1)
-        functionals = np.concatenate((self.basis.products[:, before:], varying), axis=1)
-        if isinstance(self.residual_basis, FunctionalBasis):
-            self.residual_basis.extend(functionals)
-        else:
-            self.residual_basis.extend(np.concatenate((new, self.norm.riesz(varying)), axis=1), functionals)
+        self._take_images([np.asarray(term @ new) for term in self.problem.stiffness_terms])
         if not self.snapshots:
             self.rounding = self._rounding(thetas[0], self.problem.outputs.T @ solution)
         self.snapshots.extend(states)
+
+    def _take_images(self, images: list[FloatArray]) -> None:
+        """Take the stiffness terms times the last basis vectors, (n, k) each, into what is kept of all."""
+        before, known = self.in_basis.shape[-1], self.residual_basis.vectors.shape[1]
+        basis = self.basis.vectors
+        if self.batch == 1:  # sums round as they always did
+            self.images = [np.concatenate(pair, axis=1) for pair in zip(self.images, images, strict=True)]
+            self.in_basis = np.stack([basis.T @ image for image in self.images])
+        else:
+            new = np.stack([basis.T @ image for image in images])
+            older = np.swapaxes(new[:, :before], 1, 2)
+            self.in_basis = np.concatenate((np.concatenate((self.in_basis, older), axis=1), new), axis=2)
+        found = self.residual_basis.extend(np.concatenate(images, axis=1))
+        # what was there lies in the basis that was there
+        self.residual_load = _with_rows(self.residual_load, len(found))
+        self.residual_stiffness = np.concatenate(
+            (_with_rows(self.residual_stiffness, len(found)), found.reshape(len(found), len(images), -1)),
+            axis=2,
+        )
+        added = np.swapaxes(self.dual.products, 1, 2) @ self.residual_basis.vectors[:, known:]
+        self.correction = np.concatenate((self.correction, added), axis=2)
 
     def _galerkin(self, theta: FloatArray) -> FloatArray:
         """Return the solutions (n, L) in the present basis."""
         if not self.basis.size:
             return np.zeros_like(self.problem.loads)
-        image = sum(t * k for t, k in zip(theta, self.images, strict=True))
         basis = self.basis.vectors
-        return np.asarray(basis @ np.linalg.solve(basis.T @ image, basis.T @ self.problem.loads))
+        if self.batch == 1:
+            stiffness = basis.T @ sum(t * k for t, k in zip(theta, self.images, strict=True))
+        else:
+            stiffness = np.tensordot(theta, self.in_basis, 1)
+        return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.problem.loads))
 
     def _rounding(self, theta: FloatArray, wanted: FloatArray) -> float:
         """Return the relative difference of outputs between full solutions and the basis that holds them."""
-        basis = self.basis.vectors
-        image = sum(t * k for t, k in zip(theta, self.images, strict=True))
-        coordinates = np.linalg.solve(basis.T @ image, basis.T @ self.problem.loads)
-        difference = np.abs(self.problem.outputs.T @ (basis @ coordinates) - wanted)
+        difference = np.abs(self.problem.outputs.T @ self._galerkin(theta) - wanted)
         return max(
             float(np.divide(largest, size, out=np.zeros_like(size), where=size > 0.0).max())
             for rows, least in zip(self.problem.groups, self.least, strict=True)
@@ -245,22 +209,23 @@ class StaticReduction:
 
     def arrays(self) -> dict[str, Any]:
         """Return the static fields of `AffineArrays`, and `cross_mass` with the static basis alone."""
-        problem, basis, residual = self.problem, self.basis.vectors, self.residual_basis.vectors
-        stiffness = np.stack([basis.T @ image for image in self.images])
+        problem, basis = self.problem, self.basis.vectors
         return {
-            "static_stiffness": 0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
+            "static_stiffness": 0.5 * (self.in_basis + self.in_basis.transpose(0, 2, 1)),
             "static_load": problem.loads.T @ basis,
             "static_output": problem.outputs.T @ basis,
             "bound_reference": self.reference,
-            "residual_load": residual.T @ problem.loads,
-            "residual_stiffness": np.stack([residual.T @ image for image in self.images], axis=1),
+            "residual_load": self.residual_load,
+            "residual_stiffness": self.residual_stiffness,
             # |sum c_q a_j d_qj| <= |c| |a| |d|; plus rounding
             "residual_allowance": self._largest_coefficients()
             * float(np.sqrt(self.residual_basis.dropped_square))
             + 1e-7,
             "rounding_allowance": max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
-            "dual_correction": np.swapaxes(self.dual.products, 1, 2) @ residual,
+            "dual_correction": self.correction,
             "dual_residual": self.dual.factors,
+            "dual_stiffness": self.dual.stiffness,
+            "dual_output": self.dual.output,
         }
 
     def cross_mass(self, modal_basis: FloatArray) -> FloatArray:
@@ -269,11 +234,9 @@ class StaticReduction:
         return np.stack([modal_basis.T @ image for image in images])
 
     def _largest_coefficients(self) -> float:
-        """Return the largest length of (1, theta - reference), by which parts of a residual are multiplied.
-
-        The residual is f - X u - sum (theta_q - reference_q) K_q u, and the basis was offered X u and K_q u.
-        """
-        return float(np.sqrt(1.0 + self.farthest @ self.farthest))
+        """Return the largest length of (1, theta), by which load and terms of a residual are multiplied."""
+        largest = self.reference + self.farthest
+        return float(np.sqrt(2.0 + largest @ largest))
 
 
 def greedy(
@@ -312,20 +275,34 @@ def greedy(
     class Surrogate(WeakGreedySurrogate):  # type: ignore[misc]
         """The reduced model's own bound, as pyMOR's search wants it."""
 
-        bounds, asked, rounds = np.empty(0), np.empty((0, 0)), 0
+        bounds, known, asked, rounds = np.empty(0), np.empty(0), np.empty((0, 0)), 0
 
         def evaluate(self, mus: list[Any], return_all_values: bool = False) -> Any:
             """Return the largest bound and where it is, or all bounds."""
             if not static.basis.size:  # nothing to bound yet: begin in the middle
                 bounds = np.array([-sum((np.array(mu) - np.mean(mus, axis=0)) ** 2) for mu in mus]) + 1e3
             else:
-                present = model()
-                bounds = np.array([judgement.bound(present, mu) for mu in mus])
+                bounds = self._bounds(model(), mus)
             if return_all_values:
                 return bounds
             self.bounds, self.asked = bounds, np.array(mus)
             worst = int(bounds.argmax())
             return float(bounds[worst]), mus[worst]
+
+        def _bounds(self, present: _Model, mus: list[Any]) -> FloatArray:
+            """Return the bounds; of many states, where they were largest, and zeros, until they are small."""
+            bounds, first = np.zeros(len(mus)), 0
+            if self.rounds == 1:
+                self.known = np.full(len(mus), np.inf)
+            order = np.argsort(-self.known, kind="stable")
+            few = len(mus) // LOOKED_AT if self.rounds > 1 and static.dual.output.size else 0
+            for count in (few, len(mus)):
+                for number in order[first:count]:
+                    bounds[number] = self.known[number] = judgement.bound(present, mus[number])
+                first = count
+                if bounds.max() > SEARCH_MARGIN * tolerance:
+                    break
+            return bounds
 
         def extend(self, mu: State) -> None:
             """Add the full solutions at the worst state, and at others of large bounds away from it."""
@@ -340,15 +317,15 @@ def greedy(
     surrogate, most_rounds = Surrogate(), 1 + (most_snapshots - 1) // static.batch
     result = weak_greedy(surrogate, states, atol=SEARCH_MARGIN * tolerance, max_extensions=most_rounds)
     bounds = [float(value) for value in result["max_errs"][1:]]
-    if len(bounds) < surrogate.rounds:  # stopped by the limit: the last bound was not evaluated
+    if len(bounds) < surrogate.rounds or bounds[-1] > SEARCH_MARGIN * tolerance:  # not all were looked at
         present = model()
         bounds.append(max(judgement.bound(present, mu) for mu in states))
     return bounds
 
 
-def _beside(blocks: list[FloatArray]) -> FloatArray:
-    """Return blocks (n, k) beside each other; one alone as it is: its layout decides how sums round."""
-    return blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1)
+def _with_rows(array: FloatArray, count: int) -> FloatArray:
+    """Return an array with zeros below, so that it has so many rows."""
+    return np.concatenate((array, np.zeros((count - len(array), *array.shape[1:]))))
 
 
 def _spread(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:

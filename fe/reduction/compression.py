@@ -74,12 +74,12 @@ def fewest_directions(
     for state in states:
         for coordinates in judgement.solutions(model, state):
             solutions.append(coordinates / np.linalg.norm(coordinates))
-    directions = np.linalg.svd(np.array(solutions).T)[0]
+    directions = np.linalg.svd(np.array(solutions).T, full_matrices=False)[0]
     low, high = min(2, directions.shape[1]), directions.shape[1]
     while low < high:
         middle = (low + high) // 2
         smaller = compressed(model, directions[:, :middle])
-        if max(judgement.bound(smaller, state) for state in states) <= tolerance:
+        if all(judgement.bound(smaller, state) <= tolerance for state in states):
             high = middle
         else:
             low = middle + 1

@@ -3,7 +3,6 @@
 The method and what it reaches are in `docs/reduced_model.md`.
 """
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,7 @@ from fe.runtime.reduced import ReducedModel
 from .certified_basis import AffineProblem, StaticReduction, greedy
 from .compression import WING_JUDGEMENT, compressed, fewest_directions
 from .modal_basis import ModalData, reduce_modes
-from .settings import ALONE, TOGETHER, ReductionSettings, loss_splits, remaining_levels, training_set
+from .settings import ALONE, TOGETHER, ReductionSettings, loss_splits, training_set
 from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -105,15 +104,15 @@ def reduce_model(
             together,
         )
     with stage_of(progress, "Reducing the statics") as stage:
-        counts = settings.anchors(regions)
-        levels = itertools.product(*(remaining_levels(settings.stiffness_loss, count) for count in counts))
         e, *losses = settings.validity_box(regions)[: len(reference)]
         ends = np.array((e, *(1.0 - z for z in losses)))
         static = StaticReduction(
             wing_problem(system),
             norm,
             reference,
-            anchors=[np.array((reference[0], *remaining, 1.0)) for remaining in levels],
+            duals=lambda problem: problem.solved(
+                lambda values: np.append(values, 1.0), reference, ends, settings.anchors(regions)
+            ),
             farthest=np.abs(ends - reference[:, np.newaxis]).max(axis=1),
             advance=stage.advance,
             batch=together,

@@ -72,7 +72,7 @@ class ReductionSettings:
     pitot_mass: Range = (0.0, 0.30)
     nominal_masses: tuple[float, float] = (0.169, 0.134)
     bound_tolerance: float = 6e-4
-    most_snapshots: int = 60
+    most_snapshots: int = 401
     dual_anchors: tuple[int, ...] = ()
     modal: ModalSettings = field(default_factory=ModalSettings)
 
@@ -106,9 +106,8 @@ class ReductionSettings:
 
 
 def default_anchors(regions: int) -> tuple[int, ...]:
-    """Return two approximate dual solutions along each loss, for as many regions as a model holds them."""
-    twice = MOST_ANCHORS.bit_length() - 1
-    return tuple(2 if number < twice else 1 for number in range(regions))
+    """Return two approximate dual solutions along each loss, or one where they are combined."""
+    return (2 if regions <= MOST_GRID_REGIONS else 1,) * regions
 
 
 def remaining_levels(loss: Range, count: int) -> FloatArray:

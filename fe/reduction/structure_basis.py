@@ -17,11 +17,20 @@ from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
 from fe.runtime.structure_model import StructureModel
 from fe.structure.affine import AffineStructure
+from fe.structure.design import ReductionLimits, StructureDesign
 
 from .certified_basis import AffineProblem, Judgement, State, StaticReduction, greedy
 from .compression import compressed, fewest_directions
+from .dual_solutions import DualData, DualProblem
 from .modal_basis import ModalState, loss_corners, modal_basis
-from .settings import TOGETHER, ModalSettings, default_anchors, loss_splits, remaining_levels
+from .settings import (
+    MOST_GRID_REGIONS,
+    TOGETHER,
+    ModalSettings,
+    default_anchors,
+    loss_splits,
+    remaining_levels,
+)
 from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -29,15 +38,17 @@ FloatArray = npt.NDArray[np.float64]
 LEAST_COSINE = 1e-3
 """A load whose outputs are smaller than this part of what its energy could do to them is judged by that part:
 nothing of the structure sees it there."""
+UNSEEN_SHARE = 0.1
+"""Where another load is seen, one that is not is judged by this part of what that does, each at its most."""
 SAMPLED_INSIDE = 10
 """States inside the box at which the modes are refined."""
-CHOSEN_STATES = 128
-"""States inside the box on the training set, beside corners."""
+CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024
+"""States inside the box on the training set, beside corners; of more regions than a grid would take."""
 
 
 @dataclass(frozen=True)
 class StructureSettings:
-    """How well the reduced model of a structure is to hold; where is said in the structure file.
+    """How well the reduced model of a structure is to hold; where, and both limits, the structure file says.
 
     Attributes
     ----------
@@ -50,9 +61,14 @@ class StructureSettings:
         Accuracy and number of modes.
     """
 
-    bound_tolerance: float = 6e-4
-    most_snapshots: int = 61
+    bound_tolerance: float = ReductionLimits().tolerance
+    most_snapshots: int = ReductionLimits().most_solutions
     modal: ModalSettings = field(default_factory=ModalSettings)
+
+    @classmethod
+    def of(cls, design: StructureDesign) -> "StructureSettings":
+        """Return what the table `[reduction]` of a structure file says."""
+        return cls(design.reduction.tolerance, design.reduction.most_solutions)
 
 
 @dataclass(frozen=True)
@@ -120,11 +136,14 @@ class _Terms:
         values, count = np.array(state), len(self.parameters)
         return self._coefficients(values[:count], 1.0 - values[count:])
 
-    def anchors(self) -> list[FloatArray]:
-        """Coefficients at which the dual problems are solved."""
-        middle = np.array([np.mean(ends) for ends in self.parameters])
-        levels = [remaining_levels(ends, count) for ends, count in zip(self.losses, self.counts, strict=True)]
-        return [self._coefficients(middle, np.array(kept)) for kept in itertools.product(*levels)]
+    def duals(self, problem: DualProblem) -> DualData:
+        """Dual solutions, at parameters and what the regions have kept."""
+        split, kept = len(self.parameters), [remaining_levels(ends, 1)[0] for ends in self.losses]
+        middle = np.array([*(np.mean(ends) for ends in self.parameters), *kept])
+        ends = np.array([*self.parameters, *(1.0 - np.array(self.losses))])
+        return problem.solved(
+            lambda values: self._coefficients(values[:split], values[split:]), middle, ends, self.counts
+        )
 
     def corners(self) -> list[State]:
         """Corners of parameters and losses: all of a few, else those of `loss_corners`."""
@@ -136,7 +155,8 @@ class _Terms:
 
     def training(self) -> list[State]:
         """States on which the greedy search looks for the largest bound: corners, and points between them."""
-        points = qmc.Halton(len(self.parameters) + len(self.losses), scramble=False).random(CHOSEN_STATES)
+        count = CHOSEN_STATES if len(self.losses) <= MOST_GRID_REGIONS else CHOSEN_OF_MANY
+        points = qmc.Halton(len(self.parameters) + len(self.losses), scramble=False).random(count)
         return [*self.corners(), *self.inside(points)]
 
     def inside(self, shares: FloatArray) -> list[State]:
@@ -178,6 +198,14 @@ class _Terms:
             (self.theta(state), np.array((1.0, *chosen)))
             for state, chosen in zip(self.inside(points[:, :varied]), masses, strict=True)
         ]
+
+    def largest_loads(self) -> FloatArray:
+        """Largest coefficient (L,) of each load."""
+        controls, masses = (
+            np.abs([(1.0, 1.0), *(self.structure.ranges[name] for name in names)]).max(axis=1)
+            for names in (self.structure.controls, self.structure.masses)
+        )
+        return np.asarray(controls[self.load_factors[:, 0]] * masses[self.load_factors[:, 1]])
 
     def farthest(self) -> FloatArray:
         """Largest distance (T,) of each coefficient from its reference."""
@@ -230,10 +258,10 @@ def reduce_structure(
             terms.problem,
             norm,
             terms.reference[:-1],
-            terms.anchors(),
+            terms.duals,
             terms.farthest()[:-1],
             stage.advance,
-            least := _least(terms.problem, norm),
+            least := _least(terms, norm),
             TOGETHER,
         )
         judgement, states = _judgement(terms, least), terms.training()
@@ -248,8 +276,9 @@ def reduce_structure(
     if history[-1] > settings.bound_tolerance:
         raise ReductionError(
             f"After {len(static.snapshots)} full solutions the error bound of {name} is {history[-1]:.2g} of "
-            f"the largest output, but {settings.bound_tolerance:.2g} was asked for; narrow the ranges of "
-            "parameters and losses, or allow a looser tolerance."
+            f"the largest output, but {settings.bound_tolerance:.2g} was asked for; raise "
+            f"most_solutions (now {settings.most_snapshots}) or tolerance in the table [reduction] of the "
+            "structure file, or narrow the ranges of parameters and losses."
         )
     model = _model(static, terms, name, modes, settings.modal.mode_count)
     directions = fewest_directions(model, judgement, states, settings.bound_tolerance)
@@ -335,15 +364,19 @@ def _model(
     )
 
 
-def _least(problem: AffineProblem, norm: Norm) -> FloatArray:
+def _least(terms: _Terms, norm: Norm) -> FloatArray:
     """Return the outputs (groups, L) below which a load is not seen; see `LEAST_COSINE`."""
-
-    def length(functionals: FloatArray) -> FloatArray:
-        squares = np.einsum("ik,ik->k", functionals, norm.riesz(functionals))
-        return np.asarray(np.sqrt(np.maximum(squares, 0.0)), dtype=np.float64)
-
-    loads, outputs = length(problem.loads), length(problem.outputs)
-    return LEAST_COSINE * np.array([loads * outputs[part].max() for part in problem.groups])
+    problem, largest = terms.problem, terms.largest_loads()
+    solutions = norm.riesz(problem.loads)
+    loads = np.linalg.norm(norm.whitened(problem.loads), axis=0)
+    outputs = np.linalg.norm(norm.whitened(problem.outputs), axis=0)
+    seen = np.abs(problem.outputs.T @ solutions)
+    found = []
+    for part in problem.groups:
+        least, size = LEAST_COSINE * loads * outputs[part].max(), seen[part].max(axis=0)
+        of_others = UNSEEN_SHARE * (size * largest).max() / largest
+        found.append(np.where(size < least, np.maximum(least, of_others), least))
+    return np.array(found)
 
 
 def _judgement(terms: _Terms, least: FloatArray) -> Judgement[StructureModel]:

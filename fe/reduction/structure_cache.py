@@ -34,7 +34,7 @@ def reduced_structure(
     file : Path or str
         The structure file, beside its mesh.
     settings : StructureSettings, optional
-        How well it is to hold.
+        How well it is to hold; by default as its file says.
     progress : Progress, optional
         Where a build reports.
     memory_limit : float, optional
@@ -45,10 +45,8 @@ def reduced_structure(
     FiniteElementError
         If the structure cannot be read, modelled or reduced.
     """
-    from .structure_basis import StructureSettings
-
-    file, settings = Path(file), settings or StructureSettings()
-    design_hash, path = _place(file, settings)
+    file = Path(file)
+    settings, design_hash, path = _place(file, settings)
 
     def load() -> StructureModel:
         model = StructureModel.load(path)
@@ -80,20 +78,25 @@ def check_structure(file: Path | str) -> None:
     """
     from fe.structure.operators import load_and_assemble
 
-    from .structure_basis import StructureSettings
-
-    if not _place(Path(file), StructureSettings())[1].is_file():
+    if not _place(Path(file))[2].is_file():
         load_and_assemble(file)
 
 
-def _place(file: Path, settings: "StructureSettings") -> tuple[str, Path]:
-    """Return the hash of a structure with its mesh, and where its reduced model is kept."""
+def _place(file: Path, settings: "StructureSettings | None" = None) -> tuple["StructureSettings", str, Path]:
+    """Return how a structure is reduced, its hash with that of its mesh, and where its model is kept."""
     from fe.structure.design import load_structure, structure_hash
 
+    from .structure_basis import StructureSettings
+
     design = load_structure(file)
+    settings = settings or StructureSettings.of(design)
     design_hash = structure_hash(design, file.parent / design.mesh)
     content = f"{design_hash} {settings!r} {modelling_hash((*MODELLING_ROOMS, 'structure'))}"
-    return design_hash, cache_folder() / f"structure-{hashlib.sha256(content.encode()).hexdigest()[:32]}.npz"
+    return (
+        settings,
+        design_hash,
+        cache_folder() / f"structure-{hashlib.sha256(content.encode()).hexdigest()[:32]}.npz",
+    )
 
 
 def reduced(
@@ -102,7 +105,8 @@ def reduced(
     """Reduce an assembled structure in one thread, without the cache; see `reduced_structure`."""
     from threadpoolctl import threadpool_limits
 
-    from .structure_basis import reduce_structure
+    from .structure_basis import StructureSettings, reduce_structure
 
+    settings = settings or StructureSettings.of(structure.design)
     with threadpool_limits(1):
         return reduce_structure(structure, structure.design.name, settings, progress).model

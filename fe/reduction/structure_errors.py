@@ -24,6 +24,8 @@ class MeasuredErrors:
         Relative error of the natural frequencies, at the first and the last of the states.
     states : int
         Number of states.
+    broken : int
+        In how many of them an error is larger than its bound.
     """
 
     strain: float
@@ -31,6 +33,7 @@ class MeasuredErrors:
     bound: float
     frequency: float
     states: int
+    broken: int
 
 
 def measured_errors(
@@ -57,6 +60,7 @@ def measured_errors(
     random = np.random.default_rng(seed)
     low, high = model.validity_box.T
     first_control = len(model.chosen) - len(model.controls)
+    broken = set()
     worst = {"strain": np.nan, "displacement": np.nan, "bound": 0.0, "frequency": 0.0}
     for number in range(states):
         vector = low + (high - low) * random.random(len(low))
@@ -90,11 +94,15 @@ def measured_errors(
         ):
             wanted = np.asarray(rows @ full)
             if wanted.size:
-                size = float(np.abs(wanted).max())
-                worst[what] = np.fmax(worst[what], float(np.abs(came - wanted).max()) / size)
+                size, missed = float(np.abs(wanted).max()), float(np.abs(came - wanted).max())
+                worst[what] = np.fmax(worst[what], missed / size)
+                if missed > error:
+                    broken.add(number)
                 worst["bound"] = max(worst["bound"], error / size)
         if number in (0, states - 1):
             squares, _ = lowest_eigenpairs(stiffness, structure.mass(masses), model.mode_count)
             ratio = model.modes(vector).frequency * 2.0 * np.pi / np.sqrt(squares)
             worst["frequency"] = max(worst["frequency"], float(np.abs(ratio - 1.0).max()))
-    return MeasuredErrors(**{name: float(value) for name, value in worst.items()}, states=states)
+    return MeasuredErrors(
+        **{name: float(value) for name, value in worst.items()}, states=states, broken=len(broken)
+    )

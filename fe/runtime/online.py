@@ -21,10 +21,43 @@ multiply_outer = np.multiply.outer
 
 @dataclass(frozen=True, slots=True)
 class DualArrays:
-    """Approximate dual solutions at one anchor: `correction` (O, R) and `factor` (T O, T)."""
+    """Approximate dual solutions: `correction` (O, R), and `factor` (T O, T) or their residuals (O, F)."""
 
     correction: FloatArray
     factor: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class CombinedDual:
+    """M dual functions of each output, whose Galerkin solution is its approximate dual solution.
+
+    Attributes
+    ----------
+    stiffness : (T, O M M) ndarray
+        Stiffness terms in the functions.
+    output : (O, M, 1) ndarray
+        Each output of its functions.
+    correction : (O M, R) ndarray
+        The functions, applied to the basis of the residuals.
+    factor : (O, F, 1 + T M) ndarray
+        Factors of the dual residuals.
+    """
+
+    stiffness: FloatArray
+    output: FloatArray
+    correction: FloatArray
+    factor: FloatArray
+
+    def at(self, theta: FloatArray) -> DualArrays:
+        """Return the dual solutions at the coefficients (T,) of the stiffness, with the residuals (O, F)."""
+        outputs, functions, _ = self.output.shape
+        stiffness = (theta @ self.stiffness).reshape(outputs, functions, functions)
+        weights = solve(stiffness, self.output)
+        coefficients = np.empty((outputs, self.factor.shape[2], 1))
+        coefficients[:, 0] = 1.0
+        coefficients[:, 1:] = (-theta[:, np.newaxis] * weights.transpose(0, 2, 1)).reshape(outputs, -1, 1)
+        correction = weights.transpose(0, 2, 1) @ self.correction.reshape(outputs, functions, -1)
+        return DualArrays(correction[:, 0], (self.factor @ coefficients)[:, :, 0])
 
 
 class CertifiedSolution(NamedTuple):
@@ -54,7 +87,8 @@ class OnlineArrays:
     """
 
     __slots__ = (
-        "_allowance", "_dual", "_load", "_output", "_reference", "_residual", "splits", "square", "stiffness"
+        "_allowance", "_combined", "_dual", "_load", "_output", "_reference", "_residual", "splits", "square",
+        "stiffness",
     )  # fmt: skip
 
     def __init__(self, arrays: AffineArrays) -> None:
@@ -71,8 +105,18 @@ class OnlineArrays:
         self._reference = (*arrays.bound_reference.tolist(), 1.0)
         ends = np.cumsum(arrays.dual_counts - 1)[:-1]
         self.splits = tuple([float(value) for value in split] for split in np.split(arrays.dual_split, ends))
+        dual, functions = arrays.dual_residual, arrays.dual_output.shape[-1]
+        self._combined, self._dual = None, []
+        if functions:
+            by_output = arrays.dual_correction.transpose(1, 0, 2)
+            self._combined = CombinedDual(
+                np.ascontiguousarray(arrays.dual_stiffness.transpose(1, 0, 2, 3)).reshape(len(stiffness), -1),
+                arrays.dual_output[:, :, np.newaxis],
+                np.ascontiguousarray(by_output).reshape(-1, by_output.shape[2]),
+                dual[0],
+            )
+            return
         # to be multiplied by theta, as the stiffness
-        dual = arrays.dual_residual
         factors = np.concatenate((-dual[..., 1:], dual[..., :1]), axis=-1)
         self._dual = [
             DualArrays(
@@ -103,11 +147,15 @@ class OnlineArrays:
         coefficients[:loads] = load
         multiply_outer(theta, coordinates, out=coefficients[loads:].reshape(theta.size, -1))
         residual = self._residual @ coefficients
-        number = 0
-        for split, value in zip(self.splits, loss, strict=True):
-            number = number * (len(split) + 1) + bisect_right(split, value)
-        anchor = self._dual[number]
-        dual = (anchor.factor @ theta).reshape(-1, theta.size)
+        if self._combined is not None:
+            anchor = self._combined.at(theta)
+            dual = anchor.factor
+        else:
+            number = 0
+            for split, value in zip(self.splits, loss, strict=True):
+                number = number * (len(split) + 1) + bisect_right(split, value)
+            anchor = self._dual[number]
+            dual = (anchor.factor @ theta).reshape(-1, theta.size)
         coercivity = min(
             value / reference for value, reference in zip(theta.tolist(), self._reference, strict=True)
         )

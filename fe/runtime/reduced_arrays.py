@@ -96,14 +96,20 @@ class AffineArrays(RegionArrays):
         Part of the norm of the strains, and of displacements, added to the bounds for rounding: a
         multiple of the difference seen where the reduced model holds the full solution itself.
     dual_counts : (K,) ndarray of int64
-        Number of approximate dual solutions along each loss; their product is A, at most 16.
+        Number of approximate dual solutions along each loss; their product is A, at most 16. One along each
+        where the M dual functions of an output are combined instead.
     dual_split : (sum of dual_counts less K,) ndarray
         Values of the losses at which the next approximate dual solution takes over, region by region.
-    dual_correction : (A, O', R) ndarray
+    dual_correction : (A or M, O', R) ndarray
         Approximate dual solutions, applied to the basis of the residuals; the last region's change first.
-    dual_residual : (A, O', T, T) ndarray
+    dual_residual : (A, O', T, T) or (1, O', F, 1 + T M) ndarray
         Factors of the dual residuals: their norm is that of the factor times (1, -theta_1, -theta_2, ...),
-        with the coefficients theta of all stiffness terms but the last, which is times one.
+        with the coefficients theta of all stiffness terms but the last, which is times one. Of combined
+        functions: times (1, -theta_1 c, -theta_2 c, ...), with their coefficients c (M,) in the solution.
+    dual_stiffness : (O', T, M, M) ndarray
+        Stiffness terms in the dual functions of each output; M is 0 where none are combined.
+    dual_output : (O', M) ndarray
+        Each output of its dual functions.
     modal_stiffness : (T, Nm, Nm) ndarray
         Stiffness terms in the modal basis.
     modal_mass : (1 + P, Nm, Nm) ndarray
@@ -131,6 +137,8 @@ class AffineArrays(RegionArrays):
     dual_split: FloatArray
     dual_correction: FloatArray
     dual_residual: FloatArray
+    dual_stiffness: FloatArray
+    dual_output: FloatArray
     modal_stiffness: FloatArray
     modal_mass: FloatArray
     modal_load: FloatArray
@@ -179,6 +187,9 @@ class AffineArrays(RegionArrays):
         k, m = len(self.regions), self.modal_stiffness.shape[-1]
         sizes, anchors = self._sizes(), int(self.dual_counts.prod())
         terms, loads, masses = sizes.stiffness_terms, sizes.loads, sizes.masses
+        functions, factor = self.dual_output.shape[-1], (terms, terms)
+        if functions:
+            factor = (self.dual_residual.shape[-2], 1 + terms * functions)
         return {
             "validity_box": (sizes.chosen, 2),
             "static_stiffness": (terms, n, n),
@@ -189,8 +200,10 @@ class AffineArrays(RegionArrays):
             "residual_stiffness": (r, terms, n),
             "dual_counts": (k,),
             "dual_split": (int(self.dual_counts.sum()) - k,),
-            "dual_correction": (anchors, outputs, r),
-            "dual_residual": (anchors, outputs, terms, terms),
+            "dual_correction": (functions or anchors, outputs, r),
+            "dual_residual": (anchors, outputs, *factor),
+            "dual_stiffness": (outputs, terms, functions, functions),
+            "dual_output": (outputs, functions),
             "modal_stiffness": (terms, m, m),
             "modal_mass": (1 + masses, m, m),
             "modal_load": (loads, m),
@@ -221,7 +234,7 @@ class ReducedArrays(AffineArrays):
     """
 
     what = "a reduced model"
-    layout = ("format", 2)
+    layout = ("format", 3)
 
     flapwise_reference: FloatArray
     mode_count: int

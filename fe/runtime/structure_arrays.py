@@ -45,7 +45,7 @@ class StructureArrays(AffineArrays):
     """
 
     what = "a reduced structure"
-    layout = ("structure_format", 1)
+    layout = ("structure_format", 2)
     kinds: ClassVar[Mapping[str, type[Any]]] = {
         **AffineArrays.kinds,
         "stiffness_factors": np.int64,

@@ -310,6 +310,13 @@ class Damping(Part):
     beta: float = Field(default=0.0, ge=0.0, description="s")
 
 
+class ReductionLimits(Part):
+    """How well the reduced model is to hold, and how many full solutions it may take."""
+
+    tolerance: float = Field(default=6e-4, ge=1e-5, le=0.1, description="of the largest output")
+    most_solutions: int = Field(default=401, ge=1, le=2000)
+
+
 class StructureDesign(Part):
     """A structure: all that decides its model beside the mesh file. Make it with `load_structure`.
 
@@ -334,6 +341,7 @@ class StructureDesign(Part):
     displacement: tuple[PointOutput, ...] = ()
     acceleration: tuple[PointOutput, ...] = ()
     damping: Damping = Damping()
+    reduction: ReductionLimits = ReductionLimits()
 
     @field_validator("name", "mesh")
     @classmethod
@@ -425,6 +433,7 @@ def structure_hash(design: StructureDesign, mesh_file: Path) -> str:
     """
     content = design.model_dump(mode="json")
     del content["mesh"]  # its bytes count, not its name
+    del content["reduction"]  # the structure is the same
     digest = hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
     try:
         digest.update(mesh_file.read_bytes())

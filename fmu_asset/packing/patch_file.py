@@ -4,7 +4,7 @@ The file may hold more (posterior, data hash); what is read here, in the names o
 in shorter ones, is
 
 ```json
-{"schema": "uav-twin patch 1",
+{"schema": "uav-twin patch 2",
  "effects": [{"id": "gauge_zero_drift", "primitives": [{"kind": "sensor_drift", "channel": "g17", ...}]}],
  "channels": {"g17": "strain[17]"}}
 ```
@@ -38,8 +38,9 @@ from fe.runtime.sensors import check_channels
 from fmu_asset.errors import PatchFileError
 from reporting.json_file import parse_json
 
-SCHEMA = "uav-twin patch 1"
-"""Value of `schema` in a patch file."""
+SCHEMA = "uav-twin patch 2"
+"""Value of `schema` in a patch file; files of number 1 are read too."""
+FIRST_SCHEMA = "uav-twin patch 1"
 
 QUANTITIES = ("", "strain", "displacement")
 """Quantities of outputs that `channel = "*"` may be restricted to."""
@@ -170,7 +171,7 @@ def load_patch(path: str | os.PathLike[str]) -> PatchFile:
 def parse_patch(content: bytes, where: str = "The patch file") -> PatchFile:
     """Return what the bytes of a patch file say; see `load_patch`."""
     record = parse_json(content, where, PatchFileError)
-    if not isinstance(record, dict) or record.get("schema") != SCHEMA:
+    if not isinstance(record, dict) or record.get("schema") not in (SCHEMA, FIRST_SCHEMA):
         came = record.get("schema") if isinstance(record, dict) else type(record).__name__
         raise PatchFileError(f'{where} must have "schema": "{SCHEMA}", but has {came!r}.')
     rows, channels = record.get("effects"), record.get("channels", {})

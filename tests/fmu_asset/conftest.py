@@ -61,6 +61,8 @@ def chain_model(stiffness: float = 9.0e4, regions: tuple[str, ...] = ("z1", "z2"
         dual_split=np.full(count, 0.4),
         dual_correction=np.zeros((2**count, outputs, 32)),
         dual_residual=np.zeros((2**count, outputs, count + 2, count + 2)),
+        dual_stiffness=np.empty((outputs, count + 2, 0, 0)),
+        dual_output=np.empty((outputs, 0)),
         modal_stiffness=terms,
         modal_mass=mass,
         modal_load=load,

@@ -45,6 +45,9 @@ def test_from_an_example_to_a_verdict(
     assert f"Verdict: {stored.verdict.kind.value}" in shown
     assert "seating_offset" in stored.verdict.inclusion
     assert stored.origin.command == (
+        f"uav-twin discrepancy run '{campaign.resolve()}' --model single_mass_rig --seed 0 --calibrate 1"
+    )
+    assert stored.origin.short_command == (
         "uav-twin discrepancy run 'rig test' --model single_mass_rig --seed 0 --calibrate 1"
     )
     assert "seating_offset" in {effect.identifier for effect in read_patch(out / "patch.json").effects}

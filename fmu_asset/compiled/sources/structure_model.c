@@ -45,7 +45,7 @@ static void lay_out(structure_model *model, size_t anchors, structure_arena *are
     model->output_columns = structure_take(arena, n * outputs);
     model->load_residual = structure_take(arena, model->loads * r);
     model->stiffness_residual = structure_take(arena, model->terms * n * r);
-    model->correction_columns = structure_take(arena, anchors * r * outputs);
+    model->correction_columns = structure_take(arena, (model->functions ? model->functions : anchors) * r * outputs);
 }
 
 static bool is_count(double value) { return value >= 0.0 && value <= LARGEST_SIZE && value == (double)(size_t)value; }
@@ -183,6 +183,21 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
     model->output_count = outputs;
     model->modal_outputs = modal_outputs;
     model->residual_size = r;
+    const size_t functions = extent(data, "dual_output", 1); /* arrays without values are not in the file */
+    model->functions = functions;
+    model->dual_rows = functions ? extent(data, "dual_residual", 2) : terms;
+    model->dual_columns = functions ? 1 + terms * functions : terms;
+    if (functions > 0) {
+        const size_t of_stiffness[4] = {outputs, terms, functions, functions}, of_output[2] = {outputs, functions};
+        model->dual_stiffness = shaped(data, "dual_stiffness", 4, of_stiffness, problem);
+        model->dual_output = shaped(data, "dual_output", 2, of_output, problem);
+        if (model->dual_stiffness == NULL || model->dual_output == NULL) {
+            return false;
+        }
+        if (anchors != 1 || (double)functions > LARGEST_SIZE || (double)model->dual_rows > LARGEST_SIZE) {
+            return structure_fail(problem, "the data file combines dual functions at %lu anchors", (unsigned long)anchors);
+        }
+    }
     const double *static_stiffness = NULL, *static_output = NULL, *load_residual = NULL,
                  *stiffness_residual = NULL, *correction = NULL, *modes = NULL, *gauges = NULL,
                  *residual_allowance = NULL, *rounding_allowance = NULL;
@@ -200,8 +215,8 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
         {"residual_stiffness", &stiffness_residual, 3, {r, terms, n}},
         {"residual_allowance", &residual_allowance, 0, {0}},
         {"rounding_allowance", &rounding_allowance, 0, {0}},
-        {"dual_correction", &correction, 3, {anchors, outputs, r}},
-        {"dual_residual", &model->dual_residual, 4, {anchors, outputs, terms, terms}},
+        {"dual_correction", &correction, 3, {functions ? functions : anchors, outputs, r}},
+        {"dual_residual", &model->dual_residual, 4, {anchors, outputs, model->dual_rows, model->dual_columns}},
         {"modal_stiffness", &model->modal_stiffness, 3, {terms, nm, nm}},
         {"modal_mass", &model->modal_mass, 3, {mass_terms, nm, nm}},
         {"modal_load", &model->modal_load, 2, {loads, nm}},
@@ -245,7 +260,8 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
         /* The residual is the load minus the stiffness times the coordinates. */
         transpose(model->stiffness_residual + i * n * r, stiffness_residual + t * n, r, n, terms * n, -1.0);
     }
-    for (size_t a = 0; a < anchors; ++a) {
+    memcpy(model->correction_columns, correction, functions * outputs * r * sizeof *correction);
+    for (size_t a = 0; a < anchors && functions == 0; ++a) {
         transpose(model->correction_columns + a * outputs * r, correction + a * outputs * r, outputs, r, r, 1.0);
     }
     return true;

@@ -46,7 +46,11 @@ typedef struct {
     const double *static_load;      /* (L, N) */
     const double *bound_reference;  /* (T - 1) */
     const double *dual_split[STRUCTURE_MOST_REGIONS]; /* (anchors less one) of each region, ascending */
-    const double *dual_residual;    /* (A, O, T, T) */
+    size_t functions;               /* M, dual functions of an output that are combined, or 0: the nearest counts */
+    size_t dual_rows, dual_columns; /* of a factor of `dual_residual` */
+    const double *dual_residual;    /* (A, O, T, T), or (1, O, F, 1 + T M) */
+    const double *dual_stiffness;   /* (O, T, M, M) */
+    const double *dual_output;      /* (O, M) */
     const double *modal_stiffness;  /* (T, Nm, Nm) */
     const double *modal_mass;       /* (1 + P, Nm, Nm) */
     const double *modal_load;       /* (L, Nm) */
@@ -59,7 +63,7 @@ typedef struct {
     double *output_columns;     /* (N, O) */
     double *load_residual;      /* (L, R) */
     double *stiffness_residual; /* (T, N, R) in the order of `order` */
-    double *correction_columns; /* (A, R, O) */
+    double *correction_columns; /* (A, R, O) or, as they are in the file, (M, O, R) */
     structure_data data;        /* owns the arrays */
     double *memory;             /* owns what was laid out anew */
     size_t *places;             /* owns `order` */

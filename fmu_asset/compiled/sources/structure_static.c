@@ -21,6 +21,10 @@ void structure_static_lay_out(structure_static *steady, const structure_model *m
     steady->lasting_residual = structure_take(arena, n * r);
     steady->factor = structure_take(arena, n * n);
     steady->dual_norm = structure_take(arena, outputs);
+    const size_t functions = model->functions;
+    steady->dual_weights = structure_take(arena, outputs * functions);
+    steady->dual_correction = structure_take(arena, functions ? r * outputs : 0);
+    steady->dual_work = structure_take(arena, functions * functions + model->dual_columns);
     /* Flags in the room of doubles, of which every byte is zero at first. */
     steady->solved = (bool *)(void *)structure_take(arena, model->loads);
     steady->bounded = (bool *)(void *)structure_take(arena, model->loads);
@@ -168,6 +172,28 @@ static size_t anchor_of(const structure_static *steady) {
     return index;
 }
 
+/* Combine the dual functions of each output: their Galerkin solution at the present stiffness. */
+static void combine_duals(structure_static *steady) {
+    const structure_model *model = steady->model;
+    const size_t outputs = model->output_count, r = model->residual_size, m = model->functions;
+    double *stiffness = steady->dual_work;
+    memset(steady->dual_correction, 0, r * outputs * sizeof *steady->dual_correction);
+    for (size_t o = 0; o < outputs; ++o) {
+        double *weights = steady->dual_weights + o * m;
+        structure_sum_terms(stiffness, m, model->dual_stiffness + o * model->terms * m * m, model->terms, steady->theta);
+        (void)structure_cholesky(stiffness, m); /* positive definite where the stiffness is */
+        memcpy(weights, model->dual_output + o * m, m * sizeof *weights);
+        structure_solve_lower(stiffness, m, weights);
+        structure_solve_upper(stiffness, m, weights);
+        for (size_t j = 0; j < m; ++j) {
+            const double *function = model->correction_columns + (j * outputs + o) * r;
+            for (size_t i = 0; i < r; ++i) {
+                steady->dual_correction[i * outputs + o] += weights[j] * function[i];
+            }
+        }
+    }
+}
+
 /* Make a residual of that of the loads, which it holds, and find its product with the approximate dual solutions. */
 static void take_residual(structure_static *steady, const double *coordinates, double *residual, double *correction) {
     const structure_model *model = steady->model;
@@ -182,8 +208,9 @@ static void take_residual(structure_static *steady, const double *coordinates, d
     }
     structure_add_columns(residual, r, model->stiffness_residual + lasting * n * r, r, damaged * n, steady->work);
     memset(correction, 0, outputs * sizeof *correction);
-    structure_add_columns(correction, outputs, model->correction_columns + anchor_of(steady) * r * outputs, outputs,
-                          r, residual);
+    const double *columns =
+        model->functions ? steady->dual_correction : model->correction_columns + anchor_of(steady) * r * outputs;
+    structure_add_columns(correction, outputs, columns, outputs, r, residual);
 }
 
 /* The same of one unit response, which is kept. */
@@ -197,32 +224,28 @@ static void bound_unit(structure_static *steady, size_t load) {
     steady->bounded[load] = true;
 }
 
-/* Norms of the dual residuals: of the factors times (1, -theta_1, -theta_2, ...). */
+/* Norms of the dual residuals: of the factors times (1, -theta_1, -theta_2, ...), or of combined functions times
+   (1, -theta_1 c, -theta_2 c, ...). */
 static void find_dual_norms(structure_static *steady) {
     const structure_model *model = steady->model;
-    const size_t terms = model->terms;
-    const double *factor = model->dual_residual + anchor_of(steady) * model->output_count * terms * terms;
-    double *coefficients = steady->work;
+    const size_t rows = model->dual_rows, columns = model->dual_columns, m = model->functions;
+    const double *factor = model->dual_residual + (m ? 0 : anchor_of(steady) * model->output_count * rows * columns);
+    double *coefficients = steady->dual_work + m * m;
     coefficients[0] = 1.0;
-    for (size_t k = 1; k < terms; ++k) {
+    for (size_t k = 1; k < columns && m == 0; ++k) {
         coefficients[k] = -steady->theta[k - 1];
     }
-    for (size_t i = 0; i < model->output_count; ++i) {
+    for (size_t o = 0; o < model->output_count; ++o) {
+        for (size_t k = 1; k < columns && m > 0; ++k) {
+            coefficients[k] = -steady->theta[(k - 1) / m] * steady->dual_weights[o * m + (k - 1) % m];
+        }
         double sum = 0.0;
-        for (size_t row = 0; row < terms; ++row, factor += terms) {
-            double value = 0.0;
-            size_t k = 0;
-            for (; k + 2 <= terms; k += 2) {
-                value += coefficients[k] * factor[k] + coefficients[k + 1] * factor[k + 1];
-            }
-            for (; k < terms; ++k) {
-                value += coefficients[k] * factor[k];
-            }
+        for (size_t row = 0; row < rows; ++row, factor += columns) {
+            const double value = structure_dot(factor, coefficients, columns);
             sum += value * value;
         }
-        steady->dual_norm[i] = sqrt(sum);
+        steady->dual_norm[o] = sqrt(sum);
     }
-    steady->dual_known = true;
 }
 
 /* Largest of the bounds of some outputs, before rounding; `correction` belongs to all outputs. */
@@ -243,6 +266,13 @@ structure_bounds structure_static_error_bounds(structure_static *steady, const d
     double *residual = steady->whole_residual, *correction = steady->whole_correction;
     solve_needed(steady, load);
     superpose(steady->whole_coordinates, n, model, load, steady->coordinates);
+    if (!steady->dual_known) {
+        if (model->functions > 0) {
+            combine_duals(steady);
+        }
+        find_dual_norms(steady);
+        steady->dual_known = true;
+    }
     size_t acting = 0;
     for (size_t k = 0; k < model->loads; ++k) {
         acting += load[k] != 0.0;
@@ -258,9 +288,6 @@ structure_bounds structure_static_error_bounds(structure_static *steady, const d
         }
         superpose(residual, r, model, load, steady->residual);
         superpose(correction, outputs, model, load, steady->correction);
-    }
-    if (!steady->dual_known) {
-        find_dual_norms(steady);
     }
     /* |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha */
     double remainder = structure_norm(residual, r);

@@ -26,6 +26,10 @@ typedef struct {
     double *lasting_residual;         /* (N, R) */
     double *factor;                   /* (N, N) */
     double *dual_norm;                /* (O) */
+    /* Where dual functions are combined: their coefficients in the solutions, and the solutions. */
+    double *dual_weights;             /* (O, M) */
+    double *dual_correction;          /* (R, O) */
+    double *dual_work;                /* (M, M) and 1 + T M */
     /* Response to one unit of each load; computed when it is first needed. */
     bool *solved, *bounded;           /* (L) */
     double *coordinates;              /* (L, N) */

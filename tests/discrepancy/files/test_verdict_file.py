@@ -21,6 +21,7 @@ from discrepancy.files.residuals import read_residuals, write_residuals
 from discrepancy.files.verdict import VERDICT_SCHEMA, VerdictDocument, read_verdict, write_verdict
 from discrepancy.judgement.proof import prove
 from discrepancy.verdict import (
+    CalibratedParameter,
     Estimate,
     Experiment,
     ExplainedShare,
@@ -38,7 +39,7 @@ from reporting.provenance import collect_provenance
 
 ORIGIN = Origin(
     "Wing in the laboratory", "wing", "ab" * 32, "cd" * 32, "uav-twin discrepancy campaign --out verdict",
-    collect_provenance(7, input_hashes={"campaign": "ab" * 32}),
+    collect_provenance(7, input_hashes={"campaign": "ab" * 32}), "/home/user/wing.toml",
 )  # fmt: skip
 FRICTION = NamedEffect(
     "coulomb_friction", "Coulomb friction", "root", "damping |v|^p |x|^a",
@@ -50,6 +51,7 @@ MASS = NamedEffect(
     "point_mass", "Unmodelled point mass", "", "mass", (), (),
     ModelPatch((PointMass(0.1 + 0.2, 1.7), PowerStiffness("tip", -3.0, 3.0, -1, 0.05))),
 )  # fmt: skip
+STIFFNESS = CalibratedParameter("young_modulus_factor", 1.01, nan, "1")
 VERDICT = Verdict(
     kind=VerdictKind.NAMED,
     sentence="Coulomb friction at the root (Fc/(kA) = 0.0123 ± 0.0015).",
@@ -59,7 +61,10 @@ VERDICT = Verdict(
     group=("coulomb_friction",),
     family="damping |v|^p |x|^a",
     gates=(Gate("absolute fit", None, nan, 1.2, "No noise record."), Gate("shape", True, 0.4, 2.0, "")),
-    hypotheses=(Hypothesis((FRICTION,), -12.5, 0.99, 812.0, 800.0), Hypothesis((), -inf, 0.0, nan, 806.0)),
+    hypotheses=(
+        Hypothesis((FRICTION,), -12.5, 0.99, 812.0, 800.0, (STIFFNESS,)),
+        Hypothesis((), -inf, 0.0, nan, 806.0),
+    ),
     inclusion={"coulomb_friction": 0.998},
     next_experiments=(Experiment("Release at half the amplitude", 0.6, 1.0, "Tells A from 1/A."),),
     remarks=("Trial 3 was clipped.",),
@@ -67,6 +72,7 @@ VERDICT = Verdict(
     explained=ExplainedShare(0.94, 0.92, 0.95, 3.1, 0.9, 0.06, 0.04, "held-out"),
     remainders=(RemainderEstimate("x1", 2.5, 0.3, 0.0),),
     not_fitted=(NotFitted("free_play", "screened out", 0.3), NotFitted("washout", "no flight")),
+    parameters=(STIFFNESS,),
 )
 
 
@@ -86,7 +92,7 @@ def test_a_verdict_comes_back_equal(tmp_path: Path, make_bench) -> None:
         assert same(back.proof, content)
         assert back.origin == ORIGIN
     text = path.read_text(encoding="utf-8")
-    assert json.loads(text)["schema"] == "uav-twin verdict 2"
+    assert json.loads(text)["schema"] == "uav-twin verdict 3"
     assert "NaN" not in text
     again = write_verdict(tmp_path / "again.json", VERDICT, content, ORIGIN)
     assert again.read_bytes() == path.read_bytes()
@@ -98,8 +104,16 @@ def test_a_patch_comes_back_identical_with_its_intervals(tmp_path: Path) -> None
         ModelPatch((PowerDamping("root", float(c), 0.0, 0.0, 0.1, 5e-324),))
         for c in generator.normal(1.0 / 3.0, 0.02, 4000)
     ]
-    path = write_patch(tmp_path / "patch.json", (FRICTION, MASS), ORIGIN, (draws, ()))
+    path = write_patch(
+        tmp_path / "patch.json",
+        (FRICTION, MASS),
+        ORIGIN,
+        (draws, ()),
+        sentence="Two.",
+        parameters=(STIFFNESS,),
+    )
     back = read_patch(path)
+    assert same((back.sentence, back.parameters), ("Two.", (STIFFNESS,)))
     assert back.patch == FRICTION.patch + MASS.patch
     assert same(back.effects, (FRICTION, MASS))
     assert back.origin.data_hash == "ab" * 32
@@ -186,7 +200,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
 
     refused(whole[: len(whole) // 2], "is not valid JSON")
     refused("[]", "no file of this kind")
-    refused(whole.replace("uav-twin verdict 2", "uav-twin verdict 9"), "schema 'uav-twin verdict 9'")
+    refused(whole.replace("uav-twin verdict 3", "uav-twin verdict 9"), "schema 'uav-twin verdict 9'")
     refused(whole.replace('"kind": "named"', '"kind": "guessed"'), "verdict.kind")
     refused(whole.replace('"probability": 0.998', '"probability": "high"'), "verdict.probability")
     refused(whole.replace('"sentence"', '"sentences"', 1), "sentence")
@@ -203,7 +217,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(VerdictFileError, match="There is no file"):
         read_verdict(tmp_path / "nothing.json")
     path.write_text(whole, encoding="utf-8")
-    with pytest.raises(VerdictFileError, match="'uav-twin verdict 2', but 'uav-twin patch 1' is needed"):
+    with pytest.raises(VerdictFileError, match="'uav-twin verdict 3', but 'uav-twin patch 2' is needed"):
         read_patch(path)
 
 
@@ -291,12 +305,19 @@ def test_residual_file_carries_units_and_refuses_damage(tmp_path: Path, make_ben
         read_residuals(path)
 
 
-def test_files_of_the_first_number_are_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [1, 2])
+def test_files_of_earlier_numbers_are_read(number: int, tmp_path: Path) -> None:
     path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
     content = json.loads(path.read_text(encoding="utf-8"))
-    content["schema"] = "uav-twin verdict 1"
-    for key in ("explained", "remainders", "not_fitted"):
+    content["schema"] = f"uav-twin verdict {number}"
+    del content["model_file"], content["verdict"]["parameters"]
+    for row in content["verdict"]["hypotheses"]:
+        del row["parameters"]
+    later = {"explained": None, "remainders": (), "not_fitted": ()} if number == 1 else {}
+    for key in later:
         del content["verdict"][key]
     path.write_text(json.dumps(content), encoding="utf-8")
-    found = read_verdict(path).verdict
-    assert same(found, replace(VERDICT, explained=None, remainders=(), not_fitted=()))
+    hypotheses = tuple(replace(item, parameters=()) for item in VERDICT.hypotheses)
+    found = read_verdict(path)
+    assert same(found.verdict, replace(VERDICT, parameters=(), hypotheses=hypotheses, **later))
+    assert found.origin == replace(ORIGIN, model_file=None)

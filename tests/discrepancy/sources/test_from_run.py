@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.study_hidden_effects import fly_mission
+from discrepancy.application import apply_verdict
 from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
@@ -21,14 +23,16 @@ from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.model_choice import choice_of_run
+from discrepancy.model_choice import choice_of_run, choose_model
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.memo import MemoModel
 from discrepancy.models.sensing import observe
 from discrepancy.sources.from_run import RunPlan, held_out_turns, run_campaign, run_model
 from discrepancy.verdict import VerdictKind
+from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PointMass, SensorDrift, SensorGain, SensorRotation
+from tests.discrepancy.rigs import ORIGIN
 
 TURNS = 24
 DRIFT = SensorDrift("strain[17]", -1.2e-3, float(TURNS))
@@ -178,8 +182,11 @@ def test_derivatives_by_uncertain_health_are_in_the_order_of_the_unknowns(
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
 @pytest.mark.long
-def test_a_drifting_gauge_is_found_in_the_run(campaign: Campaign, model: Model) -> None:
-    found = investigate(campaign, model, RIVALS, thorough=False)
+def test_a_drifting_gauge_is_found_in_the_run_and_applied(
+    run: Path, campaign: Campaign, tmp_path: Path
+) -> None:
+    choice = choose_model(run)
+    found = investigate(campaign, choice.model, RIVALS, thorough=False)
     assert found.verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP)
     members = {(effect.identifier, effect.place) for effect in found.verdict.effects}
     assert ("gauge_zero_drift", "g17") in members
@@ -187,6 +194,11 @@ def test_a_drifting_gauge_is_found_in_the_run(campaign: Campaign, model: Model) 
     assert found.proof.held_out_before is not None
     assert found.proof.held_out_after is not None
     assert found.proof.held_out_after.chi_square_per_dof < found.proof.held_out_before.chi_square_per_dof
+    origin = replace(ORIGIN, model_hash=choice.source_hash, model_file=choice.file)
+    write_verdict_folder(tmp_path / "verdict", VerdictContent(found, origin), report=False)
+    applied = apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
+    again = investigate(campaign, applied.path, RIVALS, thorough=False).verdict
+    assert again.kind is VerdictKind.NOTHING_MISSING, again.sentence
 
 
 @pytest.mark.slow

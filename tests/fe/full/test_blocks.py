@@ -62,13 +62,16 @@ def test_a_basis_of_functionals_holds_what_it_was_given_and_says_what_it_dropped
         independent[:, :8] @ rng.normal(size=(8, 5))
         + 10.0 ** -np.arange(1.0, 14.0, 2.6) * independent[:, 7:12],
     ]
-    for block in blocks:
-        basis.extend(block)
-    np.testing.assert_allclose(basis.vectors.T @ basis.products, np.eye(basis.vectors.shape[1]), atol=1e-11)
-    np.testing.assert_allclose(matrix @ basis.vectors, basis.products, atol=1e-11)
+    coordinates = [basis.extend(block) for block in blocks]
+    np.testing.assert_allclose(basis.vectors.T @ basis.vectors, np.eye(basis.vectors.shape[1]), atol=1e-7)
     given = np.concatenate(blocks, axis=1)
-    left = given - basis.products @ (basis.vectors.T @ given)
-    missing = np.sqrt(np.maximum(np.einsum("ik,ik->k", left, norm.riesz(left)), 0.0))
+    lengths = np.linalg.norm(norm.whitened(given), axis=0)
+    np.testing.assert_allclose(lengths**2, np.einsum("ik,ik->k", given, norm.riesz(given)), rtol=1e-11)
+    left = [
+        norm.whitened(block) - basis.vectors[:, : len(found)] @ found
+        for block, found in zip(blocks, coordinates, strict=True)
+    ]
+    missing = np.linalg.norm(np.concatenate(left, axis=1), axis=0)
     assert 8 < basis.vectors.shape[1] < 12
     assert 0.0 < missing.max() <= np.sqrt(basis.dropped_square) * (1.0 + 1e-6) + 1e-12
     assert np.sqrt(basis.dropped_square) < 1e-6
@@ -76,6 +79,6 @@ def test_a_basis_of_functionals_holds_what_it_was_given_and_says_what_it_dropped
 
 def test_a_basis_takes_nothing_of_nothing() -> None:
     basis = FunctionalBasis(SIZE, Norm(affine_sum((1.0, 1.0, 1.0), _terms())), drop=1e-8)
-    basis.extend(np.zeros((SIZE, 3)))
+    assert basis.extend(np.zeros((SIZE, 3))).shape == (0, 3)
     assert basis.vectors.shape == (SIZE, 0)
     assert basis.dropped_square == pytest.approx(0.0)

@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 
 from fe.full.affine import affine_sum
 from fe.full.operators import AffineOperators
-from fe.full.subspace import Norm, OrthonormalBasis, conjugate_gradients, triangular_factors
+from fe.full.subspace import Norm, OrthonormalBasis, conjugate_gradients
 from fe.reduction.compression import compressed, relative_bound
 from fe.reduction.reduced_basis import Reduction, reduce_model
 from fe.reduction.settings import (
@@ -279,11 +279,10 @@ def test_conjugate_gradients_solve_and_give_up() -> None:
         conjugate_gradients(matrix, norm, right, np.zeros_like(right), tolerance=1e-12, most_iterations=2)
 
 
-@pytest.mark.parametrize("functionals", [False, True])
-def test_basis_stays_orthonormal_with_nearly_dependent_vectors(functionals: bool) -> None:
+def test_basis_stays_orthonormal_with_nearly_dependent_vectors() -> None:
     norm = Norm(affine_sum((1, 1, 1, 1), SYSTEM.stiffness_terms))
     random = np.random.default_rng(5)
-    basis = OrthonormalBasis(60, norm, drop=1e-9, functionals=functionals)
+    basis = OrthonormalBasis(60, norm, drop=1e-9)
     first = random.normal(size=(60, 5))
     assert basis.extend(first, norm.product(first)) == 5
     near = first + 1e-6 * random.normal(size=first.shape)
@@ -291,21 +290,6 @@ def test_basis_stays_orthonormal_with_nearly_dependent_vectors(functionals: bool
     assert basis.extend(both, norm.product(both)) == 5
     gram = basis.vectors.T @ norm.product(basis.vectors)
     np.testing.assert_allclose(gram, np.eye(10), atol=1e-9)
-    assert 0.0 < basis.dropped_square < 1e-11
-
-
-def test_triangular_factors_give_dual_norms() -> None:
-    norm = Norm(affine_sum((1, 1, 1, 1), SYSTEM.stiffness_terms))
-    random = np.random.default_rng(6)
-    functionals = random.normal(size=(60, 3, 4))
-    functionals[:, 1, 3] = functionals[:, 1, 0]  # dependent
-    representatives = norm.riesz(functionals.reshape(60, -1)).reshape(functionals.shape)
-    factors = triangular_factors(representatives, functionals)
-    for _ in range(5):
-        c = random.normal(size=4)
-        combined = functionals @ c
-        wanted = np.sqrt(np.einsum("ng,ng->g", combined, norm.riesz(combined)))
-        np.testing.assert_allclose(np.linalg.norm(factors @ c, axis=1), wanted, rtol=1e-10)
 
 
 def test_anchors_part_the_losses_in_equal_ratios() -> None:
@@ -335,7 +319,8 @@ def test_any_number_of_regions_is_reduced_with_a_certified_bound(regions: int) -
     found = reduce_model(system, replace(SETTINGS, bound_tolerance=5e-3, most_snapshots=30))
     model = ReducedModel.from_bytes(found.model.to_bytes())
     assert model.regions == region_names(regions)
-    assert model.dual_counts.prod() == min(2**regions, 16)
+    combined = regions > 3
+    assert (model.dual_counts.prod(), model.dual_output.shape[1] > 0) == (1 if combined else 2, combined)
     assert found.bound_history[-1] <= 5e-3
     random = np.random.default_rng(regions)
     strains = []

@@ -91,6 +91,26 @@ def test_outputs_equal_those_of_the_python_fmu(
         slave.close()
 
 
+def test_a_compiled_fmu_bounds_as_python_does(
+    compiler: list[str], plate_model: StructureModel, tmp_path: Path, open_slave: Any
+) -> None:
+    compiled = build_structure_fmu(plate_model, tmp_path / "compiled.fmu", kind="compiled").path
+    slave, rng = open_slave(compiled), np.random.default_rng(3)
+    assert slave.start(response=1) == 0, slave.log
+    place, names = slave.reference, [v.name for v in slave.description.variables if v.kind == "Real"]
+    for number in range(5):
+        values = {name: float(rng.uniform(*plate_model.validity[name])) for name in plate_model.regions}
+        values |= {"pull": 2e4, "bend": -30.0 * number}
+        inputs = [place.get(name, place.get(f"health.{name}")) for name in values]
+        slave.fmu.setReal(inputs, list(values.values()))
+        assert slave.status_of(slave.fmu.doStep, 0.1 * number, 0.1) == 0, slave.log
+        seen, found = dict(zip(names, slave.everything(), strict=True)), plate_model.static_response(values)
+        for kind in ("strain", "displacement"):
+            wanted = getattr(found, f"{kind}_error_bound")
+            assert seen[f"{kind}_error_bound"] == pytest.approx(wanted, rel=1e-6)
+    slave.close()
+
+
 def test_refusals_and_states_are_those_of_the_python_fmu(
     pair: tuple[Path, Path], open_slave: Callable[..., Any]
 ) -> None:

@@ -120,6 +120,7 @@ def damaged(content: bytes) -> dict[str, bytes]:
         "last_term": with_array("stiffness_factors", np.ones((4, 2))),
         "more_gauges": with_array("gauge_count", np.array(26.0)),
         "anchors": with_array("dual_counts", np.array([2.0, 1e300])),
+        "functions": with_array("dual_output", np.ones((25, 3))),
         "splits": with_array("dual_split", np.zeros(1)),
         "overflow": with_array("dual_residual", np.zeros((1, 25, 4, 4))),
     }

@@ -1,0 +1,256 @@
+"""The way back: what a verdict found, written as a model that has it."""
+
+import json
+import shlex
+from dataclasses import dataclass
+from dataclasses import replace as changed
+from pathlib import Path
+from typing import Any
+
+from calibration.wing.result_file import load_calibration
+from calibration.wing.wing_record import WingTailoring, tailoring
+from discrepancy.errors import DiscrepancyError, ModelError
+from discrepancy.files.patch import (
+    APPLIED,
+    PATCH_NAME,
+    PATCHED,
+    StoredPatch,
+    primitive_intervals,
+    read_patch,
+    store_patch,
+)
+from discrepancy.files.verdict import VERDICT_NAME, StoredVerdict, read_verdict
+from discrepancy.model_choice import ModelChoice, ModelKind, model_of
+from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
+from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
+from fe.runtime.laws.interface import PortForce
+from fe.runtime.state import DigitalState
+from fmu_asset.packing.patch_file import SCHEMA, parse_patch
+from fmu_asset.packing.wing_packing import pack_wing
+from reporting.errors import FileNotWrittenError
+from reporting.files import atomic_write_text
+from reporting.folders import restore_folder
+from reporting.progress import Progress
+from reporting.toml_file import read_toml, toml_text
+
+ENDINGS = (".toml", ".json", ".fmu")
+RESTS_ON = {
+    VerdictKind.NAMED: "named",
+    VerdictKind.NAMED_IN_PART: "named in part: what is left has no name",
+    VerdictKind.FAMILY: "of which the family is named, not the law",
+    VerdictKind.GROUP: "one of a group that the data cannot tell apart: no name",
+    VerdictKind.UNEXPLAINED: "the best hypothesis for a gap that stays unexplained: no name",
+}
+"""How sure an effect is, by the verdict."""
+NOTHING = {
+    VerdictKind.NOTHING_MISSING: "nothing is missing, and the model stands as it is",
+    VerdictKind.BELOW_LIMIT: "what may be missing is too small to tell from noise",
+    VerdictKind.DATA_ERROR: "the data are at fault; mend them first",
+    VerdictKind.UNEXPLAINED: "no hypothesis is better than the model as it is",
+}
+"""Why a verdict gives nothing to apply."""
+
+
+@dataclass(frozen=True)
+class Applied:
+    """A patched model.
+
+    Attributes
+    ----------
+    path : Path
+        Its file.
+    sentence : str
+        What was applied, and how sure it is.
+    command : str
+        Which compares the same data with it; empty for an FMU, which wants a description first.
+    """
+
+    path: Path
+    sentence: str
+    command: str
+
+
+def apply_verdict(
+    verdict: Path | str,
+    out: Path | str | None = None,
+    *,
+    member: str | None = None,
+    replace: bool = False,
+    progress: Progress | None = None,
+) -> Applied:
+    """Write the model of a verdict with the effects that were found and the parameters beside them.
+
+    Parameters
+    ----------
+    verdict : path
+        Folder of a verdict, or its `verdict.json`.
+    out : path, optional
+        The file: .json, a patch beside the model's file, which is a model itself wherever one is asked for;
+        .toml, a lumped model whose file says it by `[[law]]`; .fmu, a wing with the effects switched on.
+        By default MODEL_patched in the working folder, .toml where that can say it.
+    member : str, optional
+        Of a group: which of `Verdict.group`; the first if left out.
+    replace : bool
+        Whether an existing file may be replaced.
+    progress : Progress, optional
+        Where the modelling of a wing reports.
+
+    Returns
+    -------
+    Applied
+        The file, and what to say of it.
+
+    Raises
+    ------
+    DiscrepancyError
+        If the verdict gives nothing to apply, its model has changed or is gone, or the file cannot say it.
+    fmu_asset.errors.PatchFileError
+        If an FMU cannot carry an effect.
+    FileNotWrittenError
+        If the file exists, or cannot be written.
+    """
+    file = Path(verdict)
+    if file.suffix != ".json":
+        restore_folder(file)
+        file = file / VERDICT_NAME
+    stored = read_verdict(file)
+    found = _found(stored, file, member)
+    choice = model_of(stored.origin, file, progress)
+    patch = changed(found, origin=stored.origin).upon(choice.built_in)
+    plain = choice.kind is ModelKind.LUMPED and all(
+        isinstance(item, PortForce) and not item.windows for item in patch.patch
+    )
+    stem = Path(choice.file or "wing").stem
+    path = Path(f"{stem}_patched{'.toml' if plain else '.json'}" if out is None else out)
+    if path.suffix not in ENDINGS:
+        raise FileNotWrittenError(f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out.")
+    if path.exists() and path.resolve() in (Path(choice.file), file.resolve()):
+        raise FileNotWrittenError(f"{path} is what the patched model is made of: choose another --out.")
+    if path.exists() and not replace:
+        raise FileNotWrittenError(f"{path} exists: choose another --out or give --replace.")
+    what = " and ".join(f"{item.name}{item.place and f' at {item.place}'}" for item in found.effects)
+    beside = f" (of {', '.join(stored.verdict.group)})" if found.verdict is VerdictKind.GROUP else ""
+    sentence = f"{what[0].upper()}{what[1:]}, {RESTS_ON[found.verdict]}{beside}."
+    patch = changed(patch, sentence=f"{sentence} {stored.verdict.sentence}")
+    if path.suffix == ".toml":
+        if not plain:
+            raise ModelError(
+                f"{path}: only laws at the ports of a lumped model can stand in its own file; give --out "
+                "with the ending .json, which is taken wherever a model is."
+            )
+        atomic_write_text(path, _lumped_text(choice, patch))
+    elif path.suffix == ".fmu":
+        pack_patched(choice, patch, path, activate=True, replace=replace, progress=progress)
+        return Applied(path, sentence, "")
+    else:
+        store_patch(path, patch)
+    return Applied(path, sentence, _again(stored.origin.command, path))
+
+
+def gives(verdict: Verdict) -> bool:
+    """Return whether a verdict gives something to apply."""
+    open_gap = verdict.kind is VerdictKind.UNEXPLAINED
+    return verdict.kind in PATCHED or (open_gap and _hypothesis(verdict, None) is not None)
+
+
+def _found(stored: StoredVerdict, file: Path, member: str | None) -> StoredPatch:
+    """Return the effects that are applied."""
+    verdict = stored.verdict
+    if member is not None and (verdict.kind is not VerdictKind.GROUP or member not in verdict.group):
+        known = ", ".join(map(repr, verdict.group)) if verdict.kind is VerdictKind.GROUP else "no group"
+        raise DiscrepancyError(f"--member {member!r} is none of {file}, which has {known}: leave it out.")
+    beside = file.parent / PATCH_NAME
+    if member is None and verdict.kind in PATCHED and beside.is_file():
+        return read_patch(beside)
+    best = _hypothesis(verdict, member) if verdict.kind in APPLIED else None
+    if best is None:
+        raise DiscrepancyError(
+            f"{file} gives nothing to apply: {NOTHING.get(verdict.kind, 'it lacks what it names')}."
+        )
+    intervals = tuple(primitive_intervals(effect.patch) for effect in best.effects)
+    return StoredPatch(
+        best.effects, intervals, stored.origin, verdict=verdict.kind, parameters=best.parameters
+    )
+
+
+def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
+    """Return what the verdict, or a member of its group, stands for; None where there is nothing."""
+    wanted = tuple(effect.identifier for effect in verdict.effects)
+    if verdict.kind is VerdictKind.GROUP:
+        wanted = tuple((member or verdict.group[0]).split(" + "))
+    if verdict.kind is not VerdictKind.UNEXPLAINED:
+        return next((item for item in verdict.hypotheses if set(item.identifiers) == set(wanted)), None)
+    none = max((item.log_evidence for item in verdict.hypotheses if not item.effects), default=0.0)
+    better = [item for item in verdict.hypotheses if item.effects and item.log_evidence > none]
+    known = better if verdict.explained is None else verdict.hypotheses  # beside a remainder it may be less
+    told = [item for item in known if item.effects and set(item.identifiers) == set(verdict.resembles)]
+    return next(iter((*told, *better)), None)
+
+
+def _lumped_text(choice: ModelChoice, patch: StoredPatch) -> str:
+    """Return the file of a lumped model with laws at its ports and calibrated parameters."""
+    file = choice.path or SHIPPED_MODELS / f"{patch.origin.model_file}.toml"
+    content: dict[str, Any] = read_toml(file, ModelError, what="lumped model")
+    calibrated = {item.name: item for item in patch.parameters}
+    for row in content.get("parameter", ()):
+        if found := calibrated.get(row["name"]):
+            row |= {"mean": found.mean, "deviation": found.deviation}
+    laws = list(content.get("law", ()))
+    for effect in patch.effects:
+        for item in effect.patch:
+            name, count = effect.identifier, sum(law["name"].startswith(effect.identifier) for law in laws)
+            laws.append({"name": f"{name}_{count + 1}" if count else name, **item.to_mapping()})
+    content |= {"law": laws, "name": f"{content['name']} with {', '.join(e.name for e in patch.effects)}"}
+    parse_lumped(content, f"{file} with {patch.sentence}")
+    return f"# {patch.sentence}\n# Laws and parameters: {patch.origin.short_command}\n\n{toml_text(content)}"
+
+
+def pack_patched(
+    choice: ModelChoice,
+    patch: StoredPatch,
+    path: Path,
+    *,
+    activate: bool = False,
+    replace: bool = False,
+    progress: Progress | None = None,
+) -> list[str]:
+    """Pack the FMU of a wing with a patch and the parameters beside it; return the switches of its effects.
+
+    Raises
+    ------
+    ModelError
+        If the model is no wing.
+    fmu_asset.errors.PatchFileError
+        If an FMU cannot carry an effect.
+    """
+    if choice.design is None:
+        raise ModelError(
+            f"{path}: only a wing is packed with its effects; of {choice.label} give --out with the ending "
+            ".json, which is taken wherever a model is."
+        )
+    rows = [{"id": item.identifier, "primitives": item.patch.to_list()} for item in patch.effects]
+    content = {"schema": SCHEMA, "effects": rows, "channels": dict(patch.channels)}
+    base = WingTailoring(DigitalState(), "", {})
+    if choice.kind is ModelKind.CALIBRATION and choice.path is not None:
+        base = tailoring(load_calibration(choice.path))
+    values: dict[str, Any] = {item.name: item.mean for item in patch.parameters}
+    effects = parse_patch(json.dumps(content).encode(), "The patch")
+    pack_wing(
+        choice.design,
+        path,
+        tailoring=changed(base, state=changed(base.state, **values)),
+        patch=effects,
+        activate=activate,
+        replace=replace,
+        progress=progress,
+    )
+    return [f"effect.{effect.id}.active" for effect in effects.effects]
+
+
+def _again(command: str, model: Path) -> str:
+    """Return the command of a verdict with another model."""
+    words = shlex.split(command)
+    if "--model" in words:
+        at = words.index("--model")
+        del words[at : at + 2]
+    return shlex.join([*words, "--model", str(model)])

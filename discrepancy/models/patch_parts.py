@@ -1,0 +1,80 @@
+"""A patch sorted by what its primitives change, and what of it all models take alike."""
+
+from collections.abc import Collection, Iterable
+from typing import NamedTuple
+
+from discrepancy.errors import ModelError
+from discrepancy.models.interface import Model
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, LoadPlace, ModelPatch, PortLoad, Primitive
+
+
+class LoadChange(NamedTuple):
+    """What of recorded loads changes.
+
+    Attributes
+    ----------
+    gain, tare : float
+        The acting force is (1 + gain) times the recorded one, plus the tare [N] where it is not zero.
+    along_span, along_chord : float
+        How far the acting force is moved [m].
+    """
+
+    gain: float = 0.0
+    tare: float = 0.0
+    along_span: float = 0.0
+    along_chord: float = 0.0
+
+    @classmethod
+    def of(cls, patch: Iterable[Primitive]) -> "LoadChange":
+        """Return the change by gains and places, one upon the other."""
+        gain, tare, span, chord = cls()
+        for item in patch:
+            if isinstance(item, LoadGain):
+                gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare * (1.0 + item.gain) + item.tare
+            elif isinstance(item, LoadPlace):
+                span, chord = span + item.along_span, chord + item.along_chord
+        return cls(gain, tare, span, chord)
+
+
+class SortedLumped(NamedTuple):
+    """Structure, internal forces, change of loads, loads at ports."""
+
+    structure: tuple[Primitive, ...]
+    forces: ModelPatch
+    change: LoadChange
+    loads: tuple[PortLoad, ...]
+
+
+def sorted_lumped(patch: ModelPatch, model: Model) -> SortedLumped:
+    """Return the primitives of a patch by what they change; those of sensors are left out.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot carry one of them.
+    """
+    structure, forces, loads = [], [], []
+    for item in patch:
+        if isinstance(item, SENSORS):
+            continue
+        if isinstance(item, INTERNAL_FORCES):
+            forces.append(item)
+        elif not model.supports(type(item)):
+            raise ModelError(f"The lumped model {model.name!r} cannot carry the primitive {item.kind!r}.")
+        elif isinstance(item, PortLoad):
+            loads.append(item)
+        elif not isinstance(item, LoadGain | LoadPlace):
+            structure.append(item)
+    return SortedLumped(tuple(structure), ModelPatch(tuple(forces)), LoadChange.of(patch), tuple(loads))
+
+
+def laws_at(forces: ModelPatch, ports: Collection[str], *, in_windows: bool = True) -> Laws:
+    """Return the laws of internal forces at ports; raises `ModelError` where one cannot be."""
+    if not len(forces):
+        return NO_LAWS
+    try:
+        return laws_of(forces, ports, in_windows=in_windows)
+    except InvalidPatchError as cause:
+        raise ModelError(str(cause)) from cause

@@ -1,0 +1,430 @@
+"""The way back: a campaign, its verdict, the model patched by it, and the campaign once more."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import uav_twin
+from discrepancy.application import apply_verdict, gives
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity
+from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
+from discrepancy.errors import ModelError, VerdictFileError
+from discrepancy.files.document import Origin
+from discrepancy.files.patch import read_patch
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.problem import Problem
+from discrepancy.model_choice import ModelChoice, choose_model
+from discrepancy.models.interface import Conditions, Model
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
+from discrepancy.models.patched import PatchedModel
+from discrepancy.models.sensing import observe
+from discrepancy.search.strategy import search
+from discrepancy.sources.examples import example_campaign, plan_of, write_example
+from discrepancy.verdict import VerdictKind
+from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
+from discrepancy.workflow import Investigation, investigate
+from fe.runtime.patch import LoadGain, ModelPatch, PowerDamping, PowerStiffness, SensorGain
+from fmu_asset.archive.fmu_file import read_fmu
+from reporting.provenance import collect_provenance
+from tests import command_line
+from tests.discrepancy.models.test_fmu import RIG as FMU_RIG
+
+CATALOGUE = load_catalogue()
+SPRING = ("cubic_stiffness", "seating_offset", "load_cell")
+CUBIC = {"stiffening": 0.15}
+
+
+def named(*identifiers: str) -> tuple[Effect, ...]:
+    return tuple(effect_by_identifier(name, CATALOGUE) for name in identifiers)
+
+
+def hidden(
+    model: Model, campaign: Campaign, identifier: str, values: dict[str, float], place: str
+) -> ModelPatch:
+    setting = Setting(campaign, model, model.scales(campaign))
+    return effect_by_identifier(identifier, CATALOGUE).patch(setting, values, place)
+
+
+def verdict_of(
+    choice: ModelChoice,
+    campaign: Campaign,
+    effects: tuple[Effect, ...],
+    folder: Path,
+    *,
+    replace_it: bool = False,
+) -> Investigation:
+    """Investigate, and write the folder of the verdict without its report."""
+    found = investigate(campaign, choice.model, effects, thorough=False)
+    origin = Origin(
+        campaign.name, choice.model.name, campaign.data_hash, choice.source_hash,
+        "uav-twin discrepancy run 'a campaign' --model rig.toml --seed 0", collect_provenance(0), choice.file,
+    )  # fmt: skip
+    write_verdict_folder(folder, VerdictContent(found, origin), report=False, replace_it=replace_it)
+    return found
+
+
+# ---------------------------------------------------------------- round trips
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a lumped model, a campaign with a cubic spring hidden in it, and its verdict."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    shutil.copy(SHIPPED_MODELS / "single_mass_rig.toml", folder / "rig.toml")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        words = (
+            "static",
+            "lab",
+            "--model",
+            "rig.toml",
+            "--seed",
+            3,
+            "--effect",
+            "cubic_stiffness@slide=0.15",
+        )
+        assert command_line.command("discrepancy", "example", *words).returncode == 0
+        done = command_line.command(
+            "discrepancy", "run", "lab", "--model", "rig.toml", "--out", "verdict", "--no-report"
+        )
+        assert done.returncode == 0, done.stderr
+        assert "Verdict: named" in done.stdout
+        assert done.stdout.rstrip().endswith("Next: uav-twin discrepancy apply verdict")
+    return folder
+
+
+def test_there_and_back_by_the_command_line(
+    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Run, apply, run again, each in another folder: nothing is missing any more."""
+    monkeypatch.chdir(tmp_path)
+    done = command_line.command("discrepancy", "apply", laboratory / "verdict")
+    assert done.returncode == 0, done.stderr
+    first, then = done.stdout.splitlines()
+    assert first == "rig_patched.toml: Geometric (cubic) stiffness at slide, named."
+    text = (tmp_path / "rig_patched.toml").read_text(encoding="utf-8")
+    assert text.startswith("# Geometric (cubic) stiffness at slide, named.")
+    content = tomllib.loads(text)
+    (law,) = content["law"]
+    assert (law["kind"], law["port"]) == ("power_stiffness", "slide")
+    found = uav_twin.read_verdict(laboratory / "verdict").verdict
+    assert [(row["name"], row["mean"], row["deviation"]) for row in content["parameter"]] == [
+        (item.name, item.mean, item.deviation) for item in found.parameters
+    ]
+    assert found.parameters[0].deviation < 0.02  # the prior's
+    *words, last = shlex.split(then.removeprefix("Next: uav-twin "))
+    assert (words[-1], last) == ("--model", "rig_patched.toml")
+    done = command_line.command(*words, last, "--out", "again", "--no-report")
+    assert done.returncode == 0, done.stderr
+    assert "Verdict: nothing missing" in done.stdout
+    assert "apply" not in done.stdout
+    done = command_line.command("discrepancy", "apply", "again", "--out", "more.json")
+    assert done.returncode == 1
+    assert "nothing is missing, and the model stands as it is" in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["again", "rig_patched.toml"]
+
+
+def test_the_command_repeats_the_run_in_any_folder(
+    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = uav_twin.read_verdict(laboratory / "verdict").origin.command
+    done = command_line.command(*shlex.split(command)[1:], "--no-report")
+    assert done.returncode == 0, done.stderr
+    once, again = (
+        json.loads((folder / "verdict.json").read_text(encoding="utf-8"))
+        for folder in (laboratory / "verdict", tmp_path / "verdicts" / "lab")
+    )
+    assert once == again
+
+
+def static_campaign(choice: ModelChoice, folder: Path) -> Campaign:
+    """Write a static campaign with a cubic spring hidden at the port of the load."""
+    model, plan = choice.model, plan_of(choice.model)
+    bare = example_campaign(model, "static", 3, plan)
+    port = "tip" if "tip" in model.ports() else model.ports()[0]
+    return write_example(
+        model, folder, "static", 3, plan, hidden(model, bare, "cubic_stiffness", CUBIC, port)
+    )
+
+
+@pytest.mark.parametrize("kind", ["FMU", "structure", "wing"])
+def test_there_and_back_from_python(
+    kind: str, foreign_fmu: Callable[[str], Path], write_beam: Callable[..., Path], tmp_path: Path
+) -> None:
+    """A patch beside the model's own file is a model itself, refused once that file has changed."""
+    file = tmp_path / "rig.toml"
+    if kind == "FMU":
+        shutil.copy(foreign_fmu("rig2"), tmp_path / "rig.fmu")
+        file.write_text(FMU_RIG.format(fmu="rig.fmu"), encoding="utf-8")
+    elif kind == "structure":
+        changes = {'set = "end", force': "point = [100, 10, 5], force"}
+        file = write_beam(tmp_path, changes, cells=2)
+    choice = choose_model(None if kind == "wing" else file)
+    campaign = static_campaign(choice, tmp_path / "campaign")
+    found = verdict_of(choice, campaign, named(*SPRING), tmp_path / "verdict")
+    assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
+    applied = uav_twin.apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
+    assert applied.command.endswith(f"--model {tmp_path / 'patched.json'}")
+    patched = choose_model(applied.path)
+    assert isinstance(patched.model, PatchedModel)
+    assert patched.model.patch == found.verdict.effects[0].patch
+    for item, calibrated in zip(patched.model.parameters, found.verdict.parameters, strict=True):
+        assert (item.mean, item.deviation) == (calibrated.mean, calibrated.deviation)
+    again = verdict_of(patched, campaign, named(*SPRING), tmp_path / "again")
+    assert again.verdict.kind is VerdictKind.NOTHING_MISSING, again.verdict.sentence
+    if kind == "wing":
+        packed = read_fmu(apply_verdict(tmp_path / "verdict", tmp_path / "wing.fmu").path)
+        calibrated = {item.name: item.mean for item in found.verdict.parameters}
+        for name, wanted in (
+            ("effect.cubic_stiffness.active", 1.0),
+            ("young_modulus_factor", calibrated["young_modulus_factor"]),
+            ("damping.alpha", calibrated["damping_alpha"]),
+        ):
+            variable = packed.variable(name)
+            assert variable is not None
+            assert float(str(variable.start)) == wanted
+        return
+    old, new = ("density = 2700", "density = 2710") if kind == "structure" else ("high = 1.3", "high = 1.4")
+    file.write_text(file.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+    for call in (lambda: choose_model(applied.path), lambda: apply_verdict(tmp_path / "verdict", "x.json")):
+        with pytest.raises(ModelError, match=r"has changed since .* run `uav-twin discrepancy run` again"):
+            call()
+
+
+# ---------------------------------------------------------------- what is no name
+
+
+@pytest.fixture(scope="module")
+def group(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The verdict of a static campaign that cannot tell a compliant root from a crack."""
+    folder = tmp_path_factory.mktemp("group")
+    choice = choose_model("three_mass_chain")
+    plan = plan_of(choice.model)
+    bare = example_campaign(choice.model, "static", 3, plan)
+    values = {"compliance_share": 0.11}
+    patch = hidden(choice.model, bare, "root_compliance", values, "")
+    campaign = write_example(choice.model, folder / "campaign", "static", 3, plan, patch)
+    found = verdict_of(choice, campaign, named("root_compliance", "breathing_crack"), folder / "verdict")
+    assert found.verdict.kind is VerdictKind.GROUP, found.verdict.sentence
+    assert set(found.verdict.group) == {"root_compliance", "breathing_crack"}
+    return folder
+
+
+def test_of_a_group_one_member_is_applied(
+    group: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The leading one unless another is asked for; both say that they are no name, and close the gap."""
+    monkeypatch.chdir(tmp_path)
+    verdict = uav_twin.read_verdict(group / "verdict").verdict
+    leading, other = verdict.group
+    for words, member in (((), leading), (("--member", other), other)):
+        out = tmp_path / f"{member}.json"
+        done = command_line.command("discrepancy", "apply", group / "verdict", "--out", out, *words)
+        assert done.returncode == 0, done.stderr
+        said = f"one of a group that the data cannot tell apart: no name (of {leading}, {other})."
+        assert said in done.stdout
+        stored = read_patch(out)
+        assert stored.verdict is VerdictKind.GROUP
+        assert stored.sentence.startswith(done.stdout.splitlines()[0].split(": ", 1)[1])
+        assert [effect.identifier for effect in stored.effects] == [member]
+        (fitted,) = [item for item in verdict.hypotheses if item.identifiers == (member,)]
+        assert stored.parameters == fitted.parameters
+        campaign = uav_twin.read_campaign(group / "campaign")
+        again = investigate(campaign, out, named(leading, other), thorough=False).verdict
+        assert again.kind is VerdictKind.NOTHING_MISSING, again.sentence
+    done = command_line.command("discrepancy", "apply", group / "verdict", "--member", "overflow")
+    assert done.returncode == 1
+    assert f"which has '{leading}', '{other}'" in done.stderr
+
+
+def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path: Path) -> None:
+    """A hardening spring with nothing but a wrong clock to explain it."""
+    choice = choose_model("single_mass_rig")
+    plan = plan_of(choice.model)
+    bare = example_campaign(choice.model, "ringdown", 3, plan)
+    patch = hidden(choice.model, bare, "cubic_stiffness", CUBIC, "slide")
+    campaign = write_example(choice.model, tmp_path / "campaign", "ringdown", 3, plan, patch)
+    found = verdict_of(choice, campaign, named("clock_error"), tmp_path / "verdict")
+    assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
+    assert gives(found.verdict)
+    assert not gives(replace(found.verdict, hypotheses=found.verdict.hypotheses[1:]))  # the model as it is
+    applied = apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
+    assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: no name.")
+    stored = read_patch(applied.path)
+    assert stored.verdict is VerdictKind.UNEXPLAINED
+    assert [effect.identifier for effect in stored.effects] == ["clock_error"]
+    assert stored.sentence.startswith(applied.sentence)
+    with pytest.raises(
+        ModelError, match="only laws at the ports of a lumped model can stand in its own file"
+    ):
+        apply_verdict(tmp_path / "verdict", tmp_path / "patched.toml")
+
+
+# ---------------------------------------------------------------- files
+
+
+def test_files_are_not_taken_from_their_owner(
+    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    verdict = laboratory / "verdict"
+    (tmp_path / "there.toml").write_text("mine", encoding="utf-8")
+    for words, message in (
+        (("--out", "there.toml"), "there.toml exists: choose another --out or give --replace"),
+        (("--out", str(laboratory / "rig.toml"), "--replace"), "is what the patched model is made of"),
+        (("--out", "model.xml"), "must end in one of .toml, .json, .fmu"),
+        (("--out", "model.fmu"), "only a wing is packed with its effects"),
+        (("--member", "free_play"), "has no group: leave it out"),
+    ):
+        done = command_line.command("discrepancy", "apply", verdict, *words)
+        assert done.returncode == 1
+        assert message in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["there.toml"]
+    assert (tmp_path / "there.toml").read_text(encoding="utf-8") == "mine"
+    done = command_line.command("discrepancy", "apply", verdict, "--out", "there.toml", "--replace")
+    assert done.returncode == 0
+    assert uav_twin.load_model("there.toml").name.endswith("with geometric (cubic) stiffness")
+
+
+def test_a_model_is_found_beside_its_patch(laboratory: Path, tmp_path: Path) -> None:
+    """Files that moved together are a model still; one without its base is not."""
+    moved = tmp_path / "moved"
+    shutil.copytree(laboratory, tmp_path / "there")
+    content = json.loads((tmp_path / "there" / "verdict" / "verdict.json").read_text(encoding="utf-8"))
+    content["model_file"] = str(tmp_path / "there" / "rig.toml")
+    (tmp_path / "there" / "verdict" / "verdict.json").write_text(json.dumps(content), encoding="utf-8")
+    apply_verdict(tmp_path / "there" / "verdict", tmp_path / "there" / "patched.json")
+    (tmp_path / "there").rename(moved)
+    assert isinstance(uav_twin.load_model(moved / "patched.json"), PatchedModel)
+    (moved / "rig.toml").unlink()
+    with pytest.raises(ModelError, match="is gone: put it back there, or beside patched"):
+        uav_twin.load_model(moved / "patched.json")
+
+
+def test_a_verdict_of_an_earlier_version_asks_for_another_run(laboratory: Path, tmp_path: Path) -> None:
+    """It is read, but does not say where its model is."""
+    folder = tmp_path / "verdict"
+    shutil.copytree(laboratory / "verdict", folder)
+    for name, schema in (("verdict.json", "uav-twin verdict 2"), ("patch.json", "uav-twin patch 1")):
+        content = json.loads((folder / name).read_text(encoding="utf-8"))
+        content["schema"] = schema
+        del content["model_file"]
+        for table in (content, content["verdict"]):
+            if isinstance(table, dict):
+                table.pop("parameters", None)
+        for row in content["verdict"]["hypotheses"] if name == "verdict.json" else ():
+            del row["parameters"]
+        (folder / name).write_text(json.dumps(content), encoding="utf-8")
+    stored = uav_twin.read_verdict(folder)
+    assert stored.verdict.parameters == ()
+    assert stored.patch == uav_twin.read_verdict(laboratory / "verdict").patch
+    for call in (
+        lambda: apply_verdict(folder, tmp_path / "x.toml"),
+        lambda: choose_model(folder / "patch.json"),
+    ):
+        with pytest.raises(VerdictFileError, match="was left by an earlier version"):
+            call()
+
+
+def test_effects_are_applied_upon_each_other(laboratory: Path, tmp_path: Path) -> None:
+    """What a patched model lacks goes into one file with what it had."""
+    first = choose_model(apply_verdict(laboratory / "verdict", tmp_path / "first.json").path)
+    assert isinstance(first.model, PatchedModel)
+    plan = plan_of(first.model)
+    drag = ModelPatch((PowerDamping("slide", 0.1, 2.0, 0.0, 0.05, 0.01),))
+    campaign = write_example(first.model, tmp_path / "campaign", "ringdown", 5, plan, drag)
+    found = verdict_of(first, campaign, named("quadratic_damping"), tmp_path / "verdict")
+    assert [item.identifier for item in found.verdict.effects] == ["quadratic_damping"]
+    second = apply_verdict(tmp_path / "verdict", tmp_path / "second.toml").path
+    laws = tomllib.loads(second.read_text(encoding="utf-8"))["law"]
+    assert [law["name"] for law in laws] == ["cubic_stiffness", "quadratic_damping"]
+    stored = read_patch(apply_verdict(tmp_path / "verdict", tmp_path / "both.json").path)
+    assert stored.origin.model_file == str((laboratory / "rig.toml").resolve())
+    assert stored.patch == first.model.patch + found.verdict.effects[0].patch
+    assert uav_twin.load_model(tmp_path / "both.json").parameters == uav_twin.load_model(second).parameters
+
+
+# ---------------------------------------------------------------- models
+
+
+def test_a_law_in_the_file_is_the_law_of_a_patch() -> None:
+    """To the last bit, in motion and at rest, with the law times the factor of a parameter."""
+    content = tomllib.loads((SHIPPED_MODELS / "single_mass_rig.toml").read_text(encoding="utf-8"))
+    law = PowerStiffness("slide", 3.0, 3.0, 0, 0.008)
+    factor = {"name": "law", "terms": "spring", "deviation": 0.1, "low": 0.5, "high": 4.0}
+    more = {"law": [{"name": "spring", **law.to_mapping()}], "parameter": [*content["parameter"], factor]}
+    own, plain = LumpedModel(parse_lumped(content | more)), LumpedModel(parse_lumped(content))
+    plan = plan_of(plain)
+    campaign = example_campaign(plain, "laboratory", 3, plan)
+    for trial in campaign.trials:
+        for size in (1.0, 2.0):
+            patch = ModelPatch((replace(law, coefficient=3.0 * size),))
+            values = np.array([1.02, 0.9])
+            start = np.zeros((1, 2))
+            one = observe(
+                own, campaign, trial, ModelPatch(), Conditions(np.append(values, size), start)
+            ).values
+            other = observe(plain, campaign, trial, patch, Conditions(values, start)).values
+            np.testing.assert_array_equal(one, other)
+
+
+def test_a_built_in_sensor_is_that_of_its_channel() -> None:
+    """Of two channels that measure one output, the one that the effect was found on."""
+    model = uav_twin.load_model("single_mass_rig")
+    noise = NoiseRecord(1e-5, 50.0)
+    channels = tuple(
+        Channel(name, Quantity.DISPLACEMENT, "displacement", noise) for name in ("laser", "transducer")
+    )
+    plan = replace(plan_of(model), channels=channels)
+    campaign = example_campaign(model, "static", 0, plan)
+    trial = campaign.trials[0]
+    patched = PatchedModel(model, ModelPatch((SensorGain("laser", 0.1),)))
+    conditions = Conditions(np.ones(len(model.parameters)))
+    seen = observe(patched, campaign, trial, ModelPatch(), conditions).values
+    np.testing.assert_allclose(seen[:, 0], 1.1 * seen[:, 1], rtol=1e-12)
+    assert np.abs(seen[:, 1]).max() > 0.0
+
+
+def test_friction_in_the_model_is_fitted_from_the_beginnings() -> None:
+    """A motion that friction ends has many optima; from the prior means the fit ends far off in one."""
+    model = uav_twin.load_model("single_mass_rig")
+    plan = plan_of(model)
+    bare = example_campaign(model, "ringdown", 1, plan)
+    patch = hidden(model, bare, "coulomb_friction", {"friction_ratio": 0.04}, "slide")
+    campaign = example_campaign(model, "ringdown", 1, plan, patch)
+    patched = PatchedModel(model, patch)
+    problem = Problem(campaign, patched, Setting(campaign, patched, patched.scales(campaign)))
+    count = problem.counts.sum()
+    assert fit(problem, Candidate(), problem.start(Candidate())).chi_square > 10.0 * count
+    assert search(problem, named("load_cell")).none.chi_square < 1.2 * count
+
+
+@pytest.mark.parametrize("kind", ["lumped", "FMU"])
+def test_gains_of_a_load_act_one_upon_the_other(
+    kind: str, foreign_fmu: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """A tare of 0.5 N that a second gain of 10 % doubles up on is 0.55 N."""
+    shutil.copy(foreign_fmu("rig2"), tmp_path / "rig.fmu")
+    (tmp_path / "rig.toml").write_text(FMU_RIG.format(fmu="rig.fmu"), encoding="utf-8")
+    model = uav_twin.load_model("single_mass_rig" if kind == "lumped" else tmp_path / "rig.toml")
+    twice = ModelPatch((LoadGain(0.2, 0.5), LoadGain(0.1, 0.0)))
+    once = ModelPatch((LoadGain(0.32, 0.55),))
+    trial = example_campaign(model, "static", 0, plan_of(model)).trials[0]
+    outputs = (("displacement", Quantity.DISPLACEMENT),)
+    conditions = Conditions(np.ones(len(model.parameters)))
+    seen, wanted = (model.respond(trial, outputs, patch, conditions).values for patch in (twice, once))
+    np.testing.assert_allclose(seen, wanted, rtol=1e-9, atol=1e-15)
