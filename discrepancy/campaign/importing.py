@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from discrepancy.campaign.reading import assemble
@@ -110,6 +110,10 @@ class Understanding:
                     of = listing(map(repr, filter(None, known)), "or")
                     raise CampaignFileError(f"--{option} must be NAME=... about {of}, and {name!r} came.")
         self.kinds = {name: self._said("kind", name, listing(KINDS, "or"), KINDS) for name in names}
+        if len(resting := [name for name, kind in self.kinds.items() if kind == NOISE]) > 1:
+            raise CampaignFileError(
+                f"Noise is read from one file, and {listing(resting)} came: give one of them."
+            )
         self.decimals = {
             sheet.name: sheet.decimal
             or self._said("decimal", sheet.name, f". or ,: {sheet.unclear} can be read as both", (".", ","))
@@ -174,7 +178,8 @@ class Understanding:
                 raise ValueError(f"a driven trial has {INPUT}NAME in the place of force")
             if role in _SI:
                 kind = {"force": Quantity.FORCE, "temperature": Quantity.TEMPERATURE}.get(role)
-                to_si = conversion(unit, _SI[role]) if kind is None else conversion_of(kind, unit)
+                number = "1" if (role, unit) == ("load_factor", "g") else unit
+                to_si = conversion(number, _SI[role]) if kind is None else conversion_of(kind, unit)
                 return Column(sheet, head, role, unit, _SI[role], None, to_si)
             quantity = self._quantity(head, role, unit)
             if quantity is None:
@@ -255,7 +260,9 @@ class Understanding:
             content["reference_temperature"] = self.reference_temperature
         tables = {sheet.name: self._table(sheet) for sheet in self.sheets}
         origin = hash_record([sheet.digest for sheet in self.sheets])
-        return assemble(parse_campaign(content, listing(tables)), content, tables, origin)
+        section = parse_campaign(content, listing(tables))
+        # whoever reads what is written remarks on it as it is by then
+        return replace(assemble(section, content, tables, origin), remarks=section.remarks)
 
     def _trial(self, file: str) -> dict[str, Any]:
         places = self.answers.get("load-place", {})
@@ -277,7 +284,9 @@ class Understanding:
     def _origin(self, sheet: Sheet) -> str:
         used = [item for item in self.columns if item.sheet is sheet and item.role != LEFT_OUT]
         columns = listing(f"{item.head!r} [{item.unit}] is {item.role}" for item in used)
-        return f"Imported from {sheet.name} (SHA-256 {sheet.digest}), {sheet.remark}: {columns}."
+        empty = sum(sheet.columns[sheet.heads.index(item.head)].count("") for item in used)
+        left = f"; {counted(empty, 'cell')} {be(empty)} empty" if empty else ""
+        return f"Imported from {sheet.name} (SHA-256 {sheet.digest}), {sheet.remark}: {columns}{left}."
 
 
 def _kind(unit: str) -> str:

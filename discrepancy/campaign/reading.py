@@ -107,7 +107,7 @@ def assemble(
     )
     _check_every_channel_is_measured(section, trials, tables)
     channels = _channels(section, printed, tables, trials, remarks)
-    remarks += remarks_on(section, channels, trials)
+    remarks += remarks_on(channels, trials)
     return Campaign(
         name=section.name,
         channels=channels,
@@ -167,8 +167,7 @@ def _check_every_channel_is_measured(
             name = section.trial[0].file
             raise CampaignFileError(
                 f"The channel {channel.name!r} is in no trial: no table has a column "
-                f"{channel.table_column!r}; "
-                f"the columns of {name} are {', '.join(tables[name].columns)}."
+                f"{channel.table_column!r}; the columns of {name} are {', '.join(tables[name].columns)}."
             )
 
 
@@ -222,6 +221,7 @@ def _trial(
         held_out=section.held_out,
         noise_factor=section.noise_factor,
         begins=section.begins or Start.SETTLED,
+        begin_assumed=section.begins is None,
         inputs=inputs,
         file=section.file,
         hold=section.hold,
@@ -327,8 +327,7 @@ def _temperature(section: TrialSection, table: TextTable, campaign: CampaignSect
     if reference is None:
         raise CampaignFileError(
             f"{user.capitalize()} has a temperature, but the campaign has no `reference_temperature`: "
-            "give it, "
-            "in degC."
+            "give it, in degC."
         )
     if column:
         return table.numbers("temperature", user, lambda text: difference(text, reference))

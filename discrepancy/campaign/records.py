@@ -275,6 +275,8 @@ class Trial:
         the acquisition (averaging, another range) [1].
     begins : Start
         How a forced or driven trial began.
+    begin_assumed : bool
+        Nobody said so.
     inputs : tuple of RecordedInput
         Driven trials: what acted. `force` is then the first force or torque among them, or zero. Static
         trials: what was held in each row beside the force.
@@ -302,6 +304,7 @@ class Trial:
     held_out: bool = False
     noise_factor: float = 1.0
     begins: Start = Start.SETTLED
+    begin_assumed: bool = field(default=False, compare=False)
     inputs: tuple[RecordedInput, ...] = ()
     hold: Hold | None = None
     file: str = field(default="", compare=False)

@@ -7,17 +7,14 @@ from collections.abc import Mapping
 from discrepancy.campaign.noise import noise_model
 from discrepancy.campaign.records import Channel, Start, Trial, TrialKind
 from discrepancy.campaign.sampling import spacing_sentence
-from discrepancy.campaign.schema import CampaignSection
 from reporting.words import counted
 
 
-def remarks_on(
-    section: CampaignSection, channels: Mapping[str, Channel], trials: tuple[Trial, ...]
-) -> list[str]:
+def remarks_on(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) -> list[str]:
     """Return the sentences on the trials of a campaign, in one order."""
     uneven = spacing_sentence({trial.name: trial.time for trial in trials if trial.is_dynamic})
     found = [] if uneven is None else [uneven]
-    return [*found, *_begins(section, trials), *_not_whitened(channels, trials)]
+    return [*found, *_begins(trials), *_not_whitened(channels, trials)]
 
 
 _BEGINS = {
@@ -27,14 +24,13 @@ _BEGINS = {
 }
 
 
-def _begins(section: CampaignSection, trials: tuple[Trial, ...]) -> list[str]:
+def _begins(trials: tuple[Trial, ...]) -> list[str]:
     """Return what is said or assumed of how trials begin, one sentence for each kind of begin."""
     groups: dict[tuple[Start, bool], list[str]] = {}
-    for given, trial in zip(section.trial, trials, strict=True):
+    for trial in trials:
         matters = trial.kind is TrialKind.DRIVEN or (trial.kind is TrialKind.FORCED and trial.force[0] != 0.0)
-        if given.begins is not None or matters:
-            assumed = given.begins is None
-            groups.setdefault((trial.begins, assumed), []).append(repr(trial.name))
+        if matters or not trial.begin_assumed:
+            groups.setdefault((trial.begins, trial.begin_assumed), []).append(repr(trial.name))
     found = []
     for (begins, assumed), names in groups.items():
         what = "The trial {} is {}" if len(names) == 1 else "The trials {} are {}"

@@ -44,7 +44,8 @@ _NUMBERS = {
 _PLAIN = re.compile(r"[+-]?\d*[.,]?\d+(?:[eE][+-]?\d+)?", re.ASCII)
 """What most of them are, found sooner."""
 _CLOCK = re.compile(r"(?:(\S+)[ T]+|(?=\d))(\d{1,2}:\d\d:\d\d)([.,]\d+)?", re.ASCII)
-_HEAD = re.compile(r"(.+?)(?:\s*\[(.+)\]|\s*\((.+)\)|\s+/\s+(.+)|,\s+(.+)|\s+in\s+(.+))")
+_HEAD = re.compile(r"(.+?)(?:(?!\S\d+\S$)\s*(?:\[([^][]+)\]|\(([^()]+)\))|\s+/\s+(.+)|,\s+(.+)|\s+in\s+(.+))")
+"""Name and unit; a number that touches its name, as in `strain[1]`, is part of it."""
 
 Rows = list[tuple[int, list[str]]]
 
@@ -112,8 +113,10 @@ def read_sheet(path: Path) -> Sheet:
         if any(map(_CLOCK.fullmatch, cells)):
             times = [_time(cell, f"{where} {line}") for cell, line in zip(cells, lines, strict=True)]
             unit, cells = "s", tuple(_Typed(time - times[0]) for time in times)
-        if not all(_is_value(cell) for cell in cells if cell):
-            left += f"; the column {title!r} holds no numbers and is left out"
+        if texts := [cell for cell in cells if cell and not _is_value(cell)]:
+            count = sum(map(bool, cells)) - len(texts)
+            held = f"{counted(count, 'number')} and {counted(len(texts), 'text')}" if count else "no numbers"
+            left += f"; the column {title!r} holds {held} and is left out"
         elif any(cells):
             names.append((name, unit))
             columns.append(cells)
@@ -304,13 +307,14 @@ def _laid_out(rows: Rows, name: str, where: str) -> tuple[list[str], list[str], 
             f"{counted(named, 'column')}: a table needs a name over each, and between commas a decimal comma "
             "makes two cells of a number."
         )
-    left = set(range(first, last)) - set(body)
+    torn = (at for at in range(last + 1, len(rows)) if core[0] in values[at])  # no footer begins so
+    left = {*range(first, last), *(at for at in torn if 2 * len(values[at] & {*core}) >= len(core))} - {*body}
     for line, row in (rows[at] for at in sorted(left) if rows[at][1] not in (head, rows[first - 1][1])):
         if not row[0].startswith("#"):
             raise CampaignFileError(
                 f"{where} {line}: numbers must stand under {head[core[0]]!r} and the other names, and "
                 f"{shown(listing(filter(None, row)))} came; leave the cell of a reading empty that is to be "
-                "left out."
+                "left out, and remove what is no row of the table."
             )
     below = [line for line, _ in rows[last + 1 :]]
     remark = f"; what stands from {below[0]} on is left out" if below else ""

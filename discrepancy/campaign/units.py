@@ -175,6 +175,8 @@ def conversion_of(quantity: Quantity, unit: str) -> Conversion:
             return Conversion(1.0, 0)
         if quantity is Quantity.TEMPERATURE:
             raise ValueError
+        if quantity is Quantity.STRAIN and re.search(r"V|[Vv]olt", unit):
+            raise ValueError  # a bridge's output is no strain before its gauge factor is known
         if quantity is Quantity.SIGNAL:
             with suppress(ValueError):
                 return conversion(unit, "1")

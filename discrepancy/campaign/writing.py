@@ -100,8 +100,7 @@ def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
         if campaign.reference_temperature is None:
             raise CampaignFileError(
                 f"The trial {trial.name!r} has temperatures, but the campaign has no reference "
-                "temperature to write "
-                "them with."
+                "temperature to write them with."
             )
         reference = campaign.reference_temperature
         columns["temperature"] = [sum_text(reference, value) for value in trial.temperature.tolist()]
@@ -144,8 +143,7 @@ def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
     if intervals or interval is None:
         raise CampaignFileError(
             "Noise records can be written only if all have one sampling interval: resample them, or keep "
-            "their "
-            "standard deviations."
+            "their standard deviations."
         )
     longest = max(len(samples) for samples, _ in recorded.values())
     columns = {"time": [repr(interval * number) for number in range(longest)]}
@@ -222,7 +220,8 @@ def _trial(trial: Trial, file: str, order: list[str]) -> dict[str, Any]:
         _toml(name): (np.flatnonzero(~trial.used[:, index]) + 1).tolist() or None
         for index, name in enumerate(trial.channels)
     }
-    said = trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED
+    driven = trial.kind is TrialKind.DRIVEN and not trial.begin_assumed
+    said = driven or trial.begins is not Start.SETTLED
     in_order = list(trial.channels) == [name for name in order if name in trial.channels]
     return {
         "name": trial.name, "kind": trial.kind, "file": file, "run": trial.run or None,
