@@ -18,7 +18,7 @@ import pytest
 from openpyxl import Workbook
 
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.model_choice import choose_model
 from discrepancy.sources.examples import example_campaign, plan_for
 from tests.command_line import command
@@ -208,6 +208,43 @@ def test_samples_at_rest_inputs_and_temperatures(tmp_path: Path, monkeypatch: py
     assert [item.name for item in trial.inputs] == ["current"]
     assert trial.inputs[0].values[3] == 3e-3
     assert trial.temperature[8] == 1.0
+
+
+def test_noise_is_of_one_file_and_remarks_are_the_origins_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("n1", "n2"):
+        rest = "".join(f"{k / 100},{(k * 7) % 11 - 5}\n" for k in range(40))
+        Path(f"{name}.csv").write_text(f"time [s],x [um]\n{rest}", "utf-8")
+    rows = "".join(f"{k / 100},{'' if k == 3 else k % 5},{k},{k / 8}\n" for k in range(16))
+    Path("push.csv").write_text(f"time [s],x [um],pull [N],leaf_strain [mV/V]\n{rows}", "utf-8")
+    given = (
+        "--kind", "noise", "--kind", "push.csv=driven", "--column", "x=displacement", "--column",
+        "pull=input:pull", "--model", MODEL, "--out", "lab",
+    )  # fmt: skip
+    done = call("push.csv", "n1.csv", "n2.csv", *given)
+    assert done.returncode == 1
+    assert done.stderr.strip() == "Noise is read from one file, and n1.csv and n2.csv came: give one of them."
+    done = call("push.csv", "n1.csv", *given)
+    assert done.returncode == 0, done.stderr
+    toml = Path("lab/campaign.toml").read_text("utf-8")
+    assert "begins" not in toml
+    assert toml.count("Imported from") == toml.split("]\n\n[")[0].count('",\n') == 2
+    assert "; 1 cell is empty." in toml
+    read = read_campaign("lab")
+    assert read.channels["leaf_strain"].quantity is Quantity.SIGNAL
+    assert "(assumed: say `begins`" in " ".join(read.remarks)
+    Path("lab/campaign.toml").write_text(toml.replace('"driven"', '"driven"\nbegins = "still"'), "utf-8")
+    assert "assumed" not in " ".join(read_campaign("lab").remarks)
+
+
+def test_a_load_factor_in_g_is_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("turn.csv").write_text("time [s],n [g],x [um]\n0,1,2\n1,2.5,3\n", "utf-8")
+    done = call("turn.csv", "--kind", "flight", "--column", "n=load_factor", "--column", "x=x")
+    assert done.returncode == 0, done.stderr
+    assert read_campaign("turn").trials[0].load_factor.tolist() == [1.0, 2.5]
 
 
 def test_a_force_is_no_input_of_a_driven_trial_unless_it_is_said(

@@ -83,6 +83,7 @@ def test_driven_trials_come_back_as_they_were(tmp_path: Path) -> None:
     campaign = read_campaign(folder_of(tmp_path))
     (tmp_path / "again").mkdir()
     again = read_campaign(write_campaign(campaign, tmp_path / "again"))
+    assert again.remarks == campaign.remarks
     for one, other in zip(campaign.trials, again.trials, strict=True):
         np.testing.assert_array_equal(one.values, other.values)
         np.testing.assert_array_equal(one.time, other.time)
@@ -91,6 +92,16 @@ def test_driven_trials_come_back_as_they_were(tmp_path: Path) -> None:
             np.testing.assert_array_equal(given.values, found.values)
             assert (given.name, given.quantity, given.hold) == (found.name, found.quantity, found.hold)
             assert given.offset_deviation == found.offset_deviation
+
+
+def test_a_begin_is_written_where_it_was_said(tmp_path: Path) -> None:
+    settled = TOML + 'begins = "settled"\n'
+    for toml, count, assumed in ((TOML, 1, True), (settled, 2, False)):
+        campaign = read_campaign(folder_of(tmp_path, toml))
+        again = write_campaign(campaign, tmp_path / "again")
+        assert (again / "campaign.toml").read_text("utf-8").count("\nbegins = ") == count
+        second = read_campaign(again).trials[1]
+        assert (second.begins, second.begin_assumed) == (Start.SETTLED, assumed)
 
 
 def test_a_forced_trial_says_what_it_assumes_of_its_begin(tmp_path: Path) -> None:

@@ -73,6 +73,15 @@ ODD = {
         b",t [s],w [mm],w [mm]\n0,0.0,1.5,2.5\n1,0.5,3.5,4.5\n",
         ("column 1", "t", "w", "w 2"), ("", "s", "mm", "mm"), ["0 0.0 1.5 2.5", "1 0.5 3.5 4.5"],
     ),
+    "numbers that are part of a name": (
+        b"t [s],strain[1],strain[2] [um/m],u(1),q [1]\ns,um/m,,mm,\n0,1.5,2.5,3.5,4.5\n1,1.6,2.6,3.6,4.6\n",
+        ("t", "strain[1]", "strain[2]", "u(1)", "q"), ("s", "um/m", "um/m", "mm", "1"),
+        ["0 1.5 2.5 3.5 4.5", "1 1.6 2.6 3.6 4.6"],
+    ),
+    "the last of several brackets": (
+        b"strain[1] [um/m];w (tip) (mm)\n1;2\n3;4\n",
+        ("strain[1]", "w (tip)"), ("um/m", "mm"), ["1 2", "3 4"],
+    ),
     "separator said, integers, blanks around": (
         b"sep=;\n F (N) ; w (um) \n 1 ; 2 \n 3 ; 4 \n",
         ("F", "w"), ("N", "um"), ["1 2", "3 4"],
@@ -104,6 +113,10 @@ def test_what_is_passed_over_is_told(tmp_path: Path) -> None:
     assert sheet.remark == "lines 7 to 9, semicolons between cells; what stands from 10 on is left out"
     sheet = sheet_of(tmp_path, b"t [s];w [mm];Notiz\n0;0,5;ok\n1;0,6;\n")
     assert sheet.remark.endswith("; the column 'Notiz' holds no numbers and is left out")
+    sheet = sheet_of(tmp_path, b"t;w;e\n0;1;OL\n1;2;OL\n2;3;OL\n3;4;4\n4;5;5\n")
+    assert sheet.remark.endswith("; the column 'e' holds 2 numbers and 3 texts and is left out")
+    sheet = sheet_of(tmp_path, b"t;w;e\n0;1;2\n1;2;3\n2;rows;in all\n;1,5;2,5\nMean;1,5;2,5\n")
+    assert sheet.remark.endswith("; what stands from 4 on is left out")
 
 
 @pytest.mark.parametrize(
@@ -113,6 +126,9 @@ def test_what_is_passed_over_is_told(tmp_path: Path) -> None:
          "decimals with a point ('0.5' in line 2) and with a comma ('0,5' in line 3)"),
         (b"t;w\n0;0,5\n1;OVL\n2;0,7\n",
          "line 3: numbers must stand under 't' and the other names, and '1 and"),
+        (b"t;w;e\n0;0,5;1\n1;0,6;2\n2;0,7;OVL\n3;0,8;OVL\n",
+         "line 4: numbers must stand under 't' and the other names, and '2, 0,7 and OVL' came"),
+        (b"t,w\n0,0.5\n1,0.6\n2,OVL\n", "line 4: numbers must stand under 't'"),
         (b"t,w\n0,1,2,3\n0,2,2,4\n", "line 2: 4 cells came, and the row above names 2 columns"),
         (b"0;1\n1;2\n", "holds no table"),
         (b"", "holds no table"),

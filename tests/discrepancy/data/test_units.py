@@ -106,6 +106,13 @@ def test_what_is_no_unit_of_ours_is_of_no_quantity(unit: str) -> None:
     assert quantities_of(unit) == ()
 
 
+@pytest.mark.parametrize("unit", ["mV/V", "V/V", "µV/V", "mV/volt"])
+def test_a_ratio_of_volts_is_a_signal_and_no_strain(unit: str) -> None:
+    assert quantities_of(unit) == (Quantity.SIGNAL,)
+    with pytest.raises(ValueError, match=f"strain must have a unit such as .*, and '{unit}' came"):
+        conversion_of(Quantity.STRAIN, unit)
+
+
 def test_a_time_is_converted_and_a_length_is_no_time() -> None:
     assert conversion("ms", "s") == (1e-3, -3)
     with pytest.raises(ValueError, match="cannot become s"):
