@@ -207,7 +207,7 @@ def investigate(
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     missing = None
-    if thorough:
+    if thorough and verdict.kind not in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT):
         with stage("Seeing the missing force", "force"):
             missing = missing_force(
                 problem, fit, [item for item in catalogue if item.unavailable(setting) is None]

@@ -22,6 +22,7 @@ _EXPECTED = {
     "bool_type": "true or false",
     "bool_parsing": "true or false",
     "finite_number": "a finite number",
+    "too_short": "at least one entry",
 }
 """What is expected, by pydantic's type of error, where its own words are those of Python."""
 
@@ -89,7 +90,7 @@ def _sentence(error: ValidationError, what: str, first_index: int) -> str:
          f"are not keys of {what}; remove them or correct their spelling"),
         ("missing", "is missing", "are missing"),
     ):  # fmt: skip
-        if places := [repr(_written(item["loc"], first_index)) for item in found if item["type"] == kind]:
+        if places := [shown(_written(item["loc"], first_index)) for item in found if item["type"] == kind]:
             return f"{listing(places)} {several if places[1:] else one}"
     first = found[0]
     place = _written(first["loc"], first_index)

@@ -17,6 +17,10 @@ _KEYS = re.compile(rf"{_TEXT}|({_PART}(?:[ \t]*+\.[ \t]*+{_PART})*+)")
 """Comments and texts of several lines, then words and dotted keys; each is gone over once, however long."""
 
 
+LONGEST_ARRAY = 90
+"""Characters of an array that stands in one line."""
+
+
 def read_toml(
     path: Path | str,
     error: type[Exception],
@@ -99,8 +103,15 @@ def _check_integers(
         _check_integers(item, here, subject, error)
 
 
+class Printed(str):
+    """A number as it is to stand in a file."""
+
+
 def toml_text(content: dict[str, Any]) -> str:
-    """Return plain data as TOML, of which `parse_toml` makes the same again; tables of tables in one line."""
+    """Return plain data as TOML, of which `parse_toml` makes the same again; what is None is left out.
+
+    Tables of tables stand in one line, longer arrays in several.
+    """
     tables = {key: item for key, item in content.items() if isinstance(item, dict)}
     arrays = {
         key: item
@@ -114,7 +125,11 @@ def toml_text(content: dict[str, Any]) -> str:
 
 
 def _lines(table: dict[str, Any]) -> str:
-    return "".join(f"{_key(key)} = {_shown(item)}\n" for key, item in table.items())
+    return "".join(f"{key} = {shown}\n" for key, shown in _pairs(table))
+
+
+def _pairs(table: dict[str, Any]) -> list[tuple[str, str]]:
+    return [(_key(key), _shown(item)) for key, item in table.items() if item is not None]
 
 
 def _key(name: str) -> str:
@@ -122,12 +137,19 @@ def _key(name: str) -> str:
 
 
 def _shown(item: Any) -> str:
+    if isinstance(item, Printed):  # `E+5` is not one of its exponents after a bare point
+        mantissa, letter, exponent = item.lower().partition("e")
+        mantissa += "0" if mantissa.endswith(".") else ""
+        return f"{mantissa}e{int(exponent)}" if letter else mantissa
     if isinstance(item, str):  # the escapes of JSON are TOML's, but for DEL
         return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(item, bool):
         return str(item).lower()
     if isinstance(item, list | tuple):
-        return f"[{', '.join(map(_shown, item))}]"
+        shown = list(map(_shown, item))
+        if sum(map(len, shown)) > LONGEST_ARRAY:
+            return "[\n" + "".join(f"    {one},\n" for one in shown) + "]"
+        return f"[{', '.join(shown)}]"
     if isinstance(item, dict):
-        return f"{{ {', '.join(f'{_key(key)} = {_shown(value)}' for key, value in item.items())} }}"
-    return repr(item)
+        return f"{{ {', '.join(f'{key} = {shown}' for key, shown in _pairs(item))} }}"
+    return repr(float(item) if isinstance(item, float) else item)  # of a number of NumPy, too

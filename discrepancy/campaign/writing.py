@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Mapping
 from dataclasses import asdict
 from math import isinf
 from pathlib import Path
@@ -28,6 +26,7 @@ from discrepancy.campaign.units import UNITS, in_unit, sum_text
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
+from reporting.toml_file import Printed, toml_text
 
 FloatArray = NDArray[np.float64]
 NOISE_FILE = "noise.csv"
@@ -157,39 +156,39 @@ def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
 
 
 def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float | None, si: bool) -> str:
-    lines = [f"format = {FORMAT}", f"name = {_toml(campaign.name)}"]
-    if campaign.reference_temperature is not None:
-        lines.append(f"reference_temperature = {_toml(campaign.reference_temperature)}  # degC")
-    if campaign.remarks:
-        lines += ["remarks = [", *(f"    {_toml(remark)}," for remark in campaign.remarks), "]"]
-    for name, (mean, deviation) in campaign.parameters.items():
-        lines += _section(f"[parameters.{_toml(name)}]", {"mean": mean, "deviation": deviation})
-    if noise_interval is not None:
-        lines += [*_section("[noise]", {"file": NOISE_FILE, "interval": noise_interval})]
-        lines[-1] += "  # s"
-    if campaign.loggers:
-        lines += _section("[loggers]", {_toml(name): names for name, names in campaign.loggers.items()})
-    for channel in campaign.channels.values():
-        lines += _section("[[channel]]", _channel(channel, si))
-    for item in {item.name: item for trial in campaign.trials for item in trial.inputs}.values():
-        lines += _section("[[input]]", _input(item))
-    for trial, file in zip(campaign.trials, files, strict=True):
-        lines += _section("[[trial]]", _trial(trial, file, list(campaign.channels)))
-    for event in campaign.events:
-        what = {"name": event.name, "trials": event.trials, "time": event.time, "until": event.until}
-        lines += _section("[[event]]", what)
-    return "\n".join(lines) + "\n"
-
-
-class _Printed(str):
-    """A number as it is to stand in the file."""
+    inputs = {item.name: item for trial in campaign.trials for item in trial.inputs}
+    noise = None if noise_interval is None else {"file": NOISE_FILE, "interval": noise_interval}
+    order = list(campaign.channels)
+    return toml_text(
+        {
+            "format": FORMAT,
+            "name": campaign.name,
+            "reference_temperature": campaign.reference_temperature,
+            "remarks": campaign.remarks or None,
+            "parameters": {
+                name: {"mean": mean, "deviation": deviation}
+                for name, (mean, deviation) in campaign.parameters.items()
+            } or None,
+            "noise": noise,
+            "loggers": dict(campaign.loggers) or None,
+            "channel": [_channel(channel, si) for channel in campaign.channels.values()],
+            "input": [_input(item) for item in inputs.values()] or None,
+            "trial": [
+                _trial(trial, file, order) for trial, file in zip(campaign.trials, files, strict=True)
+            ],
+            "event": [
+                {"name": event.name, "trials": event.trials, "time": event.time, "until": event.until}
+                for event in campaign.events
+            ] or None,
+        }
+    )  # fmt: skip
 
 
 def _channel(channel: Channel, si: bool) -> dict[str, Any]:
     unit, record, noise = _unit(channel, si), channel.noise, None
 
     def printed(deviation: float) -> str:
-        return "free" if isinf(deviation) else _Printed(in_unit(deviation, channel.quantity, unit))
+        return "free" if isinf(deviation) else Printed(in_unit(deviation, channel.quantity, unit))
 
     if record is not None and record.samples is None:
         freedom, source = record.degrees_of_freedom, record.source
@@ -217,7 +216,7 @@ def _input(item: RecordedInput) -> dict[str, Any]:
 
 def _trial(trial: Trial, file: str, order: list[str]) -> dict[str, Any]:
     left_out = {
-        _toml(name): (np.flatnonzero(~trial.used[:, index]) + 1).tolist() or None
+        name: (np.flatnonzero(~trial.used[:, index]) + 1).tolist() or None
         for index, name in enumerate(trial.channels)
     }
     driven = trial.kind is TrialKind.DRIVEN and not trial.begin_assumed
@@ -234,28 +233,3 @@ def _trial(trial: Trial, file: str, order: list[str]) -> dict[str, Any]:
         "left_out": left_out if any(left_out.values()) else None,
         "release": None if trial.release is None else asdict(trial.release),
     }  # fmt: skip
-
-
-# ---------------------------------------------------------------- values
-
-
-def _section(head: str, content: Mapping[str, Any]) -> list[str]:
-    """Return the lines of a table; what is None is left out."""
-    return ["", head, *(f"{key} = {_toml(value)}" for key, value in content.items() if value is not None)]
-
-
-def _toml(value: Any) -> str:
-    """Return a value as TOML has it."""
-    if isinstance(value, Mapping):
-        return (
-            f"{{ {', '.join(f'{key} = {_toml(item)}' for key, item in value.items() if item is not None)} }}"
-        )
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_toml, value))}]"
-    if isinstance(value, float | _Printed):
-        # `E+5` is not one of its exponents after a bare point.
-        mantissa, letter, exponent = str(value).lower().partition("e")
-        mantissa += "0" if mantissa.endswith(".") else ""
-        return f"{mantissa}e{int(exponent)}" if letter else mantissa
-    # JSON's escapes are TOML's but for DEL, which JSON leaves bare.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -119,8 +119,9 @@ def missing_force(problem: Problem, fit: CandidateFit, effects: Sequence[Effect]
     with the most evidence. Where the verdict has no law at a port, that of `effects` is drawn which follows
     the force best, if one follows it at all.
 
-    None where a model does not tell how its ports move, where laws of the verdict act at several ports, and
-    where nothing is missing.
+    None where a model does not tell how its ports move, where the verdict is no law at one port, where its
+    law is not ahead of a force without one (friction that holds is anything up to its largest), and where
+    nothing is missing.
     """
     model = problem.model.inner
     dynamic = [data for data in problem.trials if data.trial.is_dynamic]
@@ -134,19 +135,26 @@ def missing_force(problem: Problem, fit: CandidateFit, effects: Sequence[Effect]
 
 def _missing(problem: Problem, fit: CandidateFit, effects: Sequence[Effect]) -> MissingForce | None:
     search = ForceSearch(problem)
+    patch = fit.candidate.patch(problem.setting, fit.point.effect) if fit.candidate.terms else ModelPatch()
+    if not all(isinstance(item, PortForce) for item in patch):
+        return None
     strained = np.abs(fit.point.shared[problem.shared.precision > 0.0]).max(initial=0.0) > FAR
-    believed = bool(fit.candidate.terms) and not strained
+    believed = len(patch) > 0 and not strained
     at = search.locate(fit.point if believed else None)
-    evidence = {name: one.evidence - _of_nothing(one) for name, one in at.items()}
+    nothing = max(_of_nothing(one) for one in at.values())
+    evidence = {name: one.evidence - nothing for name, one in at.items()}
     port = max(at, key=lambda name: at[name].evidence)
     if evidence[port] < GROUND:
         return None
     drawn = _Drawn(at[port])
     if believed:
-        laws = _of_verdict(search, fit)
-        if len(laws) > 1:  # each hides the motion that the others make
+        laws = _of_verdict(search, fit, patch)
+        ahead = [law for law in laws if law.seen.evidence > at[law.port(at)].evidence + GROUND]
+        if (
+            len(laws) != 1 or not ahead
+        ):  # several hide each other's motion; one that sticks has no known force
             return None
-        drawn = next((law for law in laws if law.seen.evidence > at[law.port(at)].evidence + GROUND), drawn)
+        drawn = ahead[0]
     elif effects:
         first = next(iter(search.name(effects)), None)
         acts = first is not None and any(part.forces for part in first.seen.view.effects[-1].parts)
@@ -174,9 +182,8 @@ class _Drawn:
         return list(ports)[self.seen.view.port]
 
 
-def _of_verdict(search: ForceSearch, fit: CandidateFit) -> list[_Drawn]:
+def _of_verdict(search: ForceSearch, fit: CandidateFit, patch: ModelPatch) -> list[_Drawn]:
     """Return what is left at each port at which a verdict has laws, beside these."""
-    patch = fit.candidate.patch(search.problem.setting, fit.point.effect)
     columns = Columns(search.problem, search.numbers, search.point)
     named, found = " and ".join(term.effect.name for term in fit.candidate.terms), []
     for port, one in search.at.items():

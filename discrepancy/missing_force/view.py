@@ -20,7 +20,7 @@ SIZE_DOUBT, TIME_DOUBT = 3.0, 1.2
 """Prior deviations of the logarithms of a process's size and correlation time."""
 SHARES = (1.0, 0.03)
 """Sizes from which the most probable process is looked for: what is left beside a law is a part of it."""
-MOST_PASSES = 40
+MOST_PASSES = 30
 
 
 @dataclass(frozen=True, eq=False)

@@ -136,9 +136,9 @@ def test_events_survive_the_files(campaign: Campaign, tmp_path: Path) -> None:
         ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on"\ntime = 1.0', "moment 'pump_on' in"),
         *(('name = "pump_on"', f'name = "{name}"', "means something else in an expression: rename it")
           for name in ("time", "step", "max", "lambda")),
-        ("[[event]]", "[event]", "several of `event`, so write [[event]] for each, not [event]"),
+        ("[[event]]", "[event]", "several of 'event', so write [[event]] for each, not [event]"),
         ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on_until"\ntime = 1.0', "'pump_on_until' in"),
-        ('trial = "pumping"\ntime', "trials = []\ntime", "trials` must have at least one entry"),
+        ('trial = "pumping"\ntime', "trials = []\ntime", "trials: at least one entry is expected, but () came"),
     ],
 )  # fmt: skip
 def test_wrong_events_are_refused_in_one_sentence(tmp_path: Path, old: str, new: str, words: str) -> None:

@@ -11,7 +11,7 @@ from benchmarks.open_rigs.campaigns import drawn, write
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.force import missing_force
@@ -20,6 +20,7 @@ from discrepancy.model_choice import load_model
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.ported import refined, shows_ports
 from discrepancy.report.force_figure import missing_force_figure
+from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch
 
@@ -95,6 +96,9 @@ def test_a_rig_without_a_gap_misses_no_force(tmp_path: Path) -> None:
         response = problem.prediction(number, start, bare)
         data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
     assert missing_force(problem, fit(problem, Candidate(), start)) is None
+    found = investigate(problem.campaign, problem.model.inner)
+    assert found.verdict.kind is VerdictKind.NOTHING_MISSING
+    assert found.missing is None
 
 
 def test_a_finer_trial_has_the_inputs_of_the_coarse_one(tmp_path: Path) -> None:
@@ -113,3 +117,10 @@ def test_a_finer_trial_has_the_inputs_of_the_coarse_one(tmp_path: Path) -> None:
 
 def test_models_that_do_not_tell_how_ports_move_show_no_force() -> None:
     assert not shows_ports(FmuModel)
+
+
+def test_a_verdict_that_is_no_law_at_a_port_shows_no_force(tmp_path: Path) -> None:
+    problem = problem_of(tmp_path, CART)
+    (gain,) = (item for item in library() if item.identifier == "gauge_gain")
+    candidate = Candidate((Term(gain, "x"),))
+    assert missing_force(problem, fit(problem, candidate, problem.start(candidate))) is None
