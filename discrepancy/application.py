@@ -15,10 +15,12 @@ from discrepancy.files.patch import (
     PATCH_NAME,
     PATCHED,
     StoredPatch,
+    fmu_outputs,
     primitive_intervals,
     read_patch,
     store_patch,
 )
+from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.files.verdict import VERDICT_NAME, StoredVerdict, read_verdict
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
@@ -124,7 +126,8 @@ def apply_verdict(
     path = Path(f"{stem}_patched{'.toml' if plain else '.json'}" if out is None else out)
     if path.suffix not in ENDINGS:
         raise FileNotWrittenError(f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out.")
-    if path.exists() and path.resolve() in (Path(choice.file), file.resolve()):
+    made_of = (choice.file, *choice.beneath, choice.path or "", file, file.parent / PATCH_NAME)
+    if path.exists() and path.resolve() in (Path(item).resolve() for item in made_of):
         raise FileNotWrittenError(f"{path} is what the patched model is made of: choose another --out.")
     if path.exists() and not replace:
         raise FileNotWrittenError(f"{path} exists: choose another --out or give --replace.")
@@ -168,8 +171,10 @@ def _found(stored: StoredVerdict, file: Path, member: str | None) -> StoredPatch
             f"{file} gives nothing to apply: {NOTHING.get(verdict.kind, 'it lacks what it names')}."
         )
     intervals = tuple(primitive_intervals(effect.patch) for effect in best.effects)
+    residuals = file.parent / RESIDUALS_NAME
+    channels = fmu_outputs(read_residuals(residuals).channels) if residuals.is_file() else {}
     return StoredPatch(
-        best.effects, intervals, stored.origin, verdict=verdict.kind, parameters=best.parameters
+        best.effects, intervals, stored.origin, channels, verdict.kind, parameters=best.parameters
     )
 
 
@@ -248,9 +253,10 @@ def pack_patched(
 
 
 def _again(command: str, model: Path) -> str:
-    """Return the command of a verdict with another model."""
+    """Return the command of a verdict with another model, and a folder of its own for what it leaves."""
     words = shlex.split(command)
+    source = Path(words[4 if words[3] == "--from-run" else 3]).name
     if "--model" in words:
         at = words.index("--model")
         del words[at : at + 2]
-    return shlex.join([*words, "--model", str(model)])
+    return shlex.join([*words, "--model", str(model), "--out", f"verdicts/{source}_{model.stem}"])

@@ -75,6 +75,8 @@ class ModelChoice:
         As `Origin.model_file`.
     built_in : StoredPatch or None
         The patch that was built into the model of `kind`.
+    beneath : tuple of str
+        As `file`, of what a patched model rests on.
     """
 
     model: Model
@@ -86,6 +88,7 @@ class ModelChoice:
     design_hash: str = ""
     file: str = ""
     built_in: StoredPatch | None = None
+    beneath: tuple[str, ...] = ()
 
 
 def choose_model(name: str | Path | None, progress: Progress | None = None) -> ModelChoice:
@@ -240,6 +243,7 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
         label=path.name,
         source_hash=hash_record({"model": base.source_hash, "patch": hash_file(path)}),
         built_in=stored.upon(base.built_in),
+        beneath=(*base.beneath, base.file),
     )
 
 

@@ -149,7 +149,7 @@ def _write(folder: Path, content: VerdictContent, *, report: bool) -> None:
                 intervals=[primitive_intervals(e.patch, d) for e, d in zip(effects, draws, strict=True)],
             )
             write_patch(
-                folder / PATCH_NAME, effects, origin, draws, fmu_outputs(found.campaign),
+                folder / PATCH_NAME, effects, origin, draws, fmu_outputs(found.campaign.channels),
                 verdict=verdict.kind, sentence=verdict.sentence, parameters=verdict.parameters,
             )  # fmt: skip
         if verdict.kind is VerdictKind.NAMED and content.pack is not None:

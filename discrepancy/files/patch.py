@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema
 
-from discrepancy.campaign.records import Campaign, Quantity
+from discrepancy.campaign.records import Channel, Quantity
 from discrepancy.document_types import PRIMITIVE_UNITS, Number
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.document import Origin, read_document, write_document
@@ -216,7 +216,7 @@ def _fields(effect: NamedEffect) -> dict[str, Any]:
     return {item.name: getattr(effect, item.name) for item in fields(NamedEffect)}
 
 
-def fmu_outputs(campaign: Campaign) -> dict[str, str]:
+def fmu_outputs(channels: Mapping[str, Channel]) -> dict[str, str]:
     """Return the outputs of the wing FMU by the names of the channels that measure them.
 
     Gauges count from 1 in campaigns, in patches and in the FMU alike, so that `strain[k]` of a channel is
@@ -225,8 +225,8 @@ def fmu_outputs(campaign: Campaign) -> dict[str, str]:
 
     Parameters
     ----------
-    campaign : Campaign
-        Whose channels are asked for.
+    channels : mapping of str to Channel
+        By name.
 
     Returns
     -------
@@ -234,7 +234,7 @@ def fmu_outputs(campaign: Campaign) -> dict[str, str]:
         Output by channel, such as "strain[17]" for "g17".
     """
     outputs = {}
-    for name, channel in campaign.channels.items():
+    for name, channel in channels.items():
         strain = channel.quantity is Quantity.STRAIN and _STRAIN.fullmatch(channel.output)
         displacement = channel.quantity is Quantity.DISPLACEMENT and channel.output in _DISPLACEMENTS
         if strain or displacement:

@@ -300,7 +300,7 @@ def test_the_documented_files_print_the_documented_tables(
 ) -> None:
     page = (Path(__file__).parents[2] / "docs" / "laboratory_files.md").read_text("utf-8")
     blocks = re.findall(r"^```\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    loading, release, asked, given, written = blocks[:5]
+    loading, release, asked, given, written, checked = blocks[:6]
     monkeypatch.chdir(tmp_path)
     Path("loading.csv").write_text(loading, "utf-8-sig")
     Path("release.csv").write_bytes(release.encode("latin-1"))
@@ -310,6 +310,9 @@ def test_the_documented_files_print_the_documented_tables(
         said = [row.rstrip() for row in (done.stdout + done.stderr).splitlines() if row.strip()]
         assert [row.rstrip() for row in screen.splitlines() if row.strip()] == said
     assert Path("lab/02_release.csv").read_text("utf-8").startswith(written.rpartition("...")[0])
+    done = command("discrepancy", "check", "lab", "--model", "single_mass_rig")
+    assert done.returncode == 1
+    assert [row for row in done.stdout.splitlines() if row.startswith("Fault: ")] == checked.splitlines()
 
 
 # ---------------------------------------------------------------- a terminal

@@ -409,7 +409,7 @@ def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
         "rate": Channel("rate", Quantity.VELOCITY, "tip_displacement", None),
     }
     campaign = Campaign("chain", channels, (), None, {}, "")
-    outputs = fmu_outputs(campaign)
+    outputs = fmu_outputs(campaign.channels)
     assert outputs == {"g3": "strain[3]", "tip": "tip_displacement"}
     patch = ModelPatch((SensorGain("g3", 0.25),))
     named = NamedEffect("gauge_gain", "Gauge gain", "g3", "gain", (), (), patch)
