@@ -115,6 +115,6 @@ def test_a_lock_without_a_number_is_waited_for(
     os.truncate(path.with_suffix(".lock"), 0)
     monkeypatch.setattr(module, "_PAUSE", 0.001)
     monkeypatch.setattr(module, "_MOST_LOOKS", 15)
-    with pytest.raises(ReductionError, match="^Another process has been making"):
+    with pytest.raises(ReductionError, match=r"^Another process has been making"):
         ours(path)
     assert caplog.messages == [f"Waiting for another process that makes {path}."]
