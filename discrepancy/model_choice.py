@@ -3,7 +3,6 @@
 import atexit
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import cache
 from pathlib import Path
 
 from calibration.errors import CalibrationError
@@ -263,21 +262,15 @@ def _structure(path: Path, progress: Progress | None) -> ModelChoice:
 
 
 def _folder_with(name: str, content: bytes) -> Path:
-    """Return a folder that holds a file: the cache, or a scratch folder where that cannot be written."""
+    """Return a folder that holds a file: the cache or, where that cannot be written, one till the end."""
     try:
         if not (cache_folder() / name).is_file():
             atomic_write_bytes(cache_folder() / name, content)
         return cache_folder()
     except (OSError, FileNotWrittenError):
-        return atomic_write_bytes(_scratch_folder() / name, content).parent
-
-
-@cache
-def _scratch_folder() -> Path:
-    """Return a folder that goes with this process: a model opens its FMU again when it is needed."""
-    folder = plain_folder()
-    atexit.register(remove_folder, folder)
-    return folder
+        folder = plain_folder()
+        atexit.register(remove_folder, folder)  # till then the model opens its FMU again and again
+        return atomic_write_bytes(folder / name, content).parent
 
 
 def _fmu(path: Path) -> ModelChoice:
