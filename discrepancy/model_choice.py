@@ -1,5 +1,6 @@
 """Which model a campaign is compared with: a wing, a structure, a lumped model, an FMU, or one patched."""
 
+import atexit
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -32,8 +33,10 @@ from fe.structure.design import load_structure
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from fmu_asset.archive.design_record import packed_design_hash
 from fmu_asset.errors import FmuError
+from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.structures.build import structure_fmu_bytes
 from fmu_asset.structures.rig import rig_text
+from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes
 from reporting.provenance import hash_file, hash_record
 from reporting.toml_file import parse_toml, read_toml
@@ -252,15 +255,26 @@ def _structure(path: Path, progress: Progress | None) -> ModelChoice:
     try:
         reduced = reduced_structure(path, progress=progress)
         content, content_hash = structure_fmu_bytes(reduced)
-        fmu = cache_folder() / f"structure_{content_hash[:32]}.fmu"
-        text = rig_text(load_structure(path), str(fmu))
-    except (FiniteElementError, FmuError) as cause:
+        name = f"structure_{content_hash[:32]}.fmu"
+        text = rig_text(load_structure(path), name)
+        folder = _folder_with(name, content)
+    except (FiniteElementError, FmuError, FileNotWrittenError) as cause:
         raise ModelError(str(cause)) from cause
-    if not fmu.is_file():
-        atomic_write_bytes(fmu, content)
-    model = FmuModel(parse_fmu_model(parse_toml(text, str(path), ModelError), str(path)))
+    model = FmuModel(parse_fmu_model(parse_toml(text, str(path), ModelError), str(path)), folder)
     source = reduced.design_hash
     return ModelChoice(model, ModelKind.STRUCTURE, path.name, source, path=path, design_hash=source)
+
+
+def _folder_with(name: str, content: bytes) -> Path:
+    """Return a folder that holds a file: the cache or, where that cannot be written, one till the end."""
+    try:
+        if not (cache_folder() / name).is_file():
+            atomic_write_bytes(cache_folder() / name, content)
+        return cache_folder()
+    except (OSError, FileNotWrittenError):
+        folder = plain_folder()
+        atexit.register(remove_folder, folder)  # till then the model opens its FMU again and again
+        return atomic_write_bytes(folder / name, content).parent
 
 
 def _fmu(path: Path) -> ModelChoice:

@@ -104,8 +104,9 @@ class Problem:
                 self.shared = global_unknowns(campaign, model, chosen, ratios)
 
     def refused(self, candidate: Candidate, cause: DiscrepancyError) -> None:
-        """Keep why a candidate could not be evaluated or fitted, by the identifiers of its effects."""
-        self.refusals |= {term.effect.identifier: str(cause) for term in candidate.terms}
+        """Keep why an effect could not be evaluated or fitted alone; of several, any may be to blame."""
+        if len(candidate.terms) == 1:
+            self.refusals[candidate.terms[0].effect.identifier] = str(cause)
 
     def _unit_responses(self) -> dict[str, float]:
         """Estimate data over model for signals of unknown scale."""

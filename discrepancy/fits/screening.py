@@ -251,11 +251,17 @@ class Screen:
         Without `fine`, signed magnitudes are tried at one size only, enough for what is linear in them,
         unless they ask for levels of their own.
         """
+        followed, refusal = False, None
         for start in grid(term, self._peaks(term), fine=fine):
             try:
-                yield self.change(term, start)
+                change = self.change(term, start)
             except DiscrepancyError as cause:  # such as a spring softer than what is taken from it
-                self.problem.refused(Candidate((term,)), cause)
+                refusal = cause
+            else:
+                followed = True
+                yield change
+        if refusal is not None and not followed:
+            self.problem.refused(self.fit.candidate.plus(term), refusal)
 
 
 def _channels_of(patch: ModelPatch) -> frozenset[str]:

@@ -5,6 +5,7 @@ is compared with the noise (can it be seen?) and with what every other effect ca
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf, sqrt
 
@@ -265,7 +266,8 @@ def _distance(screen: Screen, target: Change, options: list[Change]) -> float:
     for number in range(len(nearest.start)):
         moved = nearest.start.copy()
         moved[number] += 10.0 * PARAMETER_STEP
-        columns.append(screen.change(nearest.term, moved).vector - nearest.vector)
+        with suppress(DiscrepancyError):  # the nearest point may be the last that the model can follow
+            columns.append(screen.change(nearest.term, moved).vector - nearest.vector)
     span = np.stack(columns)
     gram = (span * sign) @ span.T
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))

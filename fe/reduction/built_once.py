@@ -96,16 +96,18 @@ def _take(handle: int, what: Path) -> None:
     for look in range(_MOST_LOOKS):
         with suppress(BlockingIOError):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.truncate(handle, 0)
-            os.pwrite(handle, str(os.getpid()).encode(), 0)
+            with suppress(OSError):  # such as a full disk: the number only informs those who wait
+                os.truncate(handle, 0)
+                os.pwrite(handle, str(os.getpid()).encode(), 0)
             if look > _SILENT_LOOKS and not what.exists():
                 _logger.warning("The other process has ended without leaving %s; it is made here.", what)
             return
         if look == _SILENT_LOOKS:
-            holder = os.pread(handle, 20, 0).decode()
-            _logger.warning("Waiting for another process (number %s) that makes %s.", holder, what)
+            number = os.pread(handle, 20, 0).decode()
+            holder = f"another process (number {number})" if number else "another process"
+            _logger.warning("Waiting for %s that makes %s.", holder, what)
         time.sleep(_PAUSE)
     raise ReductionError(
-        f"Another process (number {holder}) has been making {what} for more than "
+        f"{holder.capitalize()} has been making {what} for more than "
         f"{_MOST_LOOKS * _PAUSE / 60:.0f} minutes. Start again to wait on; if it hangs, end it first."
     )

@@ -6,6 +6,7 @@ The method and what it reaches are in `docs/reduced_model.md`.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from math import ceil
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -306,15 +307,14 @@ def greedy(
 
         def extend(self, mu: State) -> None:
             """Add the full solutions at the worst state, and at others of large bounds away from it."""
-            first = static.batch == 1 or not static.basis.size
-            chosen = (
-                [mu] if first else _spread(self.asked, self.bounds, static.batch, SEARCH_MARGIN * tolerance)
-            )
+            count = min(static.batch, most_snapshots - len(static.snapshots))
+            alone = count == 1 or not static.basis.size
+            chosen = [mu] if alone else _spread(self.asked, self.bounds, count, SEARCH_MARGIN * tolerance)
             static.add_snapshots(chosen)
             self.rounds += 1
             static.advance(len(chosen), f"full solution {len(static.snapshots)}")
 
-    surrogate, most_rounds = Surrogate(), 1 + (most_snapshots - 1) // static.batch
+    surrogate, most_rounds = Surrogate(), 1 + ceil((most_snapshots - 1) / static.batch)
     result = weak_greedy(surrogate, states, atol=SEARCH_MARGIN * tolerance, max_extensions=most_rounds)
     bounds = [float(value) for value in result["max_errs"][1:]]
     if len(bounds) < surrogate.rounds or bounds[-1] > SEARCH_MARGIN * tolerance:  # not all were looked at

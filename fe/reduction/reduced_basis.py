@@ -12,6 +12,7 @@ from fe.full.affine import AffineSystem, affine_sum
 from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
+from reporting.words import counted
 
 from .certified_basis import AffineProblem, StaticReduction, greedy
 from .compression import WING_JUDGEMENT, compressed, fewest_directions
@@ -129,8 +130,8 @@ def reduce_model(
     model = _model(static, system, settings, modal)
     if history[-1] > settings.bound_tolerance:
         raise ReductionError(
-            f"After {len(static.snapshots)} full solutions the strain error bound is {history[-1]:.2g} of "
-            f"the largest strain, but {settings.bound_tolerance:.2g} was asked for; "
+            f"After {counted(len(static.snapshots), 'full solution')} the strain error bound is "
+            f"{history[-1]:.2g} of the largest strain, but {settings.bound_tolerance:.2g} was asked for; "
             "allow more snapshots or a looser tolerance."
         )
     directions = fewest_directions(model, WING_JUDGEMENT, states, settings.bound_tolerance)

@@ -18,6 +18,7 @@ from fe.runtime.errors import ReductionError
 from fe.runtime.structure_model import StructureModel
 from fe.structure.affine import AffineStructure
 from fe.structure.design import ReductionLimits, StructureDesign
+from reporting.words import counted
 
 from .certified_basis import AffineProblem, Judgement, State, StaticReduction, greedy
 from .compression import compressed, fewest_directions
@@ -275,10 +276,10 @@ def reduce_structure(
         )
     if history[-1] > settings.bound_tolerance:
         raise ReductionError(
-            f"After {len(static.snapshots)} full solutions the error bound of {name} is {history[-1]:.2g} of "
-            f"the largest output, but {settings.bound_tolerance:.2g} was asked for; raise "
-            f"most_solutions (now {settings.most_snapshots}) or tolerance in the table [reduction] of the "
-            "structure file, or narrow the ranges of parameters and losses."
+            f"After {counted(len(static.snapshots), 'full solution')} the error bound of {name} is "
+            f"{history[-1]:.2g} of the largest output, but {settings.bound_tolerance:.2g} was asked for; "
+            f"raise most_solutions (now {settings.most_snapshots}) or tolerance in the table [reduction] of "
+            "the structure file, or narrow the ranges of parameters and losses."
         )
     model = _model(static, terms, name, modes, settings.modal.mode_count)
     directions = fewest_directions(model, judgement, states, settings.bound_tolerance)

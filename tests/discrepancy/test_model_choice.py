@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -43,3 +47,24 @@ def test_models_that_cannot_be_used(name: str, message: str, tmp_path: Path) -> 
     (tmp_path / "design.toml").write_text("name = 'half a wing'\n", encoding="utf-8")
     with pytest.raises(ModelError, match=message):
         choose_model(tmp_path / name if "." in name else name)
+
+
+def test_a_structure_needs_no_cache(write_beam: Callable[..., Path], tmp_path: Path) -> None:
+    """Where nothing can be kept its FMU lies in a scratch folder, for as long as the process lives."""
+    (tmp_path / "no_folder").write_text("", encoding="utf-8")
+    (tmp_path / "scratch").mkdir()
+    file = write_beam(tmp_path, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
+    program = (
+        "import sys; from discrepancy.model_choice import choose_model; "
+        "runs = choose_model(sys.argv[1]).model.runs; "
+        "print(runs._path.is_file(), runs._path.parents[2])"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", program, str(file)],
+        env=os.environ | {"XDG_CACHE_HOME": str(tmp_path / "no_folder"), "TMPDIR": str(tmp_path / "scratch")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.stdout.split() == ["True", str(tmp_path / "scratch")], found.stderr
+    assert not list((tmp_path / "scratch").iterdir())

@@ -17,6 +17,7 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.cholesky import Cholesky
 from discrepancy.fits.fitting import attempt, fit
 from discrepancy.fits.problem import Problem
+from discrepancy.fits.screening import Screen
 from discrepancy.search.growing_records import Beginnings
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
@@ -86,6 +87,22 @@ def test_a_fit_ends_with_finite_numbers_or_a_sentence(
         return
     assert np.isfinite(found.log_evidence)
     assert np.all(np.isfinite(found.covariance))
+
+
+@pytest.mark.parametrize(("coefficient", "kept"), [(-1e-7, 1), (-1e-5, 0)])
+def test_what_can_be_carried_at_any_size_is_no_refusal(
+    problem: Problem, coefficient: float, kept: int
+) -> None:
+    """An effect that the structure carries while it is small has only been outdone by others."""
+    effect = softening(coefficient, 0.3)
+    candidate = Candidate((Term(effect, effect.places(problem.setting)[0]),))
+    none = fit(problem, Candidate(), problem.start(Candidate()))
+    problem.refusals.clear()
+    assert len(list(Screen(problem, none).changes(candidate.terms[0]))) == kept
+    assert len(problem.refusals) == 1 - kept
+    problem.refusals.clear()
+    problem.refused(candidate.plus(candidate.terms[0]), FitError("Of two, either may be to blame."))
+    assert not problem.refusals
 
 
 def test_nothing_is_sought_beside_a_base_that_the_beginnings_cannot_follow(problem: Problem) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 import threading
@@ -96,3 +98,23 @@ def test_a_wait_has_an_end(path: Path, other: Start, monkeypatch: pytest.MonkeyP
         ours(path)
     assert not path.exists()
     assert process.poll() is None
+
+
+def test_a_full_disk_stops_no_build(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(handle: int, content: bytes, at: int) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", full)
+    assert ours(path) == "ours"
+
+
+def test_a_lock_without_a_number_is_waited_for(
+    path: Path, other: Start, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    other(60.0)
+    os.truncate(path.with_suffix(".lock"), 0)
+    monkeypatch.setattr(module, "_PAUSE", 0.001)
+    monkeypatch.setattr(module, "_MOST_LOOKS", 15)
+    with pytest.raises(ReductionError, match=r"^Another process has been making"):
+        ours(path)
+    assert caplog.messages == [f"Waiting for another process that makes {path}."]

@@ -79,12 +79,15 @@ def test_the_file_says_how_well_and_the_structure_stays_the_same(plate_file: Pat
     assert structure_hash(load_structure(other), mesh) == structure_hash(design, mesh)
 
 
-def test_a_bound_that_is_not_reached_names_the_keys(write_beam: Callable[..., Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("most", "taken"), [(1, "1 full solution"), (4, "4 full solutions")])
+def test_a_bound_that_is_not_reached_names_the_keys(
+    most: int, taken: str, write_beam: Callable[..., Path], tmp_path: Path
+) -> None:
+    """All solutions that are allowed are taken, though they come several at once."""
     file = write_beam(tmp_path, cells=2)
     file.write_text(
-        file.read_text(encoding="utf-8") + "\n[reduction]\nmost_solutions = 2\n", encoding="utf-8"
+        file.read_text(encoding="utf-8") + f"\n[reduction]\nmost_solutions = {most}\n", encoding="utf-8"
     )
-    with pytest.raises(
-        ReductionError, match=r"After 1 full solutions .* raise most_solutions \(now 2\) or tolerance .*\[red"
-    ):
+    words = rf"After {taken} the .* raise most_solutions \(now {most}\) or tolerance .*\[red"
+    with pytest.raises(ReductionError, match=words):
         reduced_structure(file)
