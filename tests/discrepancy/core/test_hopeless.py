@@ -18,6 +18,7 @@ from discrepancy.fits.cholesky import Cholesky
 from discrepancy.fits.fitting import attempt, fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
+from discrepancy.judgement.separability import _distance
 from discrepancy.search.growing_records import Beginnings
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
@@ -103,6 +104,17 @@ def test_what_can_be_carried_at_any_size_is_no_refusal(
     problem.refusals.clear()
     problem.refused(candidate.plus(candidate.terms[0]), FitError("Of two, either may be to blame."))
     assert not problem.refusals
+
+
+def test_the_last_point_that_a_model_can_follow_is_compared_all_the_same(problem: Problem) -> None:
+    effect = softening(-4.5e-8, 0.3)
+    term = Term(effect, effect.places(problem.setting)[0])
+    screen = Screen(problem, fit(problem, Candidate(), problem.start(Candidate())))
+    last = screen.change(term, np.array([1.0]))
+    with pytest.raises(DiscrepancyError):
+        screen.change(term, np.array([1.1]))
+    assert last.size > 0.0
+    assert _distance(screen, last, [last]) == pytest.approx(0.0, abs=1e-5 * last.size)
 
 
 def test_nothing_is_sought_beside_a_base_that_the_beginnings_cannot_follow(problem: Problem) -> None:
