@@ -203,9 +203,9 @@ def test_histories_of_an_array_of_another_size(
         assert asset.step({"u": [0.0, 0.0, 1.0]}).values.tolist() == [1.0, 4.0, 12.0]
         asset.renew(control={"u": [1.0, 0.0, 0.0]})
         assert asset.step().values.tolist() == [1.0, 0.0, 0.0]
-    with closing(FmiAsset(fmu, bound, isolated=False)) as asset:
-        with pytest.raises(FmuFileError, match="3 elements but 2 start values"):
-            asset.step()
+    other = FmiAsset(fmu, bound, isolated=False)
+    with closing(other), pytest.raises(FmuFileError, match="3 elements but 2 start values"):
+        other.step()
 
 
 def test_structural_parameters_of_a_binding(foreign_fmu: Any) -> None:

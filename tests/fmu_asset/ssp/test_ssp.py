@@ -567,6 +567,16 @@ def test_fmus_of_other_versions_are_joined(foreign_fmu: Any, tmp_path: Path) -> 
         Wiring(replace(wiring.structure, connections=(array,)))
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("u", "it is an array"), ("ticked", "it changes with a clock"), ("blob", "it is of the type Binary")],
+)
+def test_what_is_no_single_number_is_not_set(foreign_fmu: Any, name: str, words: str) -> None:
+    wrong = Component("a", foreign_fmu("array3"), {name: Setting(1.0)})
+    with pytest.raises(CouplingError, match=rf"a\.{name} cannot be set: {words}; only single numbers"):
+        Wiring(SystemStructure("one", (wrong,)))
+
+
 def test_start_values_of_outputs_are_set(foreign_fmu: Any) -> None:
     """SSP 1.0, 5.2.3: what a parameter binding can set is everything that starts with a given value."""
     ball = Component("ball", foreign_fmu("ball2"), {"h": Setting(3.0), "v": Setting(-1.0)})
