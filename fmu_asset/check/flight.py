@@ -185,9 +185,8 @@ class Flights:
 
     def _step_size(self) -> Iterator[Finding]:
         header = self._binding.binding
-        with closing(
-            self._asset(step_size=header.step_size / 2.0, decimation=2 * header.decimation)
-        ) as asset:
+        asset = self._asset(step_size=header.step_size / 2.0, decimation=2 * header.decimation)
+        with closing(asset):
             try:
                 halved = self._fly(asset)
             except FmuCallError as error:
@@ -270,10 +269,8 @@ class Flights:
         """Make, step and free instances in one process, and look at its memory."""
         done = 0
         try:
-            with (
-                closing(self._asset()) as asset,
-                progress.stage("Making instances", cycles, "instances") as stage,
-            ):
+            asset = self._asset()
+            with closing(asset), progress.stage("Making instances", cycles, "instances") as stage:
                 asset.reset(**self._base)
                 half = 0
                 for done in range(cycles):

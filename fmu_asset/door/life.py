@@ -2,7 +2,7 @@
 
 import os
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NoReturn, Self
 
 import numpy as np
@@ -195,7 +195,7 @@ class OpenedFmu(SteppedAsset):
         if parameters is not None:
             self._settings = self._exchange.settings(parameters)
             self._parameters = plain_values(parameters)
-        self._start_anew((control, health, load, port))
+        self._start_anew(control, health, load, port)
 
     def renew(self, **inputs: Values | None) -> None:
         """Free the FMU's instance, make another one in the same process, and go back to the start.
@@ -218,7 +218,7 @@ class OpenedFmu(SteppedAsset):
             self._housing.renew()
         except FmuError as error:
             self._fail(error, "making a new instance")
-        self._start_anew([inputs.get(role) for role in (*INPUT_ROLES, "port")], renewed=True)
+        self._start_anew(**inputs, renewed=True)
 
     def sibling(self, parameters: Values | None = None) -> Self:
         """Return a new asset of the same FMU, binding and limits, without extracting the FMU again.
@@ -246,9 +246,18 @@ class OpenedFmu(SteppedAsset):
 
     # ------------------------------------------------------------------ inside
 
-    def _start_anew(self, inputs: Sequence[Values | None], *, renewed: bool = False) -> None:
-        start = self._exchange.start_values(*inputs)
-        self._begin(start, with_inputs=self._exchange.place(start, *inputs), renewed=renewed)
+    def _start_anew(
+        self,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
+        *,
+        renewed: bool = False,
+    ) -> None:
+        start = self._exchange.start_values(control, health, load, port)
+        given = self._exchange.place(start, control, health, load, port)
+        self._begin(start, with_inputs=given, renewed=renewed)
 
     def _begin(self, request: list[float], *, with_inputs: bool, renewed: bool = False) -> None:
         if self._lines:
@@ -281,7 +290,7 @@ class OpenedFmu(SteppedAsset):
     def _opened(self, *given: Mapping[str, Any] | None) -> Instance:
         """Return the instance, which is opened by its first use but never started again unasked.
 
-        Where a step gives a whole array, start values of another number do not stand against it.
+        Where a step gives a whole array that was resized, its start values need not fit.
         """
         if self._phase == "ready" and self._housing.instance is not None:
             return self._housing.instance
@@ -290,8 +299,8 @@ class OpenedFmu(SteppedAsset):
         if self._phase == "closed":
             raise FmuStateError("The asset is closed; reset it to start anew.")
         if self._phase == "new":
-            # A line would begin at a start value that there is not.
-            known = () if self._lines else given
+            # Without them: what keeps its start values, and lines, which begin at them.
+            known = given if self._binding.binding.structural_parameters and not self._lines else ()
             self._begin(self._exchange.start_values(*known), with_inputs=False)
         instance = self._housing.instance
         assert instance is not None
