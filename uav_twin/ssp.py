@@ -1,6 +1,5 @@
 """`uav-twin ssp ...`."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -108,7 +107,7 @@ def simulate(
     from fmu_asset.coupling.asset import CoupledAsset
     from fmu_asset.coupling.experiment import fly_system, system_experiment
     from fmu_asset.door.history_file import write_history
-    from fmu_asset.ssp.check import join_ssp
+    from fmu_asset.ssp.check import join_ssp, left_out_sentence
     from fmu_asset.ssp.reader import read_ssp
     from reporting.provenance import hash_file
 
@@ -117,7 +116,7 @@ def simulate(
     with tempfile.TemporaryDirectory() as folder:
         system = read_ssp(file, folder)
         wiring = join_ssp(system, delay or ())
-        _say_unused(wiring.left_out)
+        _warn(left_out_sentence(wiring, file))
         span = (system.span[0], system.span[1] if stop_time is None else stop_time)
         planned = system_experiment(wiring, span=span, step_size=step_size, values=given)
         with CoupledAsset(
@@ -136,11 +135,9 @@ def simulate(
     say(asset, history, file, [out, plot])
 
 
-def _say_unused(names: Sequence[str]) -> None:
-    from fmu_asset.coupling.structure import listed
-
-    if names:
-        terminal.say(f"warning: nothing in the system has these parameters, not used: {listed(names)}.")
+def _warn(sentence: str) -> None:
+    if sentence:
+        terminal.say(f"warning: {sentence}")
 
 
 def _single_numbers(texts: list[str]) -> dict[str, float]:
@@ -170,7 +167,7 @@ def check(
     for problem in result.problems:
         typer.secho(f"problem: {problem}", fg="red", err=True)
     if not json:
-        _say_unused(result.unused)
+        _warn(result.left_out)
     for loop in () if json else result.loops:
         terminal.say(
             f"warning: {loop} `uav-twin ssp simulate` does so by --delay, --iterations, --algorithm jacobi."

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ class Flights:
     def __init__(self, description: FmuDescription, binding: Binding, limits: Mapping[str, float]) -> None:
         self._description, self._binding, self._limits = description, binding, dict(limits)
         # Whether it fits is found here, before anything is started.
-        self._asset()
+        self._description = self._asset().description
         self._base = self._base_inputs()
 
     def checks(self, cycles: int, progress: Progress) -> Iterator[Finding]:
@@ -103,13 +104,16 @@ class Flights:
         )
 
     def _base_inputs(self) -> Inputs:
-        """Return the start values of the inputs in the binding's units."""
+        """Return the start values of the inputs in the binding's units; zeros where a new size took them."""
+        resized = bool(self._binding.binding.structural_parameters)
         base: Inputs = {role: {} for role in INPUT_ROLES}
         for role in INPUT_ROLES:
             for name, item in getattr(self._binding, role).items():
                 place = find(self._description, item.variable, f"{role}.{name}", "input")
                 scale = conversion(item.unit, place.variable, self._description.units, where=f"{role}.{name}")
-                values = start_values(self._description, place.variable)
+                count = len((place.variable.start or "0").split())
+                lost = resized and count not in (1, place.variable.size)
+                values = start_values(self._description, place.variable, given=lost)
                 chosen = values if place.element is None else [values[place.element]]
                 given = [scale.from_fmu(value) for value in chosen]
                 base[role][name] = given if place.variable.shape and place.element is None else given[0]
@@ -141,13 +145,13 @@ class Flights:
             )
 
     def _state(self) -> Iterator[Finding]:
-        with self._asset() as asset:
+        with closing(self._asset()) as asset:
             asset.reset(**self._base)
             for _ in range(2):
                 asset.step(**self._base)
             saved, method = asset.save_state(), asset.state_method
             expected = np.array([_row(asset, self._base) for _ in range(_STEPS - 2)])
-        with self._asset() as other:
+        with closing(self._asset()) as other:
             try:
                 other.restore_state(saved)
                 found = np.array([_row(other, self._base) for _ in range(_STEPS - 2)])
@@ -181,7 +185,8 @@ class Flights:
 
     def _step_size(self) -> Iterator[Finding]:
         header = self._binding.binding
-        with self._asset(step_size=header.step_size / 2.0, decimation=2 * header.decimation) as asset:
+        asset = self._asset(step_size=header.step_size / 2.0, decimation=2 * header.decimation)
+        with closing(asset):
             try:
                 halved = self._fly(asset)
             except FmuCallError as error:
@@ -218,7 +223,7 @@ class Flights:
     def _edges(self) -> Iterator[Finding]:
         """Fly one step at the ends of each range."""
         tried, refused = 0, []
-        with self._asset() as asset:
+        with closing(self._asset()) as asset:
             for role in INPUT_ROLES:
                 for name, item in getattr(self._binding, role).items():
                     for value in self._ends(asset, role, name):
@@ -248,7 +253,7 @@ class Flights:
         return [end for end in (low, high) if math.isfinite(end) and abs(end) < 1e9]
 
     def _reset(self) -> Iterator[Finding]:
-        with self._asset() as asset:
+        with closing(self._asset()) as asset:
             first, second = self._fly(asset), self._fly(asset)
             trial = asset.reset_trial
         if not np.array_equal(first, second):
@@ -264,13 +269,14 @@ class Flights:
         """Make, step and free instances in one process, and look at its memory."""
         done = 0
         try:
-            with self._asset() as asset, progress.stage("Making instances", cycles, "instances") as stage:
+            asset = self._asset()
+            with closing(asset), progress.stage("Making instances", cycles, "instances") as stage:
                 asset.reset(**self._base)
                 half = 0
                 for done in range(cycles):
                     if done == cycles // 2:
                         half = asset.worker_memory or 0
-                    asset.renew()
+                    asset.renew(**self._base)
                     asset.step(**self._base)
                     stage.advance()
                 end = asset.worker_memory or 0

@@ -286,6 +286,10 @@ class Wiring:
         variable = self.variable(end)
         if variable.causality not in ("parameter", "input") and not variable.startable:
             raise CouplingError(f"{end} cannot be set: it is declared as {variable.causality}.")
+        if not variable.single:
+            text = f"is of the type {variable.kind}"
+            what = "is an array" if variable.shape else "changes with a clock" if variable.clocked else text
+            raise CouplingError(f"{end} cannot be set: it {what}; only single numbers are set in a system.")
         value = setting.value
         if isinstance(value, str):
             items: Mapping[str, int] = self.declared[end.component].items.get(end.variable, {})
@@ -308,7 +312,6 @@ class Wiring:
             (isinstance(value, bool) and variable.kind != "Boolean")
             or (not isinstance(value, bool) and variable.kind == "Boolean" and value not in (0, 1))
             or (variable.base_type in ("Integer", "Enumeration") and not number.is_integer())
-            or not variable.single
             or not math.isfinite(number)
         )
         if wrong:

@@ -243,7 +243,7 @@ class Exchange:
             )
         whole = variable.kind not in FLOAT_KINDS
         return Slot(
-            position=positions[0],
+            position=positions[0] if positions else 0,
             positions=positions,
             low=max(low, own_low),
             high=min(high, own_high),

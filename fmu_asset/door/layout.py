@@ -167,6 +167,8 @@ class BlockLayout:
 
     def positions(self, place: Place) -> range:
         """Return where the values of a place stand."""
+        if not place.size:
+            return range(0)
         first = self._positions[place.variable.name] + (place.element or 0)
         return range(first, first + place.size)
 

@@ -2,6 +2,7 @@
 
 import os
 from collections import deque
+from collections.abc import Mapping
 from typing import Any, NoReturn, Self
 
 import numpy as np
@@ -194,17 +195,22 @@ class OpenedFmu(SteppedAsset):
         if parameters is not None:
             self._settings = self._exchange.settings(parameters)
             self._parameters = plain_values(parameters)
-        start = self._exchange.start_values(control, health, load, port)
-        given = self._exchange.place(start, control, health, load, port)
-        self._begin(start, with_inputs=given)
+        self._start_anew(control, health, load, port)
 
-    def renew(self) -> None:
+    def renew(self, **inputs: Values | None) -> None:
         """Free the FMU's instance, make another one in the same process, and go back to the start.
 
         `reset` uses the FMU's own reset; this is what a batch of runs without it costs.
 
+        Parameters
+        ----------
+        **inputs : mapping of str to float, optional
+            `control`, `health`, `load` and `port`, as those of `reset`.
+
         Raises
         ------
+        FmuInputError, BindingError
+            If an input does not fit.
         FmuError
             If the FMU fails.
         """
@@ -212,7 +218,7 @@ class OpenedFmu(SteppedAsset):
             self._housing.renew()
         except FmuError as error:
             self._fail(error, "making a new instance")
-        self._begin(self._exchange.start_values(), with_inputs=False, renewed=True)
+        self._start_anew(**inputs, renewed=True)
 
     def sibling(self, parameters: Values | None = None) -> Self:
         """Return a new asset of the same FMU, binding and limits, without extracting the FMU again.
@@ -239,6 +245,19 @@ class OpenedFmu(SteppedAsset):
         return other
 
     # ------------------------------------------------------------------ inside
+
+    def _start_anew(
+        self,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
+        *,
+        renewed: bool = False,
+    ) -> None:
+        start = self._exchange.start_values(control, health, load, port)
+        given = self._exchange.place(start, control, health, load, port)
+        self._begin(start, with_inputs=given, renewed=renewed)
 
     def _begin(self, request: list[float], *, with_inputs: bool, renewed: bool = False) -> None:
         if self._lines:
@@ -268,8 +287,11 @@ class OpenedFmu(SteppedAsset):
             self._request.cast("B")[:] = request
         return other
 
-    def _opened(self) -> Instance:
-        """Return the instance, which is opened by its first use but never started again unasked."""
+    def _opened(self, *given: Mapping[str, Any] | None) -> Instance:
+        """Return the instance, which is opened by its first use but never started again unasked.
+
+        Where a step gives a whole array that was resized, its start values need not fit.
+        """
         if self._phase == "ready" and self._housing.instance is not None:
             return self._housing.instance
         if self._phase == "broken":
@@ -277,7 +299,9 @@ class OpenedFmu(SteppedAsset):
         if self._phase == "closed":
             raise FmuStateError("The asset is closed; reset it to start anew.")
         if self._phase == "new":
-            self.reset()
+            # Without them: what keeps its start values, and lines, which begin at them.
+            known = given if self._binding.binding.structural_parameters and not self._lines else ()
+            self._begin(self._exchange.start_values(*known), with_inputs=False)
         instance = self._housing.instance
         assert instance is not None
         return instance

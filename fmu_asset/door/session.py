@@ -80,7 +80,7 @@ class FmiAsset(OpenedFmu):
         FmuWorkerError, FmuTimeoutError
             If the worker died or took too long.
         """
-        instance = self._opened()
+        instance = self._opened(control, health, load, port)
         request = self._request
         before = request.tobytes()
         begin = self._start_time + self._index * self._interval
@@ -118,7 +118,7 @@ class FmiAsset(OpenedFmu):
         FmuInputError, BindingError
             As `step`.
         """
-        self._opened()
+        self._opened(control, health, load, port)
         before = self._request.tobytes()
         try:
             self._exchange.place(self._request, control, health, load, port)
@@ -160,7 +160,7 @@ class FmiAsset(OpenedFmu):
             As `step`; the message says at which step. A worker that dies or takes too long reports every 20
             ms: the step named may be a little early.
         """
-        self._opened()
+        self._opened(control, health, load, port)
         roles = {"control": control, "health": health, "load": load, "port": port}
         rows = request_rows(self._exchange, np.array(self._request), roles, steps)
         index = np.arange(self._index, self._index + len(rows) + 1)
@@ -309,7 +309,9 @@ class FmiAsset(OpenedFmu):
         if replayed or not (ready and same):
             self._settings = self._exchange.settings(saved.parameters)
             self._parameters = plain_values(saved.parameters)
-            held = np.frombuffer(saved.start_inputs).tolist()
+            # Arrays that were resized may have no start values: zeros keep their place, and are not sent.
+            empty = bytes(width) if self._binding.binding.structural_parameters else b""
+            held = np.frombuffer(saved.start_inputs or empty).tolist()
             start = [0.0, 0.0, *held] if held else self._exchange.start_values()
             self._begin(start, with_inputs=bool(saved.start_inputs))
         instance = self._housing.instance

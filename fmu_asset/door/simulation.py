@@ -109,7 +109,7 @@ def request_rows(
     if count is not None and (count := operator.index(count)) < 1:
         raise FmuInputError(f"steps must be at least 1, but is {count}.")
     for slot, array in arrays:
-        if array.ndim > (len(slot.positions) > 1):
+        if array.ndim > (len(slot.positions) != 1):
             if count is None:
                 count, source = len(array), slot.label
             elif len(array) != count:
@@ -132,7 +132,7 @@ def _numbers(slot: Slot, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     count = len(slot.positions)
     if count == 1 and array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]
-    if array.ndim > 1 + (count > 1) or (count > 1 and (array.ndim == 0 or array.shape[-1] != count)):
+    if array.ndim > 1 + (count != 1) or (count != 1 and (array.ndim == 0 or array.shape[-1] != count)):
         wanted = (
             "a number, or one for each step" if count == 1 else f"{count} values, or as many for each step"
         )
@@ -142,7 +142,7 @@ def _numbers(slot: Slot, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 def _fill(rows: npt.NDArray[np.float64], slot: Slot, array: npt.NDArray[np.float64]) -> None:
     """Put a history into its columns; what is not plainly in range is looked at one by one, as in a step."""
-    per_step = array.ndim > (len(slot.positions) > 1)
+    per_step = array.ndim > (len(slot.positions) != 1)
     values = array if per_step else array[np.newaxis]
     values = values.reshape(len(values), len(slot.positions))
     with np.errstate(all="ignore"):

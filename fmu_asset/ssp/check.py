@@ -1,5 +1,6 @@
 """An SSP file against its own FMUs: joined, and tried for one step."""
 
+import difflib
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ from pathlib import Path
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.experiment import every_output
 from fmu_asset.coupling.schedule import loop_sentence
+from fmu_asset.coupling.structure import listed
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import Binding, Header, Vector
 from fmu_asset.door.units import IDENTITY, between
@@ -42,6 +44,8 @@ class SspCheck:
         Algebraic loops; a system with one is sound, but `ssp simulate` needs to be told how to break it.
     unused : tuple of str
         Parameters that the file sets and nothing takes, which SSP allows.
+    left_out : str
+        A sentence on them, with the nearest names of the system; empty if there are none.
     """
 
     path: Path
@@ -51,6 +55,7 @@ class SspCheck:
     parameters: int = 0
     loops: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
+    left_out: str = ""
 
     @property
     def passed(self) -> bool:
@@ -98,6 +103,25 @@ def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
     return wiring
 
 
+def left_out_sentence(wiring: Wiring, file: Path) -> str:
+    """Return what of a file's parameters goes nowhere, with the nearest names; empty if all are used."""
+    if not wiring.left_out:
+        return ""
+    known = [*wiring.inward]
+    for component, declared in wiring.declared.items():
+        settable = (v for v in declared.variables.values() if v.causality in ("parameter", "input"))
+        known += [f"{component}.{variable.name}" for variable in settable]
+    names = list(wiring.left_out)
+    for index, name in enumerate(names[:12]):  # more are not listed
+        owner = max((f"{c}." for c in wiring.declared if name.startswith(f"{c}.")), key=len, default="")
+        own = [item.removeprefix(owner) for item in known if item.startswith(owner)]
+        for near in difflib.get_close_matches(name.removeprefix(owner), own, 1, 0.6):
+            right = owner + near
+            hint = "its set lacks the value" if right == name else f"did you mean {right!r}?"
+            names[index] = f"{name} ({hint})"
+    return f"{file} sets parameters that nothing takes: {listed(names)}; correct or remove them."
+
+
 def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
     """Check an SSP file: archive, schemas, connections against the FMUs, and one step of 1 s in workers.
 
@@ -122,6 +146,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
             parameters=sum(len(component.settings) for component in wiring.structure.components),
             loops=(loop_sentence(plan.loops),) if plan.loops else (),
             unused=tuple(wiring.left_out),
+            left_out=left_out_sentence(wiring, file),
         )
     except FmuError as error:
         return SspCheck(file, (str(error),))

@@ -45,8 +45,10 @@ def read_bindings(element: Any, package: SspPackage, where: str) -> dict[str, Se
         If a set or mapping is missing, not valid, or uses what is not supported.
     """
     found: dict[str, Setting] = {}
+    before = len(package.unused)
     for item in element.findall("ssd:ParameterBindings/ssd:ParameterBinding", NAMESPACES):
         found |= _read_binding(item, package, where)
+    package.unused[before:] = [name for name in package.unused[before:] if name not in found]
     return found
 
 

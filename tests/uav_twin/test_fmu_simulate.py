@@ -166,6 +166,48 @@ def test_structural_parameters_size_the_arrays(
         assert "Traceback" not in error
 
 
+SIZED = """
+binding = { name = "sized", step_size = 1.0, structural_parameters = { n = 3 } }
+control.u = { variable = "u", unit = "1" }
+observation.y = { variables = "y", unit = "1" }
+"""
+
+
+def test_an_array_may_be_empty(
+    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, fmu = tmp_path / "x.csv", foreign_fmu("resize3")
+    wanted = ("--stop-time", 2, "--step-size", 1, "--set", "n=0", "--in-process", "--out", out)
+    assert flown(monkeypatch, fmu, *wanted) == 0
+    assert out.read_text(encoding="utf-8").splitlines() == ["time,total", "0.0,0.0", "1.0,0.0", "2.0,0.0"]
+    bound, given = tmp_path / "empty.toml", tmp_path / "u.csv"
+    bound.write_text(SIZED.replace("n = 3", "n = 0"), encoding="utf-8")
+    given.write_text("time,u\n0,1\n1,1\n", encoding="utf-8")
+    assert flown(monkeypatch, fmu, "--binding", bound, "--inputs", given, "--in-process") == 1
+    assert "control.u must be 0 values" in capsys.readouterr().err
+
+
+def test_histories_of_an_array_of_another_size(
+    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Weights 1, 2, 3; the two start values of the FMU are no longer of use. A state holds them, too."""
+    bound, given, out = tmp_path / "b.toml", tmp_path / "u.csv", tmp_path / "x.csv"
+    bound.write_text(SIZED, encoding="utf-8")
+    given.write_text("time,u[1],u[2],u[3]\n0,1,2,3\n1,0,0,1\n", encoding="utf-8")
+    fmu = foreign_fmu("resize3")
+    assert flown(monkeypatch, fmu, "--binding", bound, "--inputs", given, "--out", out, "--in-process") == 0
+    assert out.read_text(encoding="utf-8").splitlines()[1:] == ["1.0,1.0,4.0,9.0", "2.0,1.0,4.0,12.0"]
+    with closing(FmiAsset(fmu, bound, isolated=False)) as asset:
+        assert asset.step({"u": [1.0, 2.0, 3.0]}).values.tolist() == [1.0, 4.0, 9.0]
+        asset.restore_state(asset.save_state())
+        assert asset.step({"u": [0.0, 0.0, 1.0]}).values.tolist() == [1.0, 4.0, 12.0]
+        asset.renew(control={"u": [1.0, 0.0, 0.0]})
+        assert asset.step().values.tolist() == [1.0, 0.0, 0.0]
+    other = FmiAsset(fmu, bound, isolated=False)
+    with closing(other), pytest.raises(FmuFileError, match="3 elements but 2 start values"):
+        other.step()
+
+
 def test_structural_parameters_of_a_binding(foreign_fmu: Any) -> None:
     """They hold after every start, in a state and for an asset beside it; some cannot be taken."""
     header = {"name": "r", "step_size": 1.0, "structural_parameters": {"n": 3}}

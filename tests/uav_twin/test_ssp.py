@@ -127,14 +127,43 @@ def test_what_nothing_takes_is_a_warning(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], system: Path, tmp_path: Path
 ) -> None:
     end = "</ssm:ParameterMapping>"
-    more = f'<ssm:MappingEntry source="conductance" target="heat_exchanger.fin" />{end}'
+    more = f'<ssm:MappingEntry source="conductance" target="heat_exchanger.baffle" />{end}'
     file = str(changed(system, tmp_path / "more.ssp", **{end: more}))
     for command in (("check", file), ("simulate", file, "--stop-time", "1", "--in-process")):
         assert call(monkeypatch, "ssp", *command) == 0
-        said = capsys.readouterr().out
-        assert "warning: nothing in the system has these parameters, not used: heat_exchanger.fin." in said
+        said = " ".join(capsys.readouterr().out.split())
+        assert f"warning: {file} sets parameters that nothing takes: heat_exchanger.baffle; correct" in said
     assert call(monkeypatch, "ssp", "check", file, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["unused"] == ["heat_exchanger.fin"]
+    assert json.loads(capsys.readouterr().out)["unused"] == ["heat_exchanger.baffle"]
+
+
+def test_a_misspelt_parameter_is_not_flown(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    folder: Path,
+    system: Path,
+    tmp_path: Path,
+) -> None:
+    """The nearest name is said; what another entry gives is not missed."""
+    end = "</ssm:ParameterMapping>"
+    more = "".join(
+        f'<ssm:MappingEntry source="{source}" target="heat_exchanger.{target}" />'
+        for source, target in (("conductance", "conductanse"), ("cold", "wall_temperature"))
+    )
+    file = changed(system, tmp_path / "misspelt.ssp", **{end: more + end})
+    named = (
+        f"{file} sets parameters that nothing takes: "
+        "heat_exchanger.conductanse (did you mean 'heat_exchanger.conductance'?)"
+    )
+    assert call(monkeypatch, "ssp", "check", str(file)) == 0
+    assert f"warning: {named}" in " ".join(capsys.readouterr().out.split())
+    out = tmp_path / "run"
+    scenario = str(folder / "fouling.toml")
+    assert call(monkeypatch, "run", str(file), "--scenario", scenario, "--out", str(out), "-q") == 1
+    error = capsys.readouterr().err
+    assert named in " ".join(error.split())
+    assert len(error.strip().splitlines()) == 1
+    assert not out.exists()
 
 
 def test_the_words_of_ssp_2_are_read(

@@ -207,10 +207,14 @@ class SspSource(SeveralSource):
         return join_ssp(read_ssp(self._path(SSP_COPY), self._path(COMPONENT_FOLDER)))
 
     def _check_system(self, binding: "Binding", folder: Path) -> None:
-        from fmu_asset.ssp.check import join_ssp
+        from fmu_asset.ssp.check import join_ssp, left_out_sentence
         from fmu_asset.ssp.reader import read_ssp
 
-        self._join(join_ssp(read_ssp(self._section.all_files()[SSP_COPY], folder)), binding)
+        file = self._section.all_files()[SSP_COPY]
+        wiring = join_ssp(read_ssp(file, folder))
+        if sentence := left_out_sentence(wiring, file):
+            raise MissionInputError(sentence)
+        self._join(wiring, binding)
 
     def _make(self, progress: Progress) -> dict[str, str]:
         self._session().close()  # what does not fit is said before anything is flown

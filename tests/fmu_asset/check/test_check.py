@@ -131,3 +131,18 @@ def test_a_range_that_the_fmu_does_not_keep(foreign_fmu: Any) -> None:
     assert check.passed
     assert "1 of 4 ends of ranges fail, such as u = 10 m/s" in texts(check, "range edges")
     assert "u is too large" in texts(check, "range edges")
+
+
+def test_a_binding_with_other_sizes_is_checked_with_them(foreign_fmu: Any) -> None:
+    """Three inputs, for which the FMU has two start values."""
+    content = {
+        "binding": {"name": "sized", "step_size": 1.0, "structural_parameters": {"n": 3}},
+        "control": {"u": {"variable": "u", "unit": "1"}},
+        "observation": {"y": {"variables": "y", "unit": "1"}},
+    }
+    check = check_fmu(foreign_fmu("resize3"), parse_binding(content), cycles=2)
+    assert "3 finite outputs" in texts(check, "first flight")
+    found = verdicts(check)
+    names = ("binding", "first flight", "determinism", "step size", "reset", "instances")
+    assert [found[name] for name in names] == ["ok"] * 6
+    assert found["state"] == "warning"

@@ -16,7 +16,7 @@ void model_start(Model *m) {
 }
 int model_configure(Model *m, int begins) {
     m->i[1] = begins;
-    if (m->i[0] < 1 || m->i[0] > MOST) return ERROR;
+    if (m->i[0] < 0 || m->i[0] > MOST) return ERROR;
     length = m->i[0];
     return OK;
 }

@@ -32,7 +32,7 @@ from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import CouplingError, SspError
-from fmu_asset.ssp.check import check_ssp, join_ssp
+from fmu_asset.ssp.check import check_ssp, join_ssp, left_out_sentence
 from fmu_asset.ssp.reader import read_ssp
 from fmu_asset.ssp.writer import ssp_bytes, write_ssp
 
@@ -490,6 +490,9 @@ def test_what_is_for_nothing_is_left_out_and_named(theirs: Pack, tmp_path: Path)
     mapping = MAPPING.replace('source="chance"', 'source="luck"')
     wiring = join_ssp(read_ssp(theirs(change, {"resources/top.ssm": mapping}), tmp_path / "fmus"))
     assert {*wiring.left_out} == {"damage.seed", "rudder.seed", "mass", "structure.lod", "damage.sed"}
+    said = left_out_sentence(wiring, tmp_path)
+    assert "damage.sed (did you mean 'damage.seed'?)" in said
+    assert "damage.seed (its set lacks the value)" in said
     assert wiring.settings == before
     assert len(ssp_bytes(wiring)) > 0  # what is for nothing is not written again
 
@@ -562,6 +565,16 @@ def test_fmus_of_other_versions_are_joined(foreign_fmu: Any, tmp_path: Path) -> 
         match=r"counter\.y cannot be the source .* of the type Float64, and an output of a single",
     ):
         Wiring(replace(wiring.structure, connections=(array,)))
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("u", "it is an array"), ("ticked", "it changes with a clock"), ("blob", "it is of the type Binary")],
+)
+def test_what_is_no_single_number_is_not_set(foreign_fmu: Any, name: str, words: str) -> None:
+    wrong = Component("a", foreign_fmu("array3"), {name: Setting(1.0)})
+    with pytest.raises(CouplingError, match=rf"a\.{name} cannot be set: {words}; only single numbers"):
+        Wiring(SystemStructure("one", (wrong,)))
 
 
 def test_start_values_of_outputs_are_set(foreign_fmu: Any) -> None:
