@@ -5,7 +5,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from reporting.words import listing
+from reporting.words import counted, listing
 
 _SHOWN_LENGTH = 60
 _EXPECTED = {
@@ -22,7 +22,6 @@ _EXPECTED = {
     "bool_type": "true or false",
     "bool_parsing": "true or false",
     "finite_number": "a finite number",
-    "too_short": "at least one entry",
 }
 """What is expected, by pydantic's type of error, where its own words are those of Python."""
 
@@ -99,7 +98,10 @@ def _sentence(error: ValidationError, what: str, first_index: int) -> str:
         return f"{before}{first['ctx']['error']}"
     if first["type"] == "tuple_type" and isinstance(first["input"], dict):
         return f"there can be several of {place!r}, so write [[{place}]] for each, not [{place}]"
-    if first["type"] in _EXPECTED:
+    if first["type"] == "too_short":
+        least = first["ctx"]["min_length"]
+        message = f"at least {counted(least, 'entry', 'entries')} {'is' if least == 1 else 'are'} expected"
+    elif first["type"] in _EXPECTED:
         message = f"{_EXPECTED[first['type']]} is expected"
     else:
         message = first["msg"][0].lower() + first["msg"][1:]

@@ -138,7 +138,7 @@ def test_events_survive_the_files(campaign: Campaign, tmp_path: Path) -> None:
           for name in ("time", "step", "max", "lambda")),
         ("[[event]]", "[event]", "several of 'event', so write [[event]] for each, not [event]"),
         ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on_until"\ntime = 1.0', "'pump_on_until' in"),
-        ('trial = "pumping"\ntime', "trials = []\ntime", "at least one entry is expected, but () came"),
+        ('trial = "pumping"\ntime', "trials = []\ntime", "at least 1 entry is expected, but () came"),
     ],
 )  # fmt: skip
 def test_wrong_events_are_refused_in_one_sentence(tmp_path: Path, old: str, new: str, words: str) -> None:

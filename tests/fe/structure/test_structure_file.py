@@ -263,7 +263,7 @@ def test_a_rosette_is_gauges_at_one_point(make: Callable[[str], Path]) -> None:
         ("[1, 2, 0]]", "[2, 0, 0]]", r"rosette\[1\]: the two axes must point in two directions"),
         ("axes", "axis", r"rosette\[1\]: 'axis' is not a key of a rosette"),
         ("[1, 2, 0]]", "[0, 0, 1]]", r"gauge\[3\] \(r_b\): its direction points 45 degrees out of"),
-        ('"r"', '"a"\nangles = []', r"rosette\[1\]: angles: .* at least 2"),
+        ('"r"', '"a"\nangles = []', r"rosette\[1\]: angles: at least 2 entries are expected"),
     ):
         with pytest.raises(FiniteElementError, match=sentence):
             load_and_assemble(make(GOOD + rosette.replace(old, new)))
