@@ -111,14 +111,14 @@ class Conversion(NamedTuple):
 
 
 @cache
-def _registry() -> UnitRegistry[Any]:
+def _known_units() -> UnitRegistry[Any]:
     """Return the units of pint in fractions of integers; pi is that of floats, and so are its multiples."""
     import pint
 
-    registry: UnitRegistry[Any] = pint.UnitRegistry(None, non_int_type=Fraction, on_redefinition="ignore")
-    registry.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
-    registry.define(f"pi = {Decimal(pi)} = π")
-    return registry
+    known: UnitRegistry[Any] = pint.UnitRegistry(None, non_int_type=Fraction, on_redefinition="ignore")
+    known.load_definitions(Path(pint.__file__).with_name("default_en.txt"))
+    known.define(f"pi = {Decimal(pi)} = π")
+    return known
 
 
 def _expression(unit: str, *, acceleration: bool) -> str:
@@ -150,12 +150,12 @@ def conversion(unit: str, si: str) -> Conversion:
         return Conversion(1.0, 0)  # pint takes a third of a second to load
     from pint.errors import PintError
 
-    registry = _registry()
+    known = _known_units()
     factors, roots = [], []
     for text in (unit, si):
         try:
             expression = _expression(text, acceleration=si == UNITS[Quantity.ACCELERATION].si)
-            factor, root = registry.get_root_units(registry.parse_units(expression))
+            factor, root = known.get_root_units(known.parse_units(expression))
         except (PintError, AttributeError, TypeError, ArithmeticError) as cause:
             raise ValueError(f"{text!r} is no unit") from cause
         factors.append(Fraction(str(factor)))

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import NoiseModel
@@ -107,7 +108,7 @@ class SeenTrial:
             block = np.zeros((3 * n, 3 * n))
             block[:n, :n], block[:n, n : 2 * n] = self.system.generator * length, np.eye(n) * length
             block[n : 2 * n, 2 * n :] = np.eye(n)
-            whole = _exponential(block)
+            whole = expm(block)
             found.append((whole[:n, :n], whole[:n, n : 2 * n] - whole[:n, 2 * n :], whole[:n, 2 * n :]))
         moves, begins, ends = (np.ascontiguousarray(items) for items in zip(*found, strict=True))
         return moves, begins, ends
@@ -154,12 +155,6 @@ class SeenTrial:
     def over_noise(self, columns: FloatArray) -> FloatArray:
         """Return columns (..., N, C) over the noise's deviations, zero where a reading does not count."""
         return np.asarray(columns / self.deviation * self.used)
-
-
-def _exponential(matrix: FloatArray) -> FloatArray:
-    from scipy.linalg import expm
-
-    return np.asarray(expm(matrix))
 
 
 def decaying_part(noise: NoiseModel, interval: float) -> tuple[float, float] | None:

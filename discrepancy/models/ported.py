@@ -45,23 +45,6 @@ class PortedSystem:
 
 
 @dataclass(frozen=True, eq=False)
-class PortedMotion:
-    """A trial as a model has it, and what a missing force would add.
-
-    Attributes
-    ----------
-    system : PortedSystem
-        The latter.
-    positions, speeds : (N, P) ndarray
-        Motion of the ports by the model at the trial's stamps.
-    """
-
-    system: PortedSystem
-    positions: FloatArray
-    speeds: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class OutputRows:
     """What outputs show: rows of q, q', q'' (C, M) each, and what they show of a port's force (P, C)."""
 
