@@ -35,6 +35,7 @@ from discrepancy.location.change_points import GapWindow, gap_windows
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.force import MissingForce, missing_force
+from discrepancy.missing_force.naming import ForceSearch, key_of, sees_forces
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wrapped import innermost
@@ -43,7 +44,7 @@ from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from fe.runtime.patch import ModelPatch
 from reporting.words import be
 
-from .errors import CampaignDataError
+from .errors import CampaignDataError, DiscrepancyError
 from .model_choice import load_model
 from .search_settings import SEARCH
 from .verdict import Experiment, NotFitted, Proof, Verdict, VerdictKind
@@ -209,9 +210,7 @@ def investigate(
     missing = None
     if thorough and verdict.kind not in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT):
         with stage("Seeing the missing force", "force"):
-            missing = missing_force(
-                problem, fit, [item for item in catalogue if item.unavailable(setting) is None]
-            )
+            missing = _missing(problem, search, fit)
     proof = None
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
@@ -240,6 +239,24 @@ def investigate(
         seconds,
         missing,
     )
+
+
+def _missing(problem: Problem, search: Search, fit: CandidateFit) -> MissingForce | None:
+    """Return the missing force, with the law of a verdict drawn through it; None where none can be seen."""
+    try:
+        force = search.force
+        if force is None:
+            if not sees_forces(problem):
+                return None
+            force = ForceSearch(problem)
+            force.locate()
+        key = key_of(fit.candidate)
+        found = next((item for item in search.forces if key_of(item.candidate) == key), None)
+        if found is None and fit.candidate.terms:
+            found = force.followed(force.whole, fit.candidate, fit.point.effect)
+        return missing_force(force, force.whole if found is None else found)
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # it is shown, and no verdict rests on it
+        return None
 
 
 def _dated(verdict: Verdict, windows: tuple[GapWindow, ...]) -> str:

@@ -1,9 +1,10 @@
-"""The Kalman filter with a missing force at one port: evidence of columns, and the force and motion seen.
+"""The Kalman filter with missing forces at ports: evidence of columns, and the forces and the motion seen.
 
-The force is a Gaussian process in time of deviation `size` and correlation time `time`: Matern 3/2, two
+A force is a Gaussian process in time of deviation `size` and correlation time `time`: Matern 3/2, two
 states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for Signal Processing), or 1/2.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -61,21 +62,18 @@ class Process:
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """A trial with a missing force at a port.
+    """A trial with missing forces at ports.
 
     Attributes
     ----------
     trial : SeenTrial
         Which.
-    port : int
-        Number of the port.
-    process : Process
-        The force.
+    processes : mapping of int to Process
+        The force at each port, by its number.
     """
 
     trial: SeenTrial
-    port: int
-    process: Process
+    processes: Mapping[int, Process]
 
     @cached_property
     def _scale(self) -> FloatArray:
@@ -83,11 +81,19 @@ class Filtered:
         system = self.trial.system
         n = len(system.generator)
         pace = max(float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9)
-        push = max(float(np.max(np.abs(system.actions[self.port]), initial=0.0)), 1e-300) * self.process.size
+        pushes = [np.abs(system.actions[p]).max(initial=0.0) * one.size for p, one in self.processes.items()]
+        push = max(*pushes, 1e-300)
         units = np.full(n, push / pace)
         half = n // 2 if 2 * (n // 2) == n else 0
         units[:half] /= pace
         return units
+
+    @cached_property
+    def _places(self) -> list[int]:
+        """Where each force stands in the whole state."""
+        counts = [len(one.generator) for one in self.processes.values()]
+        begin = len(self.trial.system.generator)
+        return [begin + sum(counts[:number]) for number in range(len(counts))]
 
     @cached_property
     def _white(self) -> FloatArray:
@@ -100,23 +106,26 @@ class Filtered:
     @cached_property
     def _system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Generator, noise intensity, rows of the readings, covariance at the first sample."""
-        trial, own = self.trial, self.process.generator
+        trial = self.trial
         n, units, noises = len(trial.system.generator), self._scale, len(trial.coloured)
-        force = slice(n, n + len(own))
-        whole = n + len(own) + noises
+        begin = n + sum(len(one.generator) for one in self.processes.values())
+        whole = begin + noises
         generator, intensity, start = np.zeros((3, whole, whole))
         generator[:n, :n] = trial.system.generator * units / units[:, None]
-        generator[:n, n] = -trial.system.actions[self.port] * self.process.size / units
-        generator[force, force] = own
-        intensity[force.stop - 1, force.stop - 1] = self.process.intensity
         rows = np.zeros((len(trial.deviation), whole))
         rows[:, :n] = trial.system.outputs * units / trial.deviation[:, None]
-        rows[:, n] = -trial.system.through[self.port] * self.process.size / trial.deviation
-        start[force, force] = np.eye(len(own))
-        if trial.settled:  # at rest under the missing force too
-            begun = np.linalg.lstsq(generator[:n, :n], -generator[:n, n], rcond=1e-12)[0]
-            start[:n, :n], start[:n, n], start[n, :n] = np.outer(begun, begun), begun, begun
-        for at, (channel, share, rate) in enumerate(trial.coloured, force.stop):
+        for (port, one), at in zip(self.processes.items(), self._places, strict=True):
+            force = slice(at, at + len(one.generator))
+            generator[:n, at] = -trial.system.actions[port] * one.size / units
+            generator[force, force] = one.generator
+            intensity[force.stop - 1, force.stop - 1] = one.intensity
+            rows[:, at] = -trial.system.through[port] * one.size / trial.deviation
+            start[force, force] = np.eye(len(one.generator))
+            if trial.settled:  # at rest under the missing force too
+                begun = np.linalg.lstsq(generator[:n, :n], -generator[:n, at], rcond=1e-12)[0]
+                start[:n, :n] += np.outer(begun, begun)
+                start[:n, at] = start[at, :n] = begun
+        for at, (channel, share, rate) in enumerate(trial.coloured, begin):
             generator[at, at], intensity[at, at], start[at, at] = -rate, 2.0 * rate, 1.0
             rows[channel, at] = np.sqrt(share)
         rows *= self._white[:, None]
@@ -152,7 +161,7 @@ class Filtered:
         return np.asarray(found.reshape(-1, found.shape[-1]))
 
     def smoothed(self, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the added state (F, n) and the missing force (F,) at the fine stamps, given readings."""
+        """Return the added state (F, n) and the missing forces (P, F) at the fine stamps, given readings."""
         moves, slot, gains, sizes, _, filtered = self._passed
         lengths, which = self.trial.steps
         rows = self._system[2]
@@ -169,14 +178,15 @@ class Filtered:
         parts = self.trial.parts
         fine = self._steps(lengths / parts)
         found = _between(parts, *fine, which, slot, filtered, means, later)
-        n = len(self._scale)
-        return np.asarray(found[:, :n] * self._scale), np.asarray(found[:, n] * self.process.size)
+        sizes = np.array([one.size for one in self.processes.values()])
+        forces = found[:, self._places].T * sizes[:, None]
+        return np.asarray(found[:, : len(self._scale)] * self._scale), np.asarray(forces)
 
-    def deviation(self) -> FloatArray:
-        """Return the deviation (N,) of the missing force at the samples, all columns being known."""
+    def deviation(self, port: int) -> FloatArray:
+        """Return the deviation (N,) of the missing force of a port at the samples, columns being known."""
         moves, slot, gains, sizes, predicted, _ = self._passed
         shown = np.zeros((1, len(self._system[0])))
-        shown[0, len(self._scale)] = self.process.size
+        shown[0, self._places[list(self.processes).index(port)]] = self.processes[port].size
         found = _variances(
             moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, predicted, shown
         )

@@ -5,9 +5,10 @@ at their prior means; a calibrated parameter acts on the motion that the model h
 missing force adds to it (`slopes`), so that both together are exact along the motion that was.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,8 @@ LONGEST_MEMORY, LEAST_WHITE = 2000, 1e-3
 """Samples that a coloured noise remembers at most; the least share of its variance that is taken as white."""
 SMALL = 1e-3
 """Step of the derivative of a system by a parameter, in prior deviations."""
+
+NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 
 _driven = compiled(kernels.driven)
 
@@ -103,14 +106,16 @@ class SeenTrial:
     def fine(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Transition (J, n, n) of a fine step, and what a push at its begin and end does (J, n, n)."""
         n = len(self.system.generator)
-        found = []
-        for length in self.steps[0] / self.parts:
-            block = np.zeros((3 * n, 3 * n))
-            block[:n, :n], block[:n, n : 2 * n] = self.system.generator * length, np.eye(n) * length
-            block[n : 2 * n, 2 * n :] = np.eye(n)
-            whole = expm(block)
-            found.append((whole[:n, :n], whole[:n, n : 2 * n] - whole[:n, 2 * n :], whole[:n, 2 * n :]))
-        moves, begins, ends = (np.ascontiguousarray(items) for items in zip(*found, strict=True))
+        lengths = self.steps[0] / self.parts
+        blocks = np.zeros((len(lengths), 3 * n, 3 * n))
+        unit = lengths[:, None, None] * np.eye(n)
+        blocks[:, :n, :n] = self.system.generator * lengths[:, None, None]
+        blocks[:, :n, n : 2 * n], blocks[:, n : 2 * n, 2 * n :] = unit, np.eye(n)
+        whole = expm(blocks)
+        ends = whole[:, :n, 2 * n :]
+        moves, begins, ends = (
+            np.ascontiguousarray(item) for item in (whole[:, :n, :n], whole[:, :n, n : 2 * n] - ends, ends)
+        )
         return moves, begins, ends
 
     @cached_property
@@ -134,21 +139,37 @@ class SeenTrial:
             start = np.linalg.lstsq(self.system.generator, -push * force[0], rcond=1e-12)[0]
         return self._moved(start, push[:, None], force[:, None])
 
+    def ahead(self, forces: Mapping[int, FloatArray], begin: int, end: int) -> FloatArray:
+        """Return what forces at ports (F,) do to the readings from one sample until another, from nothing."""
+        fine = slice(begin * self.parts, (end - 1) * self.parts + 1)
+        pushes = np.array([force[fine] for force in forces.values()]).T
+        directions = -np.array([self.system.actions[port] for port in forces]).T
+        which = np.ascontiguousarray(self.steps[1][begin:end])
+        states = self._moved(np.zeros(len(directions)), directions, pushes, which)
+        shown = states[:: self.parts] @ self.system.outputs.T
+        for port, force in forces.items():
+            shown -= np.outer(force[fine][:: self.parts], self.system.through[port])
+        return np.asarray(shown / self.deviation * self.used[begin:end])
+
     def turned(self, slope: FloatArray, added: FloatArray) -> FloatArray:
         """Return the state (F, n) that a change of the generator makes of an added state (F, n)."""
         rows = np.flatnonzero(np.any(slope, axis=1))
         return self._moved(np.zeros(len(slope)), np.eye(len(slope))[:, rows], added @ slope[rows].T)
 
-    def _moved(self, start: FloatArray, directions: FloatArray, pushes: FloatArray) -> FloatArray:
+    def _moved(
+        self, start: FloatArray, directions: FloatArray, pushes: FloatArray, which: IntArray | None = None
+    ) -> FloatArray:
         moves, begins, ends = self.fine
         begins, ends = np.ascontiguousarray(begins @ directions), np.ascontiguousarray(ends @ directions)
         pushes = np.ascontiguousarray(pushes)
-        return np.asarray(_driven(self.parts, moves, begins, ends, self.steps[1], start, pushes))
+        return np.asarray(
+            _driven(self.parts, moves, begins, ends, self.steps[1] if which is None else which, start, pushes)
+        )
 
-    def readings(self, states: FloatArray, port: int = 0, force: FloatArray | None = None) -> FloatArray:
-        """Return what readings (N, C) show of an added state (F, n), and at once of a port's force (F,)."""
+    def readings(self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES) -> FloatArray:
+        """Return what readings (N, C) show of an added state (F, n), and at once of forces (F,) at ports."""
         shown = states[:: self.parts] @ self.system.outputs.T
-        if force is not None:
+        for port, force in forces.items():
             shown -= np.outer(force[:: self.parts], self.system.through[port])
         return self.over_noise(shown)
 
@@ -212,7 +233,7 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         ends = []
         for sign in (1.0, -1.0):
             moved = point.shared.copy()
-            moved[k] = sign * SMALL
+            moved[k] += sign * SMALL
             ends.append(system(moved).generator)
         slopes.append((ends[0] - ends[1]) / (2.0 * SMALL))
     interval = float(np.median(np.diff(trial.time)))

@@ -15,12 +15,13 @@ from discrepancy.fits.linearisation import Point
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
+from discrepancy.missing_force.naming import Explained, ForceSearch, key_of, sees_forces
 from discrepancy.models.wrapped import has_law
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import MicroSlip, ModelPatch
 
 from .growing_records import Beginnings
-from .hypotheses import Hypotheses, Tell, in_silence, key_of
+from .hypotheses import Hypotheses, Tell, in_silence
 from .starting_points import acts_within, are_related, pairs, starts
 
 FloatArray = NDArray[np.float64]
@@ -40,6 +41,8 @@ class Search(Hypotheses):
 
     beginnings: Beginnings = field(init=False)
     longest: int = field(init=False, default=0)
+    force: ForceSearch | None = field(init=False, default=None)
+    forces: list[Explained] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -164,6 +167,26 @@ class Search(Hypotheses):
                 self.settle()
             if move.needed(self):
                 move.make(self)
+
+    def by_force(self) -> None:
+        """Fit what the missing force may be: the sets of effects that follow it best."""
+        self.tell("looking for the missing force")
+        self.force = ForceSearch(self.problem)
+        self.force.locate()
+        self.forces = self.force.name(self.effects)
+        best = self.force.score(self.forces[0], len(self.effects))
+        close = [
+            item
+            for item in self.forces
+            if item.candidate.terms and self.force.score(item, len(self.effects)) > best - SEARCH.followed
+        ][: SEARCH.far_fits]
+        for number, item in enumerate(close):
+            names = " and ".join(item.candidate.identifiers)
+            self.tell(f"fitting {names} to the end, {len(close) - number - 1} more")
+            found = attempt(self.problem, item.candidate, self.force.whole_point(item))
+            if found is not None:
+                self.keep(found, exact=True)
+        self.settle()
 
     def unexplained(self) -> bool:
         """Whether the best candidate cannot be shown to explain the data."""
@@ -375,7 +398,9 @@ STRATEGY = (
 """Simple causes before others: one effect, one law of free shape, more effects, any two; then fewer again."""
 
 
-def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:
+def search(
+    problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence, *, by_force: bool = True
+) -> Search:
     """Fit the model without effect, then search the catalogue.
 
     Parameters
@@ -387,6 +412,8 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
         or ended is tried so too.
     tell : callable
         Takes a few words on what is fitted, and how much is left.
+    by_force : bool
+        Whether the missing force leads, where it can be seen.
 
     Returns
     -------
@@ -401,7 +428,10 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
     usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)
-    found.run()
+    if by_force and sees_forces(problem):
+        found.by_force()
+    else:
+        found.run()
     return found
 
 
