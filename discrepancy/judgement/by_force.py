@@ -208,7 +208,8 @@ class _Said:
         rows = []
         for trial, motion in zip(at.view.trials, at.motions, strict=True):
             samples = slice(None, None, trial.parts)
-            columns = (motion.forces[port], *trial.port_motion(port, motion.added), trial.fine_time)
+            moving = motion.positions[:, port], motion.speeds[:, port]
+            columns = (motion.forces[port], *moving, trial.fine_time)
             rows.append(np.array([column[samples] for column in columns]))
         force, position, speed, time = np.concatenate(rows, axis=1)
         scaled = [values / max(float(np.std(values)), 1e-300) for values in (position, speed)]

@@ -84,18 +84,7 @@ class Court:
         outside = self.share(item, held_out=True)
         if not outside.tested:
             return outside.value > COUNTER
-        acts = any(self.acts(term) for term in item.candidate.terms)
-        return not _is_little(outside, least) or (acts and self.gain(item) > SEARCH.bayes_factor)
-
-    def gain(self, item: Explained) -> float:
-        """Return how much more probable a hypothesis makes trials that were not fitted [nat]."""
-        if id(item) not in self._gains:
-            self._gains[id(item)] = self.shares.gain(item)
-        return self._gains[id(item)]
-
-    @cached_property
-    def _gains(self) -> dict[int, float]:
-        return {}
+        return not _is_little(outside, least)
 
     def acts(self, term: Term) -> bool:
         """Whether a term acts on the structure, and is no description of readings."""

@@ -14,6 +14,7 @@ from discrepancy.models.sensing import observe_response
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
+from fe.runtime.sensors import clock_of
 
 from .law_courses import law_course
 from .trial import SeenTrial
@@ -98,7 +99,9 @@ class Columns:
         readings = np.zeros_like(trial.residual)
         forces: dict[int, FloatArray] = {}
         for port, law in self._at_ports(trial, laws):
-            course = law_course(law, trial.fine_time, *trial.port_motion(port, motion.added))
+            position, speed = motion.positions[:, port], motion.speeds[:, port]
+            doubt, holding = motion.speed_deviations.get(port, 0.0), motion.forces.get(port, 0.0)
+            course = law_course(law, trial.fine_time, position, speed, doubt, holding)
             state = trial.pushed(port, course)
             added += state
             readings += trial.readings(state, {port: course})
@@ -123,9 +126,18 @@ class Columns:
         problem, data = self.problem, self.problem.trials[number]
         shared, local = self.point.shared, self.point.local[number]
         values, rates = problem.response(number, shared, local, ModelPatch())
-        added = trial.readings(motion.explained, motion.laws) * trial.deviation
-        true = values + added
-        slope = np.gradient(true, trial.time, axis=0) if rates is not None else None
+        gains = 1.0 + problem.shared.gains(shared, data.trial.channels)
+        true = values + trial.readings(motion.explained, motion.laws) * trial.deviation / gains
+        slope = None
+        if rates is not None:
+            pace = motion.explained @ trial.system.generator.T
+            for port, force in motion.laws.items():
+                pace = pace - np.outer(force, trial.system.actions[port])
+            slope = rates + (pace @ trial.system.outputs.T)[:: trial.parts] / gains
         conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(shared), local)
         with_it = observe_response(problem.campaign, data.trial, sensors, conditions, true, slope)
-        return trial.over_noise(with_it.values - true)
+        changed = with_it.values - true
+        rate, zero = clock_of(sensors)
+        if slope is not None:
+            changed += slope * (rate * trial.time + zero)[:, None]
+        return trial.over_noise(changed * gains)

@@ -19,6 +19,9 @@ from .trial import SeenTrial
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+LATER = 200
+"""Samples after which more of them tell nothing of a moment."""
+
 callable_when_compiled(kernels.is_steady)
 _discretised = compiled(kernels.discretised)
 _covariances = compiled(kernels.covariances)
@@ -145,6 +148,11 @@ class Filtered:
         return moves, *_covariances(moves, noises, which, rows, self.trial.used, start)
 
     @property
+    def is_sound(self) -> bool:
+        """Whether no variance has been lost to rounding, as under forces far larger than what is read."""
+        return bool(np.all(self._passed[3] > 0.5))
+
+    @property
     def log_determinant(self) -> float:
         """Half the sum of the logarithms of the readings' variances given those before [nat]."""
         _, slot, _, sizes, _, _ = self._passed
@@ -154,7 +162,8 @@ class Filtered:
     def whitened(self, columns: FloatArray) -> FloatArray:
         """Return columns (K, N, C) as independent numbers of variance one (N C, K)."""
         moves, slot, gains, sizes, _, _ = self._passed
-        given = np.ascontiguousarray(np.moveaxis(columns * self._white, 0, -1))
+        given = np.moveaxis(columns, 0, -1)
+        given = np.ascontiguousarray(given * self._white[:, None] if self.trial.coloured else given)
         found = _whitened(
             moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, given
         )
@@ -184,10 +193,20 @@ class Filtered:
 
     def deviation(self, port: int) -> FloatArray:
         """Return the deviation (N,) of the missing force of a port at the samples, columns being known."""
+        shown = np.zeros(len(self._system[0]))
+        shown[self._places[list(self.processes).index(port)]] = self.processes[port].size
+        return self._deviations(shown, slice(None))
+
+    def speed_deviation(self, port: int) -> float:
+        """Return that of a port's speed, at a sample with many that follow."""
+        shown = np.zeros(len(self._system[0]))
+        shown[: len(self._scale)] = self.trial.system.speeds[port] * self._scale
+        return float(self._deviations(shown, slice(-LATER, None))[0])
+
+    def _deviations(self, shown: FloatArray, at: slice) -> FloatArray:
+        """Return the smoothed deviation of a row (n,) of the state at last samples."""
         moves, slot, gains, sizes, predicted, _ = self._passed
-        shown = np.zeros((1, len(self._system[0])))
-        shown[0, self._places[list(self.processes).index(port)]] = self.processes[port].size
-        found = _variances(
-            moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, predicted, shown
-        )
+        which, used = self.trial.steps[1][at], self.trial.used[at]
+        rows = self._system[2]
+        found = _variances(moves, which, rows, used, slot[at], gains, sizes, predicted, shown[None])
         return np.asarray(np.sqrt(found[:, 0]))

@@ -120,7 +120,7 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
     filters = found.view.filtered(found.processes)
     for trial, motion, one in zip(found.view.trials, found.motions, filters, strict=True):
         samples = slice(None, None, trial.parts)
-        position, speed = trial.port_motion(at, motion.added)
+        position, speed = motion.positions[:, at], motion.speeds[:, at]
         force, left = motion.forces[at][samples], motion.left[at][samples]
         law = force - left if named else None
         motion_at = (position[samples], speed[samples])

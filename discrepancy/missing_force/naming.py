@@ -20,9 +20,8 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.models.ported import shows_ports
+from discrepancy.models.ported import apart, shows_ports
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import ModelPatch
 
 from .columns import Columns
 from .filtered import Process
@@ -125,9 +124,7 @@ class ForceSearch:
     """
 
     def __init__(self, problem: Problem) -> None:
-        model = problem.model.inner
-        self.laws: ModelPatch
-        linear, self.laws = model.apart() if hasattr(model, "apart") else (model, ModelPatch())
+        linear, self.laws = apart(problem.model.inner)
         trials = tuple(data.trial for data in problem.trials)
         self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]

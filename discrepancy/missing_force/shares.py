@@ -11,8 +11,7 @@ from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 
 from .columns import Columns
-from .naming import Explained, ForceSearch, scaled
-from .regression import Regression, regression
+from .naming import Explained, ForceSearch
 from .trial import SeenTrial, seen_trial
 from .view import Motion, View
 
@@ -22,8 +21,6 @@ WINDOWS, SHORTEST = 12, 8
 """Blocks into which a trial is cut, and samples of a block at least."""
 WITHIN = 2.0
 """Prior deviations within which parameters stay where the missing force without any effect is told."""
-OTHER_SIZES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-"""Sizes of what is left in trials that were not fitted, over that where it was."""
 TESTED = 0.1
 """Share of the missing force from which on a law has one that these trials can test."""
 DRAWS, SEED = 2000, 0
@@ -100,7 +97,6 @@ class ForceShares:
         campaign = search.problem.campaign
         held = tuple(trial for trial in campaign.held_out if trial.is_dynamic)
         self._outside: tuple[Columns, View] | None = None
-        self._told: list[float] = []
         self._bare: dict[bool, tuple[View, list[Motion]]] = {}
         if held:
             problem = Problem(
@@ -173,39 +169,6 @@ class ForceShares:
         ]
         return max(shares, key=lambda share: share.interval[0])
 
-    def gain(self, found: Explained) -> float:
-        """Return how much more probable a hypothesis makes trials that were not fitted [nat].
-
-        With what the fitted ones tell of its unknowns, and over missing forces alone.
-        """
-        if not self._told:
-            self._told.append(self._evidence(self.search.whole))
-        return self._evidence(found) - self._told[0]
-
-    def _evidence(self, found: Explained) -> float:
-        """Return the evidence of the trials held out, given those that were fitted.
-
-        What is left may be larger there: laws that nobody knows grow with the motion.
-        """
-        assert self._outside is not None
-        columns, view = self._outside
-        motions = self.motions(found, held_out=True)[1]
-        linear = self.search.linear(columns, view, motions, found.candidate, found.effect)
-        if linear is None:
-            return -np.inf
-        mean, covariance = found.solution.mean, found.solution.covariance
-        left = [
-            residual - np.tensordot(mean, each, 1)
-            for residual, each in zip(linear.residuals, linear.columns, strict=True)
-        ]
-        return max(
-            _given(
-                regression(linear.filtered(scaled(found.processes, size, 1.0)), left, linear.columns),
-                covariance,
-            )
-            for size in OTHER_SIZES
-        )
-
     def _without(self, held_out: bool) -> tuple[View, list[Motion]]:
         """Return motion and missing force without any effect, parameters being within twice their priors."""
         if held_out not in self._bare:
@@ -234,15 +197,6 @@ class ForceShares:
             view = replace(view, motions=motions, known=known, own=own)
             motions = view.along(wide, solution)[2]
         return view, motions
-
-
-def _given(found: Regression, covariance: FloatArray) -> float:
-    """Return the evidence [nat] of what is regressed, its unknowns being as far off as a covariance tells."""
-    gram, along = found.products[1:, 1:], found.products[1:, 0]
-    inner = np.eye(len(covariance)) + covariance @ gram
-    known = float(along @ np.linalg.solve(inner, covariance @ along)) if len(along) else 0.0
-    half = 0.5 * float(np.linalg.slogdet(inner)[1])
-    return -0.5 * (float(found.products[0, 0]) - known) - found.log_determinant - half
 
 
 def _share(before: FloatArray, after: FloatArray, noise: FloatArray) -> FloatArray:

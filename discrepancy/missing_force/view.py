@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +42,19 @@ class Motion:
         What no law of the hypothesis is of it.
     explained : (F, n) ndarray
         State that parameters and laws add: without what is left.
+    positions, speeds : (F, P) ndarray
+        Of the ports.
+    speed_deviations : mapping of int to float
+        How well the speeds of ports of missing forces are known.
     """
 
     added: FloatArray
     forces: Mapping[int, FloatArray]
     left: Mapping[int, FloatArray]
     explained: FloatArray
+    positions: FloatArray
+    speeds: FloatArray
+    speed_deviations: Mapping[int, float]
 
     @property
     def laws(self) -> dict[int, FloatArray]:
@@ -80,6 +88,17 @@ class Part:
             forces[port] = forces.get(port, 0.0) + factor * force
         readings = self.readings + factor * other.readings
         return Part(readings, sum(added[1:], added[0]) if added else None, forces)
+
+
+class Turned(NamedTuple):
+    """What a unit of a shared unknown makes of the added state: readings (N, C), and state (F, n) if it does.
+
+    It is linear about a value of the unknown.
+    """
+
+    readings: FloatArray
+    about: float
+    state: FloatArray | float = 0.0
 
 
 Column = Sequence[Part]
@@ -131,39 +150,49 @@ class View:
         return np.concatenate((self.shared_precision, self.precision))
 
     @cached_property
-    def turned(self) -> list[list[FloatArray | None]]:
-        """State (F, n) that each shared unknown makes of the added one, by trial."""
-        if not self.motions:
-            return [[None] * len(trial.slopes) for trial in self.trials]
-        return [
-            [
-                None if slope is None or not np.any(slope) else trial.turned(slope, motion.added)
-                for slope in trial.slopes
-            ]
-            for trial, motion in zip(self.trials, self.motions, strict=True)
-        ]
+    def turned(self) -> list[dict[int, Turned]]:
+        """What shared unknowns, by their numbers, make of the added state, by trial."""
+        found: list[dict[int, Turned]] = [{} for _ in self.trials]
+        for trial, motion, of_trial in zip(self.trials, self.motions, found, strict=False):
+            for k, slope in enumerate(trial.slopes):
+                if slope is not None and np.any(slope):
+                    state = trial.turned(slope, motion.added)
+                    of_trial[k] = Turned(trial.readings(state), float(trial.about[k]), state)
+            shown = trial.readings(motion.added, motion.forces)
+            for k, channel, scale in trial.gains:
+                alone = scale * np.eye(shown.shape[1])[channel]
+                of_trial[k] = Turned(shown * alone, float(trial.about[k]))
+        return found
 
     @cached_property
     def columns(self) -> list[FloatArray]:
         """What all unknowns do to the readings (K, N, C), by trial."""
         found = []
         for number, trial in enumerate(self.trials):
-            columns = trial.shared.copy()
-            for k, state in enumerate(self.turned[number]):
-                if state is not None:
-                    columns[k] += trial.readings(state)
-            effects = [item[number].readings[None] for item in self.effects]
-            found.append(np.concatenate((columns, *effects)))
+            effects = [item[number].readings for item in self.effects]
+            columns = (
+                np.moveaxis(np.stack([*trial.shared, *effects], axis=-1), -1, 0)
+                if len(trial.shared) + len(effects)
+                else np.zeros((0, *trial.residual.shape))
+            )
+            for k, turned in self.turned[number].items():
+                columns[k] += turned.readings
+            found.append(columns)
         return found
 
     @cached_property
     def residuals(self) -> list[FloatArray]:
         """Residuals (N, C) beside what is known, by trial."""
         known = [item for item in (self.known, self.own) if item is not None]
-        return [
-            trial.residual - sum((item[number].readings for item in known), np.zeros_like(trial.residual))
-            for number, trial in enumerate(self.trials)
-        ]
+        found = []
+        for number, trial in enumerate(self.trials):
+            left = trial.residual - sum(
+                (item[number].readings for item in known), np.zeros_like(trial.residual)
+            )
+            for turned in self.turned[number].values():
+                left = left + turned.about * turned.readings
+            found.append(left)
+        return found
 
     def filtered(self, processes: Processes) -> list[Filtered]:
         """Return the filters of missing forces."""
@@ -174,7 +203,7 @@ class View:
         return regression(self.filtered(processes), self.residuals, self.columns)
 
     def solve(self, processes: Processes) -> Solution:
-        """Return evidence and values of all unknowns beside missing forces."""
+        """Return evidence and values of all unknowns beside missing forces; of all trials."""
         return self.products(processes).solve(range(len(self.precisions)), self.precisions)
 
     def most_probable(
@@ -208,7 +237,7 @@ class View:
             )
             for port, one in processes.items()
         ]
-        if np.abs(away).max() > FARTHEST:
+        if np.abs(away).max() > FARTHEST or not all(one.is_sound for one in self.filtered(processes)):
             return -np.inf
         return float(self.solve(processes).evidence - 0.5 * np.sum(np.square(away)))
 
@@ -248,9 +277,8 @@ class View:
                 left = left - np.tensordot(values, trial.local, 1)
             free, forces = one.smoothed(left)
             added = free.copy()
-            for mean, state in zip(solution.mean[:count], self.turned[number], strict=True):
-                if state is not None:
-                    added = added + mean * state
+            for k, turned in self.turned[number].items():
+                added = added + (solution.mean[k] - turned.about) * turned.state
             remaining = dict(zip(processes, forces, strict=True))
             what = Part(left, added, remaining)
             for mean, item in zip(solution.mean[count:], self.effects, strict=True):
@@ -258,7 +286,9 @@ class View:
             what = what if self.known is None else what.plus(self.known[number], 1.0)
             moved = what if self.own is None else what.plus(self.own[number], 1.0)
             assert moved.added is not None
-            motions.append(Motion(moved.added, what.forces, remaining, moved.added - free))
+            moving = trial.port_motion(np.concatenate((solution.mean[:count], values)), moved.added)
+            doubts = {port: one.speed_deviation(port) for port in processes}
+            motions.append(Motion(moved.added, what.forces, remaining, moved.added - free, *moving, doubts))
             local.append(values)
         return solution, local, motions
 
