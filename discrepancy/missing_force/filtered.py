@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 callable_when_compiled(kernels.is_steady)
-_discretised = compiled(kernels.discretised)
+discretised = compiled(kernels.discretised)
 _covariances = compiled(kernels.covariances)
 _whitened = compiled(kernels.whitened)
 _smoothed = compiled(kernels.smoothed)
@@ -90,7 +90,7 @@ class Filtered:
         return units
 
     @cached_property
-    def _white(self) -> FloatArray:
+    def white(self) -> FloatArray:
         """Deviation (C,) of each channel's noise over that of what is white of it."""
         found = np.ones(len(self.trial.deviation))
         for channel, share, _ in self.trial.coloured:
@@ -98,7 +98,7 @@ class Filtered:
         return found
 
     @cached_property
-    def _system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Generator, noise intensity, rows of the readings, covariance at the first sample."""
         trial, own = self.trial, self.process.generator
         n, units, noises = len(trial.system.generator), self._scale, len(trial.coloured)
@@ -119,12 +119,12 @@ class Filtered:
         for at, (channel, share, rate) in enumerate(trial.coloured, force.stop):
             generator[at, at], intensity[at, at], start[at, at] = -rate, 2.0 * rate, 1.0
             rows[channel, at] = np.sqrt(share)
-        rows *= self._white[:, None]
+        rows *= self.white[:, None]
         return generator, intensity, rows, start
 
     def _steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return transitions and noises (J, n, n) of steps (J,) [s]."""
-        return _discretised(*self._system[:2], lengths)
+        return discretised(*self.system[:2], lengths)
 
     @cached_property
     def _passed(
@@ -132,22 +132,22 @@ class Filtered:
     ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         lengths, which = self.trial.steps
         moves, noises = self._steps(lengths)
-        _, _, rows, start = self._system
+        _, _, rows, start = self.system
         return moves, *_covariances(moves, noises, which, rows, self.trial.used, start)
 
     @property
     def log_determinant(self) -> float:
         """Half the sum of the logarithms of the readings' variances given those before [nat]."""
         _, slot, _, sizes, _, _ = self._passed
-        white = np.sum(self.trial.used * np.log(self._white))
+        white = np.sum(self.trial.used * np.log(self.white))
         return 0.5 * float(np.sum(np.log(sizes[slot]) * self.trial.used)) - float(white)
 
     def whitened(self, columns: FloatArray) -> FloatArray:
         """Return columns (K, N, C) as independent numbers of variance one (N C, K)."""
         moves, slot, gains, sizes, _, _ = self._passed
-        given = np.ascontiguousarray(np.moveaxis(columns * self._white, 0, -1))
+        given = np.ascontiguousarray(np.moveaxis(columns * self.white, 0, -1))
         found = _whitened(
-            moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, given
+            moves, self.trial.steps[1], self.system[2], self.trial.used, slot, gains, sizes, given
         )
         return np.asarray(found.reshape(-1, found.shape[-1]))
 
@@ -155,7 +155,7 @@ class Filtered:
         """Return the added state (F, n) and the missing force (F,) at the fine stamps, given readings."""
         moves, slot, gains, sizes, _, filtered = self._passed
         lengths, which = self.trial.steps
-        rows = self._system[2]
+        rows = self.system[2]
         means, later = _smoothed(
             moves,
             which,
@@ -164,7 +164,7 @@ class Filtered:
             slot,
             gains,
             sizes,
-            np.ascontiguousarray(readings * self._white),
+            np.ascontiguousarray(readings * self.white),
         )
         parts = self.trial.parts
         fine = self._steps(lengths / parts)
@@ -175,9 +175,9 @@ class Filtered:
     def deviation(self) -> FloatArray:
         """Return the deviation (N,) of the missing force at the samples, all columns being known."""
         moves, slot, gains, sizes, predicted, _ = self._passed
-        shown = np.zeros((1, len(self._system[0])))
+        shown = np.zeros((1, len(self.system[0])))
         shown[0, len(self._scale)] = self.process.size
         found = _variances(
-            moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, predicted, shown
+            moves, self.trial.steps[1], self.system[2], self.trial.used, slot, gains, sizes, predicted, shown
         )
         return np.asarray(np.sqrt(found[:, 0]))

@@ -138,6 +138,21 @@ class ForceSearch:
                 self.point = self._point(self.best())
         return self.at
 
+    def rough(self, port: str) -> Seen:
+        """Return the missing force at a port as one that may jump, linear about the motion that it gives."""
+        found = self.at[port]
+        for _ in range(2):
+            self.point = self._point(found)
+            trials = [seen_trial(self.problem, number, self.point) for number in self.numbers]
+            columns = Columns(self.problem, self.numbers, self.point)
+            view = View(trials, found.view.port, self.problem.shared.precision)
+            for _ in range(2):
+                motions = view.smoothed(found.process)[2]
+                own = columns.of_patch(view, motions, self.laws) if len(self.laws) else None
+                view = replace(view, motions=motions, certain=() if own is None else (own,))
+            found = seen(view, replace(found.process, rough=True))
+        return found
+
     def best(self) -> Seen:
         """Return the view of the largest evidence."""
         return max(self.at.values(), key=lambda item: item.evidence)

@@ -6,7 +6,7 @@ missing force adds to it (`slopes`), so that both together are exact along the m
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -71,6 +71,8 @@ class SeenTrial:
         Motion of the ports by the model at the fine stamps.
     settled : bool
         Whether it begins at rest under what acts.
+    about : (K,) ndarray
+        Shared unknowns of the point.
     """
 
     name: str
@@ -88,6 +90,7 @@ class SeenTrial:
     positions: FloatArray
     speeds: FloatArray
     settled: bool
+    about: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def steps(self) -> tuple[FloatArray, IntArray]:
@@ -228,4 +231,5 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         trial.name, trial.time, residual, used,
         deviation, coloured, by_shared, by_local, unknowns.precision, base, slopes, count,
         positions, speeds, trial.begins.value == "settled" and trial.kind.value != "ringdown",
+        point.shared,
     )  # fmt: skip

@@ -129,11 +129,14 @@ class View:
 
     @cached_property
     def residuals(self) -> list[FloatArray]:
-        """Residuals (N, C) beside what is certain, by trial."""
+        """Residuals (N, C) beside what is certain, by trial; the systems are those of their points."""
         found = []
         for number, trial in enumerate(self.trials):
-            known = [item.parts[number].readings for item in self.certain]
-            found.append(trial.residual - sum(known) if known else trial.residual)
+            left = trial.residual - sum(item.parts[number].readings for item in self.certain)
+            for value, state in zip(trial.about, self.turned[number], strict=False):
+                if state is not None:
+                    left = left + value * trial.readings(state)
+            found.append(np.asarray(left))
         return found
 
     def filtered(self, process: Process) -> list[Filtered]:
@@ -185,9 +188,10 @@ class View:
                 values = np.zeros(0)
             added, force = one.smoothed(left)
             count = len(trial.slopes)
-            for mean, state in zip(solution.mean[:count], self.turned[number], strict=True):
+            about = trial.about if len(trial.about) else np.zeros(count)
+            for off, state in zip(solution.mean[:count] - about, self.turned[number], strict=True):
                 if state is not None:
-                    added = added + mean * state
+                    added = added + off * state
             weights = (*solution.mean[count:], *(1.0 for _ in self.certain))
             for mean, item in zip(weights, (*self.effects, *self.certain), strict=True):
                 part = item.parts[number]

@@ -1,0 +1,412 @@
+"""Since when, until when: stretches of a record in which a force acts that does not act otherwise.
+
+Beside a force of small size that may be missing throughout, a second one, larger, is on or off. Which it is
+in a stretch is weighed with all unknowns of the records: a filter tells what is known before a moment, its
+counterpart backwards what the readings after it say (Fraser and Potter 1969, IEEE Transactions on Automatic
+Control 14, 387-390), so that the evidence of an event with any begin and any end costs no pass of its own.
+Stretches are turned on or off, one after the other, while that gains more than the places of its ends cost.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from fe.compilation import callable_when_compiled, compiled
+
+from . import event_kernels as kernels
+from .filtered import Filtered, Process, discretised
+from .regression import LEAST_PRECISION
+from .view import SIZE_DOUBT, TIME_DOUBT, Motion, View
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+CHANGE_PRICE = 4.0
+"""ln odds against a change, beside the choice of its place."""
+STARTS = 40
+"""Places between which a stretch is looked for first."""
+MOST_STEPS = 400_000
+"""Steps of the filter for one such look, of a long record."""
+PLACES = 80
+"""Places of a change that are weighed at once."""
+FINE = 4000
+"""Places of a change in a short record: between its samples too."""
+MOST_EVENTS = 6
+"""Stretches of a record: more are no events, but a force that varies."""
+STARTS_FROM = ((True, 1.0, 0.0, 0.003), (False, 3.0, 0.0, 0.003), (False, 3.0, 1.0, 0.1), (False, 5.0, 0.0, 1.0))
+"""Whether all stretches are on at first, size of the event's force, its time over that of the records (or as
+the process), size of the other one."""
+FEW_PASSES, MOST_PASSES, ROUNDS = 30, 60, 5
+LEAST_GAIN = 0.5
+REACH = np.array([0.9, 0.7, 0.9, 0.7])
+DOUBTS = np.array([SIZE_DOUBT, 3.0, SIZE_DOUBT, TIME_DOUBT])
+"""Prior deviations of the logarithms of sizes and times; an event may be a push that stays as it is."""
+RANGE = 12.0
+"""Evidence below the largest [nat] at which a place is out of the question."""
+
+callable_when_compiled(kernels.passed)
+_toggled = compiled(kernels.toggled)
+_tails = compiled(kernels.tails)
+
+
+@dataclass(frozen=True)
+class Acting:
+    """The force of events, and what may be missing throughout."""
+
+    event: Process
+    rest: Process
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """A record as the kernels take it, in steps that are `parts` times smaller than its own."""
+
+    moves: FloatArray
+    noises: FloatArray
+    length: IntArray
+    rows: FloatArray
+    used: BoolArray
+    columns: FloatArray
+    begun: FloatArray
+
+    @property
+    def roots(self) -> FloatArray:
+        """Roots of the noises."""
+        return _roots(self.noises)
+
+
+def _roots(covers: FloatArray) -> FloatArray:
+    """Return roots (..., n, n) of covariances."""
+    values, vectors = np.linalg.eigh(covers)
+    return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+def _turned(items: FloatArray) -> FloatArray:
+    return np.swapaxes(items, -1, -2)
+
+
+def without(
+    products: FloatArray, halves: FloatArray, precision: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return products (..., W, W) and half log determinants (...) without the last, unknown, columns."""
+    if not len(precision):
+        return products, halves
+    prior = np.maximum(precision, LEAST_PRECISION)
+    count = products.shape[-1] - len(prior)
+    root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
+    along = np.linalg.solve(root, products[..., count:, :count])
+    halves = halves + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.log(prior).sum()
+    return products[..., :count, :count] - _turned(along) @ along, halves
+
+
+def joined(
+    before: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    after: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Return products (..., W, W) and half log determinants (...) of whole records from both their parts."""
+    cover, mean, products, halves = before
+    known, along, later, more = after
+    root = _roots(cover)
+    inner = np.linalg.cholesky(np.eye(cover.shape[-1]) + _turned(root) @ known @ root)
+    seen = np.linalg.solve(inner, _turned(root) @ (along - known @ mean))
+    cross = _turned(mean) @ along
+    whole = products + later - cross - _turned(cross) + _turned(mean) @ known @ mean - _turned(seen) @ seen
+    return whole, halves + more + np.log(np.diagonal(inner, axis1=-2, axis2=-1)).sum(-1)
+
+
+class EventSearch:
+    """Looks for events at a view's port.
+
+    Parameters
+    ----------
+    view : View
+        Trials, port, unknowns, what is known to act.
+    process : Process
+        A force that acts throughout: the scale of both forces' priors.
+    flips : sequence of (N,) ndarray of bool
+        By trial, the samples at which the force of events turns its sign.
+    """
+
+    def __init__(self, view: View, process: Process, flips: Sequence[BoolArray]) -> None:
+        self.view, self.process, self.flips = view, process, flips
+        self.columns = [
+            np.concatenate((residual[None], columns, trial.local))
+            for trial, residual, columns in zip(view.trials, view.residuals, view.columns, strict=True)
+        ]
+
+    def steps(self, number: int, acting: Acting, parts: int = 1) -> Steps:
+        """Return a trial as the kernels take it."""
+        trial = self.view.trials[number]
+        one = Filtered(trial, self.view.port, acting.event)
+        generator, intensity, rows, start = one.system
+        f, n = len(trial.system.generator), len(generator) + 1  # the event's force, and last the other one
+        ratio = acting.rest.size / acting.event.size
+        wide = np.zeros((3, n, n))
+        for item, small in zip(wide, (generator, intensity, start), strict=True):
+            item[:-1, :-1] = small
+        wide[0, :f, -1] = generator[:f, f] * ratio
+        wide[0, -1, -1], wide[1, -1, -1], wide[2, -1, -1] = -1.0 / acting.rest.time, acting.rest.intensity, 1.0
+        wide[2, :f, -1] = wide[2, -1, :f] = start[:f, f] * ratio
+        begun = np.stack((wide[2], wide[2]))
+        begun[:, :f, :f] = np.outer(start[:f, f], start[:f, f]) * ratio**2
+        begun[1, :f, :f] += start[:f, :f]
+        begun[0, f], begun[0, :, f] = 0.0, 0.0
+        lengths, which = trial.steps
+        on = discretised(wide[0], wide[1], lengths / parts)
+        wide[:2, f, :] = wide[:2, :, f] = 0.0
+        off = discretised(wide[0], wide[1], lengths / parts)
+        moves, noises = (np.stack((no, no, yes, yes)) for no, yes in zip(off, on, strict=True))
+        moves[:3, :, f] = 0.0
+        moves[0, :, :, f] = moves[1, :, :, f] = 0.0
+        noises[:3, :, f], noises[:3, :, :, f] = 0.0, 0.0
+        noises[1, :, f, f] = 1.0
+        moves, noises = (np.concatenate((items, items), axis=1) for items in (moves, noises))
+        half = moves.shape[1] // 2
+        moves[:, half:, f] *= -1.0  # the force turns with the motion
+        noises[:, half:, f] *= -1.0
+        noises[:, half:, :, f] *= -1.0
+        fine = (len(trial.time) - 1) * parts + 1
+        used = np.zeros((fine, trial.used.shape[1]), dtype=bool)
+        used[::parts] = trial.used
+        columns = np.zeros((*used.shape, len(self.columns[number])))
+        columns[::parts] = np.moveaxis(self.columns[number] * one.white, 0, -1)
+        length = np.concatenate((which[:1], np.repeat(which[1:], parts)))
+        length[::parts] += half * self.flips[number]
+        rows = np.column_stack((rows, rows[:, f] * ratio))
+        return Steps(
+            moves.reshape(-1, n, n), noises.reshape(-1, n, n), length, rows, used, columns, begun
+        )
+
+    def whole(self, number: int, steps: Steps, on: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Return products of residual and shared unknowns of a trial, and half log determinants."""
+        after = _tails(
+            steps.moves, steps.roots, steps.length, on, steps.rows, steps.used, steps.columns, np.array([0])
+        )
+        n, width = len(steps.rows[0]), steps.columns.shape[2]
+        before = (
+            steps.begun[None, int(on[0])], np.zeros((1, n, width)), np.zeros((1, width, width)), np.zeros(1)
+        )  # fmt: skip
+        products, halves = without(*joined(before, after), self.view.trials[number].local_precision)
+        return products[0], halves[0]
+
+    def ways(
+        self, number: int, steps: Steps, on: BoolArray, starts: IntArray, ends: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the same (A, B, ..) with the event the other way from each start to each end."""
+        given = steps.length, on, steps.rows, steps.used, steps.columns
+        before = _toggled(steps.moves, steps.noises, *given, steps.begun, starts, ends)
+        after = _tails(steps.moves, steps.roots, *given, ends)
+        there = np.isfinite(before[3])
+        at = np.nonzero(there)
+        products, halves = without(
+            *joined(tuple(item[at] for item in before), tuple(item[at[1]] for item in after)),
+            self.view.trials[number].local_precision,
+        )
+        found = np.zeros((*there.shape, *products.shape[1:])), np.full(there.shape, np.inf)
+        found[0][at], found[1][at] = products, halves
+        return found
+
+    def evidence(self, products: FloatArray, halves: FloatArray) -> FloatArray:
+        """Return ln evidence (...) from products and half log determinants summed over trials."""
+        left, halves = without(products, halves, self.view.shared_precision)
+        return -0.5 * left[..., 0, 0] - halves
+
+    def total(self, acting: Acting, paths: Sequence[BoolArray]) -> float:
+        """Return ln evidence of events in all trials."""
+        parts = [self.whole(k, self.steps(k, acting), on) for k, on in enumerate(paths)]
+        return float(self.evidence(sum(part[0] for part in parts), sum(part[1] for part in parts)))
+
+    def fitted(self, about: Acting, paths: Sequence[BoolArray], passes: int) -> tuple[Acting, float]:
+        """Return the most probable forces beside events, from some on, and ln evidence less all prices."""
+        process = self.process
+        scale = np.tile((process.size, process.time), 2)
+        given = (about.event.size, about.event.time, about.rest.size, about.rest.time)
+        first = np.log(np.array(given) / scale)
+
+        def acting(move: FloatArray) -> Acting:
+            size, time, rest, slow = np.exp(np.clip(first + move * REACH, -14.0, 14.0)) * scale
+            event = replace(process, size=float(size), time=float(time))
+            return Acting(event, replace(process, size=float(rest), time=float(slow)))
+
+        def objective(move: FloatArray) -> float:
+            prior = float(0.5 * np.sum(((first + move * REACH) / DOUBTS) ** 2))
+            return prior - self.total(acting(move), paths)
+
+        simplex = np.vstack((np.zeros(4), np.eye(4)))
+        options = {"xatol": 0.05, "fatol": 0.2, "maxfev": passes, "initial_simplex": simplex}
+        found = minimize(objective, simplex[0], method="Nelder-Mead", options=options)
+        price = sum(len(changes(on)) * change_price(len(on)) for on in paths)
+        return acting(found.x), -float(found.fun) - price
+
+    def turned(self, acting: Acting, paths: Sequence[BoolArray]) -> list[BoolArray]:
+        """Return paths with stretches turned on or off, one after the other, each of which pays."""
+        steps = [self.steps(number, acting) for number in range(len(paths))]
+        alone = [self.whole(*item) for item in zip(range(len(paths)), steps, paths, strict=True)]
+        found = list(paths)
+        for number, on in enumerate(paths):
+            one = _Record(self, number, steps[number], [item for k, item in enumerate(alone) if k != number])
+            better: BoolArray | None = on
+            for _ in range(2 * MOST_EVENTS):
+                if better is None:
+                    break
+                found[number] = one.placed(better)
+                better = one.turned(found[number])
+            alone[number] = self.whole(number, steps[number], found[number])
+        return found
+
+    def record(self, number: int, acting: Acting, paths: Sequence[BoolArray], parts: int) -> "_Record":
+        """Return a trial in finer steps, beside the others as they are."""
+        others = [
+            self.whole(k, self.steps(k, acting), on) for k, on in enumerate(paths) if k != number
+        ]
+        return _Record(self, number, self.steps(number, acting, parts), others)
+
+
+class _Record:
+    """A trial whose changes are looked for, beside what the others tell of the shared unknowns."""
+
+    def __init__(
+        self, search: EventSearch, number: int, steps: Steps, others: Sequence[tuple[FloatArray, FloatArray]]
+    ) -> None:
+        self.search, self.number, self.steps, self.others = search, number, steps, others
+
+    def _evidence(self, products: FloatArray, halves: FloatArray) -> FloatArray:
+        for more, half in self.others:
+            products, halves = products + more, halves + half
+        return self.search.evidence(products, halves)
+
+    def turned(self, on: BoolArray) -> BoolArray | None:
+        """Return a path with the stretch turned on or off that gains most; None where none pays."""
+        count = len(on)
+        size = min(max(MOST_STEPS // count, 12), STARTS, count)
+        grid = np.unique(np.r_[np.linspace(0, count, size + 1).round(), changes(on)]).astype(np.int64)
+        values = self._evidence(*self.search.ways(self.number, self.steps, on, grid[:-1], grid[1:]))
+        cost = change_price(count) * np.where(np.isin(grid, changes(on)), -1.0, 1.0)
+        cost[[0, -1]] = 0.0
+        gains = values - cost[:-1, None] - cost[None, 1:]
+        a, b = np.unravel_index(np.argmax(gains), gains.shape)
+        if gains[a, b] <= self._evidence(*self.search.whole(self.number, self.steps, on)):
+            return None
+        found = on.copy()
+        found[grid[a] : grid[b + 1]] ^= True
+        return found
+
+    def placed(self, on: BoolArray) -> BoolArray:
+        """Return a path with its changes where they are most probable beside each other."""
+        for _ in range(3):
+            before = on.copy()
+            for k, old in enumerate(changes(on)):
+                places, values = self.curve(on, k)
+                new = places[np.argmax(values)]
+                on = on.copy()
+                on[min(old, new) : max(old, new)] = on[old] if new < old else on[old - 1]
+            if np.array_equal(on, before):
+                break
+        return on
+
+    def curve(self, on: BoolArray, k: int) -> tuple[IntArray, FloatArray]:
+        """Return places of a change between its neighbours, densest where it is probable, ln evidence of each."""
+        low, at, high = np.r_[0, changes(on), len(on)][k : k + 3]
+        later = on.copy()
+        later[low:high] = on[at]
+        places, values = np.zeros(0, dtype=np.int64), np.zeros(0)
+        first, last = low + 1, high - 1
+        while True:
+            new = np.setdiff1d(np.linspace(first, last, PLACES).round().astype(np.int64), places)
+            if not len(new):
+                return places, values
+            found = self.search.ways(self.number, self.steps, later, np.array([low]), new)
+            places, values = np.r_[places, new], np.r_[values, self._evidence(*found)[0]]
+            order = np.argsort(places)
+            places, values = places[order], values[order]
+            near = np.flatnonzero(values > values.max() - RANGE)
+            first, last = places[max(near[0] - 1, 0)], places[min(near[-1] + 1, len(places) - 1)]
+
+
+def changes(on: BoolArray) -> IntArray:
+    """Return the samples from which on a force acts that did not, or does not any more."""
+    return np.flatnonzero(np.diff(on)) + 1
+
+
+def change_price(count: int) -> float:
+    """Return what a change costs in a record of `count` samples [nat]: its place, and that it is there."""
+    return float(np.log(count)) + CHANGE_PRICE
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """Events at a view's port: whether the force acts from each sample on, by trial.
+
+    Attributes
+    ----------
+    search : EventSearch
+        What they were looked for in.
+    acting : Acting
+        The forces.
+    paths : sequence of (N,) ndarray of bool
+        By trial.
+    score : float
+        ln evidence less the prices of all changes, priors of the forces included [nat].
+    """
+
+    search: EventSearch
+    acting: Acting
+    paths: Sequence[BoolArray]
+    score: float
+
+    def moments(self, number: int) -> FloatArray:
+        """Return median and both ends of the 90 % interval (C, 3) of each change in a trial [s]."""
+        on, time = self.paths[number], self.search.view.trials[number].time
+        parts = max(1, FINE // len(on))
+        one = self.search.record(number, self.acting, self.paths, parts)
+        fine = np.repeat(on, parts)[: (len(on) - 1) * parts + 1]
+        found = np.zeros((len(changes(on)), 3))
+        for k in range(len(found)):
+            places, values = one.curve(fine, k)
+            at = np.interp(places / parts, np.arange(len(on)), time)
+            weight = np.exp(values - values.max())
+            share = np.r_[0.0, np.cumsum(0.5 * (weight[1:] + weight[:-1]) * np.diff(at))]
+            found[k] = np.interp((0.5, 0.05, 0.95), share / share[-1], at)
+        return found
+
+
+def events(view: View, motions: Sequence[Motion], process: Process) -> Events:
+    """Return the most probable events at a view's port, about the process of a force that acts throughout."""
+    length = max(float(np.ptp(trial.time)) for trial in view.trials)
+    whole = [np.ones(len(trial.time), dtype=bool) for trial in view.trials]
+    tried: list[Events] = []
+    for flips in turns(view, motions):
+        search = EventSearch(view, process, flips)
+        for on, size, time, rest in STARTS_FROM:
+            event = replace(process, size=process.size * size, time=time * length or process.time)
+            acting = Acting(event, replace(process, size=process.size * rest))
+            paths = [item & on for item in whole]
+            tried.append(_round(search, acting, paths, FEW_PASSES))
+    best = max(tried, key=lambda item: item.score)
+    for _ in range(ROUNDS):
+        again = _round(best.search, best.acting, best.paths, MOST_PASSES)
+        if again.score < best.score + LEAST_GAIN:
+            break
+        best = again
+    return best
+
+
+def _round(search: EventSearch, acting: Acting, paths: Sequence[BoolArray], passes: int) -> Events:
+    paths = search.turned(acting, paths)
+    acting, score = search.fitted(acting, paths, passes)
+    return Events(search, acting, paths, score)
+
+
+def turns(view: View, motions: Sequence[Motion]) -> list[list[BoolArray]]:
+    """Return where a force may turn its sign, by trial (N,): nowhere, or with the speed of its port."""
+    speeds = [
+        np.sign(trial.port_motion(view.port, motion.added)[1][:: trial.parts])
+        for trial, motion in zip(view.trials, motions, strict=True)
+    ]
+    found = [[np.zeros(len(speed), dtype=bool) for speed in speeds]]
+    with_speed = [np.r_[False, speed[1:] != speed[:-1]] for speed in speeds]
+    return [*found, with_speed] if any(flips.any() for flips in with_speed) else found
