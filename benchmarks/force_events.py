@@ -25,6 +25,8 @@ from benchmarks.open_rigs.rigs import HEATED, STORES, Course, FloatArray, entry,
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.fits.problem import Problem
+from discrepancy.missing_force.events import events
+from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.model_choice import load_model
 from discrepancy.workflow import checked
 
@@ -73,7 +75,9 @@ def drawn(folder: Path, kind: str, seed: Sequence[int]) -> Case:
         return float(levels[np.searchsorted(moments, t, "right")])
 
     def during(t: float) -> float:
-        return float(sum(size for size, (begin, end) in zip(sizes, windows) if begin <= t < end))
+        return float(
+            sum(size for size, (begin, end) in zip(sizes, windows, strict=False) if begin <= t < end)
+        )
 
     def heated(t: float, y: FloatArray) -> list[float]:
         hidden = 60.0 * during(t) if kind != "leak" else -1.5 * during(t) * y[0]
@@ -136,3 +140,52 @@ def problem_of(case: Case) -> Problem:
     model = load_model(case.folder / "model.toml")
     campaign, _ = checked(read_campaign(case.folder), model, hold_out=False)
     return Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+
+
+def found_in(case: Case) -> FloatArray:
+    """Return medians and ends of the 90 % intervals (C, 3) of all changes of a record [s]."""
+    search = ForceSearch(problem_of(case))
+    at = search.locate()
+    one = search.rough(max(at, key=lambda name: at[name].evidence))
+    return events(one.view, one.motions, one.process).moments(0)
+
+
+def counted(case: Case, found: FloatArray) -> Counter[str]:
+    """Return how many moments there are, are close, are held, were missed and are not there."""
+    truth = [moment for window in case.windows for moment in window]
+    counts = Counter(moments=len(truth), others=max(0, len(found) - len(truth)))
+    for true in truth:
+        if not len(found):
+            counts["missed"] += 1
+            continue
+        value, low, high = min(found, key=lambda item: abs(item[0] - true))
+        counts["close"] += abs(value - true) <= 0.01 * case.length
+        counts["held"] += low <= true <= high
+    return counts
+
+
+def main() -> None:
+    """Make the records, look for events, and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    print(f"{'what acts':10s} {'moments':>8s} {'close':>6s} {'held':>6s} {'missed':>7s} {'others':>7s}")
+    for number, kind in enumerate(KINDS):
+        counts: Counter[str] = Counter()
+        began = clock.process_time()
+        for k in range(given.count):
+            with threadpool_limits(1):
+                case = drawn(given.out / f"{kind}-{k}", kind, (given.seed, k, number))
+                counts += counted(case, found_in(case))
+        row = [counts[name] for name in ("moments", "close", "held", "missed", "others")]
+        took = (clock.process_time() - began) / given.count
+        print(
+            f"{kind:10s} {row[0]:8d} {row[1]:6d} {row[2]:6d} {row[3]:7d} {row[4]:7d}  {took:.1f} s",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

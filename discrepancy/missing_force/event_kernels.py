@@ -1,10 +1,6 @@
-"""Loops of the filter with a force that acts at times only, compiled: what was before, and what comes after.
+"""Loops of the filter with a force that acts at times only, compiled: what was before, what comes after.
 
-A step leads to a sample by one of four kinds: the force is off at both ends, begins, ends, is on (twice
-whether it was on, and whether it is). Where it is off its state is zero; where it begins, that of a process
-of which nothing was seen.
-
-Shapes: n states, c channels, N samples, W columns that are filtered alike, J different steps.
+Shapes: n states, c channels, N samples, W columns that are filtered alike, S different steps.
 """
 
 import numpy as np
@@ -17,116 +13,75 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 
-def passed(
-    at: int, moves: FloatArray, noises: FloatArray, rows: FloatArray, used: BoolArray, columns: FloatArray,
-    cover: FloatArray, mean: FloatArray, products: FloatArray, gains: FloatArray, sizes: FloatArray,
-    known: bool,
-) -> tuple[FloatArray, FloatArray, float, bool]:  # fmt: skip
-    """Return covariance, mean and half the logarithm of the readings' variances after a step and a sample.
-
-    `at` is the step, below zero: none. `products` (W, W), `gains` (c, n) and `sizes` (c,) are brought up to
-    date in place; where they are `known`, the covariance is steady, and whether it has become so comes last.
-    """
-    before, half = cover, 0.0
-    if at >= 0:
-        mean = moves[at] @ mean
-        if not known:
-            cover = moves[at] @ cover @ moves[at].T + noises[at]
-    for c in range(len(rows)):
-        if used[c]:
-            if not known:
-                weight = cover @ rows[c]
-                sizes[c] = rows[c] @ weight + 1.0
-                gains[c] = weight / sizes[c]
-                keep = np.eye(len(cover)) - np.outer(gains[c], rows[c])
-                cover = keep @ cover @ keep.T + np.outer(gains[c], gains[c])
-            left = columns[c] - rows[c] @ mean
-            mean = mean + np.outer(gains[c], left)
-            products += np.outer(left, left) / sizes[c]
-            half += 0.5 * np.log(sizes[c])
-    return cover, mean, half, known or is_steady(cover, before)
-
-
-def toggled(
-    moves: FloatArray, noises: FloatArray, length: IntArray, on: BoolArray, rows: FloatArray,
-    used: BoolArray, columns: FloatArray, begun: FloatArray, starts: IntArray, ends: IntArray,
+def heads(
+    moves: FloatArray, noises: FloatArray, which: IntArray, rows: FloatArray, used: BoolArray,
+    columns: FloatArray, first: int, cover: FloatArray, mean: FloatArray, places: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    """Return what is known before sample b of `ends`, had the force been the other way since a of `starts`.
+    """Return what the readings of samples `first` to `places` (B,), these left out, tell of the state.
 
     Parameters
     ----------
-    moves, noises : (4 J, n, n) ndarray
-        Transitions and noises by kind, then by step.
-    length : (N,) ndarray
-        Which step leads to each sample.
-    on : (N,) ndarray
-        Whether the force acts from each sample to the next one.
+    moves, noises : (S, n, n) ndarray
+        Transitions and noises.
+    which : (N,) ndarray
+        Step that leads to each sample.
     rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
         Of the readings over their noise, which count, and what is filtered.
-    begun : (2, n, n) ndarray
-        Covariance at the first sample: the force off, on.
-    starts, ends : (A,), (B,) ndarray
-        In order; ends reach from 0 to N.
+    first : int
+        First sample that is read.
+    cover, mean : (n, n), (n, W) ndarray
+        State after the sample before it; at the first of the record, there.
+    places : (B,) ndarray
+        In order.
 
     Returns
     -------
-    covers, means, products, halves : (A, B, n, n), (A, B, n, W), (A, B, W, W), (A, B) ndarray
-        Covariance and mean before that sample, products of the columns before it as independent numbers of
-        variance one, half the logarithm of their variances. Not a number where b is not after a.
+    covers, means, products, halves : (B, n, n), (B, n, W), (B, W, W), (B,) ndarray
+        State after the last sample read, products of the columns as independent numbers of variance one,
+        half the logarithm of the readings' variances.
     """
-    steps, count, n, width = len(moves) // 4, len(on), rows.shape[1], columns.shape[2]
-    covers = np.full((len(starts), len(ends), n, n), np.nan)
-    means = np.zeros((len(starts), len(ends), n, width))
-    products = np.zeros((len(starts), len(ends), width, width))
-    halves = np.full((len(starts), len(ends)), np.nan)
-    gains, sizes = np.zeros((2, len(rows), n)), np.ones((2, len(rows)))
-    cover, mean, product, half = begun[int(on[0])].copy(), np.zeros((n, width)), np.zeros((width, width)), 0.0
-    now, last, steady = 0, -1, False  # the sample whose readings are the next along the way as it is
-    for a in range(len(starts)):
-        while now < starts[a]:
-            at = -1 if now == 0 else (2 * int(on[now - 1]) + int(on[now])) * steps + length[now]
-            alike = now > 0 and at == last and np.all(used[now] == used[now - 1])
-            cover, mean, more, steady = passed(
-                at, moves, noises, rows, used[now], columns[now], cover, mean, product, gains[0], sizes[0],
-                steady and alike,
-            )  # fmt: skip
-            half, last, now = half + more, at, now + 1
-        own, own_mean, own_product, own_half = cover.copy(), mean.copy(), product.copy(), half
-        own_last, own_steady = -1, False
-        b = np.searchsorted(ends, starts[a], "right")
-        for k in range(starts[a], count + 1):
-            was = k > 0 and (on[k - 1] if k == starts[a] else not on[k - 1])
-            if b == len(ends):
-                break
-            if ends[b] == k:
-                covers[a, b], means[a, b] = own, own_mean
-                if k < count:
-                    at = (2 * int(was) + int(on[k])) * steps + length[k]
-                    covers[a, b] = moves[at] @ own @ moves[at].T + noises[at]
-                    means[a, b] = moves[at] @ own_mean
-                products[a, b], halves[a, b] = own_product, own_half
-                b += 1
-            if k == count:
-                break
-            at = -1 if k == 0 else (2 * int(was) + int(not on[k])) * steps + length[k]
-            if k == 0:
-                own = begun[int(not on[0])].copy()
-            alike = k > 0 and at == own_last and np.all(used[k] == used[k - 1])
-            own, own_mean, more, own_steady = passed(
-                at, moves, noises, rows, used[k], columns[k], own, own_mean, own_product, gains[1], sizes[1],
-                own_steady and alike,
-            )  # fmt: skip
-            own_half, own_last = own_half + more, at
+    n, width = mean.shape
+    covers, means = np.zeros((len(places), n, n)), np.zeros((len(places), n, width))
+    products, halves = np.zeros((len(places), width, width)), np.zeros(len(places))
+    product, half = np.zeros((width, width)), 0.0
+    gains, sizes = np.zeros((len(rows), n)), np.ones(len(rows))
+    b, steady = 0, False
+    for k in range(first, places[-1] + 1):
+        while b < len(places) and places[b] == k:
+            covers[b], means[b], products[b], halves[b] = cover, mean, product, half
+            b += 1
+        if b == len(places):
+            break
+        alike = k > first + 1 and which[k] == which[k - 1] and bool(np.all(used[k] == used[k - 1]))
+        steady = steady and alike
+        before = cover
+        if k > 0:
+            mean = moves[which[k]] @ mean
+            if not steady:
+                cover = moves[which[k]] @ cover @ moves[which[k]].T + noises[which[k]]
+        for c in range(len(rows)):
+            if used[k, c]:
+                if not steady:
+                    weight = cover @ rows[c]
+                    sizes[c] = rows[c] @ weight + 1.0
+                    gains[c] = weight / sizes[c]
+                    keep = np.eye(n) - np.outer(gains[c], rows[c])
+                    cover = keep @ cover @ keep.T + np.outer(gains[c], gains[c])
+                left = columns[k, c] - rows[c] @ mean
+                mean = mean + np.outer(gains[c], left)
+                product += np.outer(left, left) / sizes[c]
+                half += 0.5 * np.log(sizes[c])
+        steady = steady or (alike and is_steady(cover, before))
     return covers, means, products, halves
 
 
 def tails(
-    moves: FloatArray, roots: FloatArray, length: IntArray, on: BoolArray, rows: FloatArray,
-    used: BoolArray, columns: FloatArray, places: IntArray,
+    moves: FloatArray, roots: FloatArray, which: IntArray, rows: FloatArray, used: BoolArray,
+    columns: FloatArray, places: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return what the readings from samples `places` (B,) on tell of the state there.
 
-    `roots` (4 J, n, n) are those of the noises. Of a state z their logarithm is, for columns in the weights
+    `roots` (S, n, n) are those of the noises. Of a state z their logarithm is, for columns in the weights
     w (W,): w h' z - z J z / 2 - w c w / 2 - half.
 
     Returns
@@ -134,7 +89,7 @@ def tails(
     J, h, c, half : (B, n, n), (B, n, W), (B, W, W), (B,) ndarray
         Zero from N on.
     """
-    steps, count, n, width = len(moves) // 4, len(on), rows.shape[1], columns.shape[2]
+    count, n, width = len(which), rows.shape[1], columns.shape[2]
     known, along = np.zeros((len(places), n, n)), np.zeros((len(places), n, width))
     products, halves = np.zeros((len(places), width, width)), np.zeros(len(places))
     J, h, c, half = np.zeros((n, n)), np.zeros((n, width)), np.zeros((width, width)), 0.0
@@ -142,7 +97,7 @@ def tails(
     b = np.searchsorted(places, count) - 1
     last, steady = -1, False
     for k in range(count - 1, -1, -1):
-        alike = k < count - 1 and np.all(used[k] == used[k + 1])
+        alike = k < count - 1 and bool(np.all(used[k] == used[k + 1]))
         for channel in range(len(rows)):
             if used[k, channel]:
                 h += np.outer(rows[channel], columns[k, channel])
@@ -158,7 +113,7 @@ def tails(
             b -= 1
         if b < 0:
             break
-        at = (2 * int(on[k - 1]) + int(on[k])) * steps + length[k]
+        at = which[k]
         if not (steady and alike and at == last):
             root = roots[at]
             inner = np.eye(n) + root.T @ read @ root

@@ -9,6 +9,7 @@ Stretches are turned on or off, one after the other, while that gains more than 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +19,14 @@ from fe.compilation import callable_when_compiled, compiled
 
 from . import event_kernels as kernels
 from .filtered import Filtered, Process, discretised
+from .kalman_kernels import is_steady
 from .regression import LEAST_PRECISION
 from .view import SIZE_DOUBT, TIME_DOUBT, Motion, View
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+States = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 CHANGE_PRICE = 4.0
 """ln odds against a change, beside the choice of its place."""
@@ -37,9 +40,13 @@ FINE = 4000
 """Places of a change in a short record: between its samples too."""
 MOST_EVENTS = 6
 """Stretches of a record: more are no events, but a force that varies."""
-STARTS_FROM = ((True, 1.0, 0.0, 0.003), (False, 3.0, 0.0, 0.003), (False, 3.0, 1.0, 0.1), (False, 5.0, 0.0, 1.0))
-"""Whether all stretches are on at first, size of the event's force, its time over that of the records (or as
-the process), size of the other one."""
+STARTS_FROM = ((3.0, False, 0.003), (3.0, True, 0.1), (5.0, False, 1.0))
+"""Forces of which the search begins, over the process: size of the event's force, whether it hardly varies
+within a record, size of the other one."""
+NONE = 1e-3
+"""Size of no force over one."""
+GROUND = 3.0
+"""Evidence over no missing force [nat] from which there is one in a record."""
 FEW_PASSES, MOST_PASSES, ROUNDS = 30, 60, 5
 LEAST_GAIN = 0.5
 REACH = np.array([0.9, 0.7, 0.9, 0.7])
@@ -48,8 +55,8 @@ DOUBTS = np.array([SIZE_DOUBT, 3.0, SIZE_DOUBT, TIME_DOUBT])
 RANGE = 12.0
 """Evidence below the largest [nat] at which a place is out of the question."""
 
-callable_when_compiled(kernels.passed)
-_toggled = compiled(kernels.toggled)
+callable_when_compiled(is_steady)
+_heads = compiled(kernels.heads)
 _tails = compiled(kernels.tails)
 
 
@@ -73,10 +80,30 @@ class Steps:
     columns: FloatArray
     begun: FloatArray
 
-    @property
+    @cached_property
     def roots(self) -> FloatArray:
         """Roots of the noises."""
         return _roots(self.noises)
+
+    def which(self, on: BoolArray) -> IntArray:
+        """Return the step (N,) that leads to each sample, the force acting from some on."""
+        kind = 2 * np.r_[False, on[:-1]] + on
+        return np.asarray(kind * (len(self.moves) // 4) + self.length)
+
+    def before(self, on: BoolArray, first: int, state: Sequence[FloatArray], places: IntArray) -> States:
+        """Return the states before steps to some samples, from that before the step to the first on."""
+        given = self.moves, self.noises, self.which(on), self.rows, self.used, self.columns
+        cover, mean, products, halves = _heads(*given, first, state[0], state[1], places)
+        return cover, mean, products + state[2], halves + state[3]
+
+    def after(self, on: BoolArray, places: IntArray) -> States:
+        """Return what the readings from some samples on tell of the states there."""
+        return _tails(self.moves, self.roots, self.which(on), self.rows, self.used, self.columns, places)
+
+    def begin(self, on: bool) -> States:
+        """Return the state at the first sample."""
+        n, width = self.rows.shape[1], self.columns.shape[2]
+        return self.begun[int(on)], np.zeros((n, width)), np.zeros((width, width)), np.zeros(())
 
 
 def _roots(covers: FloatArray) -> FloatArray:
@@ -89,30 +116,25 @@ def _turned(items: FloatArray) -> FloatArray:
     return np.swapaxes(items, -1, -2)
 
 
-def without(
-    products: FloatArray, halves: FloatArray, precision: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return products (..., W, W) and half log determinants (...) without the last, unknown, columns."""
     if not len(precision):
         return products, halves
     prior = np.maximum(precision, LEAST_PRECISION)
     count = products.shape[-1] - len(prior)
     root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
-    along = np.linalg.solve(root, products[..., count:, :count])
+    along = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
     halves = halves + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.log(prior).sum()
     return products[..., :count, :count] - _turned(along) @ along, halves
 
 
-def joined(
-    before: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    after: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-) -> tuple[FloatArray, FloatArray]:
+def joined(before: Sequence[FloatArray], after: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return products (..., W, W) and half log determinants (...) of whole records from both their parts."""
     cover, mean, products, halves = before
     known, along, later, more = after
     root = _roots(cover)
     inner = np.linalg.cholesky(np.eye(cover.shape[-1]) + _turned(root) @ known @ root)
-    seen = np.linalg.solve(inner, _turned(root) @ (along - known @ mean))
+    seen = np.asarray(np.linalg.solve(inner, _turned(root) @ (along - known @ mean)))
     cross = _turned(mean) @ along
     whole = products + later - cross - _turned(cross) + _turned(mean) @ known @ mean - _turned(seen) @ seen
     return whole, halves + more + np.log(np.diagonal(inner, axis1=-2, axis2=-1)).sum(-1)
@@ -149,7 +171,7 @@ class EventSearch:
         for item, small in zip(wide, (generator, intensity, start), strict=True):
             item[:-1, :-1] = small
         wide[0, :f, -1] = generator[:f, f] * ratio
-        wide[0, -1, -1], wide[1, -1, -1], wide[2, -1, -1] = -1.0 / acting.rest.time, acting.rest.intensity, 1.0
+        wide[:, -1, -1] = acting.rest.generator[0, 0], acting.rest.intensity, 1.0
         wide[2, :f, -1] = wide[2, -1, :f] = start[:f, f] * ratio
         begun = np.stack((wide[2], wide[2]))
         begun[:, :f, :f] = np.outer(start[:f, f], start[:f, f]) * ratio**2
@@ -161,7 +183,6 @@ class EventSearch:
         off = discretised(wide[0], wide[1], lengths / parts)
         moves, noises = (np.stack((no, no, yes, yes)) for no, yes in zip(off, on, strict=True))
         moves[:3, :, f] = 0.0
-        moves[0, :, :, f] = moves[1, :, :, f] = 0.0
         noises[:3, :, f], noises[:3, :, :, f] = 0.0, 0.0
         noises[1, :, f, f] = 1.0
         moves, noises = (np.concatenate((items, items), axis=1) for items in (moves, noises))
@@ -177,38 +198,39 @@ class EventSearch:
         length = np.concatenate((which[:1], np.repeat(which[1:], parts)))
         length[::parts] += half * self.flips[number]
         rows = np.column_stack((rows, rows[:, f] * ratio))
-        return Steps(
-            moves.reshape(-1, n, n), noises.reshape(-1, n, n), length, rows, used, columns, begun
-        )
+        return Steps(moves.reshape(-1, n, n), noises.reshape(-1, n, n), length, rows, used, columns, begun)
 
     def whole(self, number: int, steps: Steps, on: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return products of residual and shared unknowns of a trial, and half log determinants."""
-        after = _tails(
-            steps.moves, steps.roots, steps.length, on, steps.rows, steps.used, steps.columns, np.array([0])
-        )
-        n, width = len(steps.rows[0]), steps.columns.shape[2]
-        before = (
-            steps.begun[None, int(on[0])], np.zeros((1, n, width)), np.zeros((1, width, width)), np.zeros(1)
-        )  # fmt: skip
-        products, halves = without(*joined(before, after), self.view.trials[number].local_precision)
+        begin = [item[None] for item in steps.begin(bool(on[0]))]
+        found = joined(begin, steps.after(on, np.array([0])))
+        products, halves = without(*found, self.view.trials[number].local_precision)
         return products[0], halves[0]
 
     def ways(
         self, number: int, steps: Steps, on: BoolArray, starts: IntArray, ends: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the same (A, B, ..) with the event the other way from each start to each end."""
-        given = steps.length, on, steps.rows, steps.used, steps.columns
-        before = _toggled(steps.moves, steps.noises, *given, steps.begun, starts, ends)
-        after = _tails(steps.moves, steps.roots, *given, ends)
-        there = np.isfinite(before[3])
-        at = np.nonzero(there)
-        products, halves = without(
-            *joined(tuple(item[at] for item in before), tuple(item[at[1]] for item in after)),
-            self.view.trials[number].local_precision,
-        )
-        found = np.zeros((*there.shape, *products.shape[1:])), np.full(there.shape, np.inf)
-        found[0][at], found[1][at] = products, halves
-        return found
+        """Return the same (A, B, ..) with the event the other way from each start to each end after it."""
+        after, size, shape = steps.after(on, ends), len(steps.moves) // 4, (len(starts), len(ends))
+        width = 1 + len(self.view.shared_precision)
+        products, halves = np.zeros((*shape, width, width)), np.full(shape, np.inf)
+        states = steps.before(on, 0, steps.begin(bool(on[0])), starts)
+        last = ends == len(on)
+        to = np.where(last, 0, ends)
+        at = (2 * ~on[ends - 1] + on[to]) * size + steps.length[to]
+        moves = np.where(last[:, None, None], np.eye(len(steps.rows[0])), steps.moves[at])
+        noises = np.where(last[:, None, None], 0.0, steps.noises[at])
+        for k, start in enumerate(starts):
+            state = [item[k] for item in states] if start else steps.begin(not on[0])
+            there = ends > start
+            other = on.copy()
+            other[start:] ^= True
+            cover, mean, *sums = steps.before(other, int(start), state, ends[there])
+            move = moves[there]
+            arrived = move @ cover @ _turned(move) + noises[there], move @ mean, *sums
+            found = joined(arrived, [item[there] for item in after])
+            products[k, there], halves[k, there] = without(*found, self.view.trials[number].local_precision)
+        return products, halves
 
     def evidence(self, products: FloatArray, halves: FloatArray) -> FloatArray:
         """Return ln evidence (...) from products and half log determinants summed over trials."""
@@ -218,7 +240,8 @@ class EventSearch:
     def total(self, acting: Acting, paths: Sequence[BoolArray]) -> float:
         """Return ln evidence of events in all trials."""
         parts = [self.whole(k, self.steps(k, acting), on) for k, on in enumerate(paths)]
-        return float(self.evidence(sum(part[0] for part in parts), sum(part[1] for part in parts)))
+        products, halves = (np.sum(items, axis=0) for items in zip(*parts, strict=True))
+        return float(self.evidence(products, halves))
 
     def fitted(self, about: Acting, paths: Sequence[BoolArray], passes: int) -> tuple[Acting, float]:
         """Return the most probable forces beside events, from some on, and ln evidence less all prices."""
@@ -260,9 +283,7 @@ class EventSearch:
 
     def record(self, number: int, acting: Acting, paths: Sequence[BoolArray], parts: int) -> "_Record":
         """Return a trial in finer steps, beside the others as they are."""
-        others = [
-            self.whole(k, self.steps(k, acting), on) for k, on in enumerate(paths) if k != number
-        ]
+        others = [self.whole(k, self.steps(k, acting), on) for k, on in enumerate(paths) if k != number]
         return _Record(self, number, self.steps(number, acting, parts), others)
 
 
@@ -309,7 +330,7 @@ class _Record:
         return on
 
     def curve(self, on: BoolArray, k: int) -> tuple[IntArray, FloatArray]:
-        """Return places of a change between its neighbours, densest where it is probable, ln evidence of each."""
+        """Return places of a change, densest where it is probable, and ln evidence of each."""
         low, at, high = np.r_[0, changes(on), len(on)][k : k + 3]
         later = on.copy()
         later[low:high] = on[at]
@@ -374,25 +395,57 @@ class Events:
         return found
 
 
-def events(view: View, motions: Sequence[Motion], process: Process) -> Events:
-    """Return the most probable events at a view's port, about the process of a force that acts throughout."""
+def events(view: View, motions: Sequence[Motion], process: Process, least: float = -np.inf) -> Events:
+    """Return the most probable events at a view's port.
+
+    Parameters
+    ----------
+    view : View
+        Trials, port, unknowns.
+    motions : sequence of Motion
+        Of the trials.
+    process : Process
+        A force that acts throughout.
+    least : float
+        Evidence of what else explains all [nat]: with less there are no events.
+
+    Returns
+    -------
+    Events
+        With changes where these tell more than a force that acts throughout the records that have one.
+    """
     length = max(float(np.ptp(trial.time)) for trial in view.trials)
-    whole = [np.ones(len(trial.time), dtype=bool) for trial in view.trials]
-    tried: list[Events] = []
-    for flips in turns(view, motions):
-        search = EventSearch(view, process, flips)
-        for on, size, time, rest in STARTS_FROM:
-            event = replace(process, size=process.size * size, time=time * length or process.time)
+    off = [np.zeros(len(trial.time), dtype=bool) for trial in view.trials]
+    searches = [EventSearch(view, process, flips) for flips in turns(view, motions)]
+    always = [_throughout(search, off) for search in searches]
+    tried = []
+    for search in searches:
+        for size, slow, rest in STARTS_FROM:
+            event = Process(process.size * size, length if slow else process.time, rough=True)
             acting = Acting(event, replace(process, size=process.size * rest))
-            paths = [item & on for item in whole]
-            tried.append(_round(search, acting, paths, FEW_PASSES))
+            tried.append(_round(search, acting, off, FEW_PASSES))
     best = max(tried, key=lambda item: item.score)
     for _ in range(ROUNDS):
         again = _round(best.search, best.acting, best.paths, MOST_PASSES)
         if again.score < best.score + LEAST_GAIN:
             break
         best = again
-    return best
+    steady = max(always, key=lambda item: item.score)
+    changed = any(len(changes(on)) for on in best.paths)
+    return best if changed and best.score > max(least, steady.score) else steady
+
+
+def _throughout(search: EventSearch, off: Sequence[BoolArray]) -> Events:
+    """Return a force that acts throughout the records in which there is one."""
+    rest = replace(search.process, size=NONE * search.process.size)
+    paths = [~on for on in off]
+    acting, score = search.fitted(Acting(search.process, rest), paths, FEW_PASSES)
+    acting = replace(acting, rest=rest)
+    for number, on in enumerate(off):
+        fewer = [*paths[:number], on, *paths[number + 1 :]]
+        if search.total(acting, fewer) > search.total(acting, paths) - GROUND:
+            paths = fewer
+    return Events(search, acting, paths, score)
 
 
 def _round(search: EventSearch, acting: Acting, paths: Sequence[BoolArray], passes: int) -> Events:

@@ -146,9 +146,9 @@ def _missing(problem: Problem, fit: CandidateFit, effects: Sequence[Effect]) -> 
     port = max(at, key=lambda name: at[name].evidence)
     if evidence[port] < GROUND:
         return None
-    drawn = _Drawn(at[port])
+    drawn = Drawn(at[port])
     if believed:
-        laws = _of_verdict(search, fit, patch)
+        laws = [law for name in at if (law := law_at_port(search, fit, name)) is not None]
         ahead = [law for law in laws if law.seen.evidence > at[law.port(at)].evidence + GROUND]
         if (
             len(laws) != 1 or not ahead
@@ -160,7 +160,7 @@ def _missing(problem: Problem, fit: CandidateFit, effects: Sequence[Effect]) -> 
         acts = first is not None and any(part.forces for part in first.seen.view.effects[-1].parts)
         if first is not None and acts and first.evidence > at[port].evidence + GROUND:
             column = first.seen.view.effects[-1]
-            drawn = _Drawn(first.seen, column, first.size, first.term.effect.name)
+            drawn = Drawn(first.seen, column, first.size, first.term.effect.name)
     return _told(search, drawn.port(at), drawn, evidence)
 
 
@@ -170,7 +170,7 @@ def _of_nothing(found: Seen) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
+class Drawn:
     """What is left of the missing force beside a law, which is a factor times a column."""
 
     seen: Seen
@@ -179,30 +179,28 @@ class _Drawn:
     name: str = ""
 
     def port(self, ports: Iterable[str]) -> str:
+        """Return its port, one of some."""
         return list(ports)[self.seen.view.port]
 
 
-def _of_verdict(search: ForceSearch, fit: CandidateFit, patch: ModelPatch) -> list[_Drawn]:
-    """Return what is left at each port at which a verdict has laws, beside these."""
-    columns = Columns(search.problem, search.numbers, search.point)
-    named, found = " and ".join(term.effect.name for term in fit.candidate.terms), []
-    for port, one in search.at.items():
-        forces = (item for item in patch if isinstance(item, PortForce))
-        own = ModelPatch(tuple(item for item in forces if item.port == port))
-        drawn, motions = None, one.motions
-        for _ in range(ROUNDS if len(own) else 0):  # along the motion that the law itself gives
-            column = columns.of_patch(one.view, motions, own, fit.candidate.acts_on)
-            if column is None:
-                break
-            view = replace(one.view, motions=motions, certain=(*one.view.certain, column))
-            drawn = _Drawn(seen(view, one.process), column, 1.0, named)
-            motions = drawn.seen.motions
-        if drawn is not None:
-            found.append(drawn)
-    return found
+def law_at_port(search: ForceSearch, fit: CandidateFit, port: str) -> Drawn | None:
+    """Return what is left at a port beside the laws of a verdict there; None where it has none."""
+    candidate, one, drawn = fit.candidate, search.at[port], None
+    patch = candidate.patch(search.problem.setting, fit.point.effect) if candidate.terms else ()
+    own = ModelPatch(tuple(item for item in patch if isinstance(item, PortForce) and item.port == port))
+    columns, motions = Columns(search.problem, search.numbers, search.point), one.motions
+    for _ in range(ROUNDS if len(own) else 0):  # along the motion that the law itself gives
+        column = columns.of_patch(one.view, motions, own, candidate.acts_on)
+        if column is None:
+            break
+        view = replace(one.view, motions=motions, certain=(*one.view.certain, column))
+        named = " and ".join(term.effect.name for term in candidate.terms)
+        drawn = Drawn(seen(view, one.process), column, 1.0, named)
+        motions = drawn.seen.motions
+    return drawn
 
 
-def _told(search: ForceSearch, port: str, drawn: _Drawn, evidence: Mapping[str, float]) -> MissingForce:
+def _told(search: ForceSearch, port: str, drawn: Drawn, evidence: Mapping[str, float]) -> MissingForce:
     found, view = drawn.seen, drawn.seen.view
     courses = []
     for number, (trial, motion) in enumerate(zip(view.trials, found.motions, strict=True)):

@@ -1,0 +1,157 @@
+"""When there is a gap in the records in time: events of the missing force, or of what readings show.
+
+Where a model tells how its ports move, an event is a force at the port that tells most, or on the reading of
+one channel where that tells more, beside all unknowns of the records. Elsewhere it acts on the pattern over
+the channels in which the residuals of a fit are largest.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import TrialKind
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.problem import Problem
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.models.ported import PortedSystem, shows_ports
+from discrepancy.verdict import GapWindow, Moment
+
+from .events import MOST_EVENTS, Events, changes, events
+from .filtered import Process
+from .force import law_at_port
+from .naming import ForceSearch, Seen, seen
+from .trial import SeenTrial
+from .view import View
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IN_TIME = frozenset(TrialKind) - {TrialKind.STATIC}
+
+SHOWS = 0.2
+"""Share of the largest channel's size from which on a channel shows a gap."""
+READING_SIZES, READING_TIMES = (3.0, 30.0, 300.0), (0.02, 0.3)
+"""Processes on a reading that are weighed against the force: over the noise, over the record's length."""
+
+
+def gap_windows(
+    problem: Problem, fit: CandidateFit, residuals: ResidualSet, *, seed: int = 0
+) -> tuple[GapWindow, ...]:
+    """Return when there is a gap of the model as it was, in records held out too.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    fit : CandidateFit
+        Of the verdict: where its law at a port, acting throughout, tells more than events, there are none.
+    residuals : ResidualSet
+        Of the model as it was; those of trials whose force cannot be seen are looked at themselves.
+    seed : int
+        Of the draw that restores what the fit has absorbed.
+    """
+    dynamic = tuple(item.trial for item in residuals.trials if item.trial.is_dynamic)
+    if not dynamic or not shows_ports(problem.model.inner):
+        return residual_windows(residuals, seed=seed)
+    search = ForceSearch(problem.with_trials(dynamic))
+    at = search.locate()
+    port = max(at, key=lambda name: at[name].evidence)
+    at[port] = search.rough(port)
+    found = _most_telling(at[port])
+    law = law_at_port(search, fit, port)
+    best = events(found.view, found.motions, found.process, -np.inf if law is None else law.seen.evidence)
+    shown = [
+        trial.readings(trial.pushed(found.view.port, motion.force), found.view.port, motion.force)
+        for trial, motion in zip(found.view.trials, found.motions, strict=True)
+    ]
+    windows = _windows(best, [trial.channels for trial in dynamic], shown, with_effect=False)
+    return windows + residual_windows(residuals, seed=seed, kinds=frozenset({TrialKind.FLIGHT}))
+
+
+def residual_windows(
+    residuals: ResidualSet,
+    *,
+    seed: int = 0,
+    with_effect: bool = False,
+    kinds: frozenset[TrialKind] = IN_TIME,
+) -> tuple[GapWindow, ...]:
+    """Return when the residuals of a hypothesis are more than noise, in trials of some kinds.
+
+    `with_effect`: whether it is the best one, not the model as it was.
+    """
+    found: tuple[GapWindow, ...] = ()
+    white = residuals.white(np.random.default_rng((seed, 1)))
+    for item, series in zip(residuals.trials, white, strict=True):
+        if item.trial.kind in kinds and item.used.any() and len(series) > 1:
+            one, pattern = of_series(item.trial.name, item.trial.time, series, item.used)
+            best = events(one.view, one.motions, one.process)
+            shown = one.motions[0].force[:, None] * pattern
+            found += _windows(best, [item.trial.channels], [shown], with_effect=with_effect)
+    return found
+
+
+def _most_telling(at: Seen) -> Seen:
+    """Return the missing force, or what one channel shows beside the model where that tells more."""
+    view, best = at.view, at
+    trials = view.trials
+    for channel in range(min(trial.residual.shape[1] for trial in trials)):
+        on_reading = replace(view, trials=[_reading(trial, channel) for trial in trials], port=0)
+        length = max(float(np.ptp(trial.time)) for trial in trials)
+        processes = [
+            Process(size, time * length, rough=True) for size, time in product(READING_SIZES, READING_TIMES)
+        ]
+        about = max(processes, key=lambda item: on_reading.solve(item).evidence)
+        if on_reading.solve(about).evidence > best.evidence:
+            best = seen(on_reading, about)
+    return best
+
+
+def _reading(trial: SeenTrial, channel: int) -> SeenTrial:
+    """Return a trial whose only port is a reading; a unit of its force is the deviation of the noise."""
+    shown = np.zeros((1, len(trial.deviation)))
+    shown[0, channel] = -trial.deviation[channel]
+    still = np.zeros((len(trial.positions), 1))
+    none = np.zeros((1, len(trial.system.generator)))
+    system = replace(
+        trial.system, ports=("reading",), actions=none, positions=none, speeds=none, through=shown
+    )
+    return replace(trial, system=system, positions=still, speeds=still)
+
+
+def of_series(name: str, time: FloatArray, series: FloatArray, used: BoolArray) -> tuple[Seen, FloatArray]:
+    """Return residuals in noises (N, C) as a record of one reading: their largest pattern (C,), which too."""
+    series = np.where(used, series, 0.0)
+    pattern = np.linalg.svd(series, full_matrices=False)[2][:1]
+    none, columns = np.zeros((1, 0)), np.zeros((0, len(time), 1))
+    still = np.zeros((len(time), 1))
+    system = PortedSystem(np.zeros((0, 0)), ("readings",), none, none, none, none, -np.ones((1, 1)))
+    trial = SeenTrial(
+        name, time, series @ pattern.T, np.any(used, axis=1).reshape(-1, 1), np.ones(1), (),
+        columns, columns, np.zeros(0), system, (), 1, still, still, False,
+    )  # fmt: skip
+    size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
+    found = seen(View([trial], 0, np.zeros(0)), Process(size, 0.1 * float(np.ptp(time)), rough=True))
+    return found, pattern[0]
+
+
+def _windows(
+    best: Events, channels: Sequence[tuple[str, ...]], shown: Sequence[FloatArray], *, with_effect: bool
+) -> tuple[GapWindow, ...]:
+    """Return the windows of events, given by trial the channels and what these show of the force (N, C)."""
+    windows = []
+    for number, (trial, on) in enumerate(zip(best.search.view.trials, best.paths, strict=True)):
+        ends = (float(trial.time[0]), float(trial.time[-1]))
+        at = changes(on)
+        if len(at) > 2 * MOST_EVENTS:
+            on, at = np.ones_like(on), at[:0]
+        moments = [Moment(*map(float, item)) for item in best.moments(number)] if len(at) else []
+        edges, known = [0, *at, len(on)], [None, *moments, None]
+        for k in np.flatnonzero(on[edges[:-1]]):
+            size = np.sqrt(np.mean(shown[number][edges[k] : edges[k + 1]] ** 2, axis=0))
+            rows = zip(channels[number], size > SHOWS * size.max(), strict=True)
+            names = tuple(name for name, shows in rows if shows)
+            largest = float(size.max())
+            windows.append(GapWindow(trial.name, names, known[k], known[k + 1], *ends, largest, with_effect))
+    return tuple(windows)
