@@ -9,24 +9,18 @@ Stretches are turned on or off, one after the other, while that gains more than 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from fe.compilation import callable_when_compiled, compiled
-
-from . import event_kernels as kernels
+from .event_steps import Steps, joined, without
 from .filtered import Filtered, Process, discretised
-from .kalman_kernels import is_steady
-from .regression import LEAST_PRECISION
 from .view import SIZE_DOUBT, TIME_DOUBT, Motion, View
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-States = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 CHANGE_PRICE = 4.0
 """ln odds against a change, beside the choice of its place."""
@@ -38,6 +32,8 @@ PLACES = 80
 """Places of a change that are weighed at once."""
 FINE = 4000
 """Places of a change in a short record: between its samples too."""
+WORK = 4000
+"""Samples of all records between which events are looked for; of more, some are left out until the last."""
 MOST_EVENTS = 6
 """Stretches of a record: more are no events, but a force that varies."""
 STARTS_FROM = ((3.0, False, 0.003), (3.0, True, 0.1), (5.0, False, 1.0))
@@ -55,10 +51,6 @@ DOUBTS = np.array([SIZE_DOUBT, 3.0, SIZE_DOUBT, TIME_DOUBT])
 RANGE = 12.0
 """Evidence below the largest [nat] at which a place is out of the question."""
 
-callable_when_compiled(is_steady)
-_heads = compiled(kernels.heads)
-_tails = compiled(kernels.tails)
-
 
 @dataclass(frozen=True)
 class Acting:
@@ -66,78 +58,6 @@ class Acting:
 
     event: Process
     rest: Process
-
-
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """A record as the kernels take it, in steps that are `parts` times smaller than its own."""
-
-    moves: FloatArray
-    noises: FloatArray
-    length: IntArray
-    rows: FloatArray
-    used: BoolArray
-    columns: FloatArray
-    begun: FloatArray
-
-    @cached_property
-    def roots(self) -> FloatArray:
-        """Roots of the noises."""
-        return _roots(self.noises)
-
-    def which(self, on: BoolArray) -> IntArray:
-        """Return the step (N,) that leads to each sample, the force acting from some on."""
-        kind = 2 * np.r_[False, on[:-1]] + on
-        return np.asarray(kind * (len(self.moves) // 4) + self.length)
-
-    def before(self, on: BoolArray, first: int, state: Sequence[FloatArray], places: IntArray) -> States:
-        """Return the states before steps to some samples, from that before the step to the first on."""
-        given = self.moves, self.noises, self.which(on), self.rows, self.used, self.columns
-        cover, mean, products, halves = _heads(*given, first, state[0], state[1], places)
-        return cover, mean, products + state[2], halves + state[3]
-
-    def after(self, on: BoolArray, places: IntArray) -> States:
-        """Return what the readings from some samples on tell of the states there."""
-        return _tails(self.moves, self.roots, self.which(on), self.rows, self.used, self.columns, places)
-
-    def begin(self, on: bool) -> States:
-        """Return the state at the first sample."""
-        n, width = self.rows.shape[1], self.columns.shape[2]
-        return self.begun[int(on)], np.zeros((n, width)), np.zeros((width, width)), np.zeros(())
-
-
-def _roots(covers: FloatArray) -> FloatArray:
-    """Return roots (..., n, n) of covariances."""
-    values, vectors = np.linalg.eigh(covers)
-    return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
-
-
-def _turned(items: FloatArray) -> FloatArray:
-    return np.swapaxes(items, -1, -2)
-
-
-def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return products (..., W, W) and half log determinants (...) without the last, unknown, columns."""
-    if not len(precision):
-        return products, halves
-    prior = np.maximum(precision, LEAST_PRECISION)
-    count = products.shape[-1] - len(prior)
-    root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
-    along = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
-    halves = halves + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.log(prior).sum()
-    return products[..., :count, :count] - _turned(along) @ along, halves
-
-
-def joined(before: Sequence[FloatArray], after: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return products (..., W, W) and half log determinants (...) of whole records from both their parts."""
-    cover, mean, products, halves = before
-    known, along, later, more = after
-    root = _roots(cover)
-    inner = np.linalg.cholesky(np.eye(cover.shape[-1]) + _turned(root) @ known @ root)
-    seen = np.asarray(np.linalg.solve(inner, _turned(root) @ (along - known @ mean)))
-    cross = _turned(mean) @ along
-    whole = products + later - cross - _turned(cross) + _turned(mean) @ known @ mean - _turned(seen) @ seen
-    return whole, halves + more + np.log(np.diagonal(inner, axis1=-2, axis2=-1)).sum(-1)
 
 
 class EventSearch:
@@ -227,7 +147,7 @@ class EventSearch:
             other[start:] ^= True
             cover, mean, *sums = steps.before(other, int(start), state, ends[there])
             move = moves[there]
-            arrived = move @ cover @ _turned(move) + noises[there], move @ mean, *sums
+            arrived = move @ cover @ np.swapaxes(move, -1, -2) + noises[there], move @ mean, *sums
             found = joined(arrived, [item[there] for item in after])
             products[k, there], halves[k, there] = without(*found, self.view.trials[number].local_precision)
         return products, halves
@@ -395,15 +315,13 @@ class Events:
         return found
 
 
-def events(view: View, motions: Sequence[Motion], process: Process, least: float = -np.inf) -> Events:
+def events(view: View, process: Process, least: float = -np.inf) -> Events:
     """Return the most probable events at a view's port.
 
     Parameters
     ----------
     view : View
         Trials, port, unknowns.
-    motions : sequence of Motion
-        Of the trials.
     process : Process
         A force that acts throughout.
     least : float
@@ -414,25 +332,56 @@ def events(view: View, motions: Sequence[Motion], process: Process, least: float
     Events
         With changes where these tell more than a force that acts throughout the records that have one.
     """
+    every = -(-sum(len(trial.time) for trial in view.trials) // WORK)
+    coarse = thinned(view, every)
     length = max(float(np.ptp(trial.time)) for trial in view.trials)
-    off = [np.zeros(len(trial.time), dtype=bool) for trial in view.trials]
-    searches = [EventSearch(view, process, flips) for flips in turns(view, motions)]
-    always = [_throughout(search, off) for search in searches]
-    tried = []
-    for search in searches:
+    off = [np.zeros(len(trial.time), dtype=bool) for trial in coarse.trials]
+    always, tried = [], []
+    for with_speed, flips in enumerate(turns(coarse)):
+        search = EventSearch(coarse, process, flips)
+        always.append((_throughout(search, off), with_speed))
         for size, slow, rest in STARTS_FROM:
             event = Process(process.size * size, length if slow else process.time, rough=True)
             acting = Acting(event, replace(process, size=process.size * rest))
-            tried.append(_round(search, acting, off, FEW_PASSES))
-    best = max(tried, key=lambda item: item.score)
+            tried.append((_round(search, acting, off, FEW_PASSES), with_speed))
+    best, turning = max(tried, key=lambda item: item[0].score)
     for _ in range(ROUNDS):
         again = _round(best.search, best.acting, best.paths, MOST_PASSES)
         if again.score < best.score + LEAST_GAIN:
             break
         best = again
-    steady = max(always, key=lambda item: item.score)
+    steady = max(always, key=lambda item: item[0].score)
     changed = any(len(changes(on)) for on in best.paths)
-    return best if changed and best.score > max(least, steady.score) else steady
+    if not changed or best.score <= max(least, steady[0].score):
+        best, turning = steady
+    if every == 1:
+        return best
+    whole = EventSearch(view, process, turns(view)[turning])
+    paths = [
+        np.repeat(on, every)[: len(trial.time)] for on, trial in zip(best.paths, view.trials, strict=True)
+    ]
+    for number in range(len(paths)):
+        paths[number] = whole.record(number, best.acting, paths, 1).placed(paths[number])
+    return Events(whole, best.acting, paths, best.score)
+
+
+def thinned(view: View, every: int) -> View:
+    """Return a view with every so many one of the readings."""
+    trials, motions = [], []
+    for number, trial in enumerate(view.trials):
+        at = slice(None, None, every)
+        fine = slice((len(trial.time) - 1) // every * every * trial.parts + 1)
+        known = sum(item.parts[number].readings for item in view.certain)
+        trials.append(
+            replace(
+                trial, time=trial.time[at], residual=(trial.residual - known)[at], used=trial.used[at],
+                shared=trial.shared[:, at], local=trial.local[:, at], parts=trial.parts * every,
+                positions=trial.positions[fine], speeds=trial.speeds[fine],
+            )
+        )  # fmt: skip
+        if view.motions:
+            motions.append(Motion(view.motions[number].added[fine], view.motions[number].force[fine]))
+    return replace(view, trials=trials, motions=motions, certain=())
 
 
 def _throughout(search: EventSearch, off: Sequence[BoolArray]) -> Events:
@@ -454,12 +403,11 @@ def _round(search: EventSearch, acting: Acting, paths: Sequence[BoolArray], pass
     return Events(search, acting, paths, score)
 
 
-def turns(view: View, motions: Sequence[Motion]) -> list[list[BoolArray]]:
+def turns(view: View) -> list[list[BoolArray]]:
     """Return where a force may turn its sign, by trial (N,): nowhere, or with the speed of its port."""
-    speeds = [
-        np.sign(trial.port_motion(view.port, motion.added)[1][:: trial.parts])
-        for trial, motion in zip(view.trials, motions, strict=True)
-    ]
-    found = [[np.zeros(len(speed), dtype=bool) for speed in speeds]]
-    with_speed = [np.r_[False, speed[1:] != speed[:-1]] for speed in speeds]
-    return [*found, with_speed] if any(flips.any() for flips in with_speed) else found
+    never = [np.zeros(len(trial.time), dtype=bool) for trial in view.trials]
+    turning = []
+    for trial, motion in zip(view.trials, view.motions, strict=False):  # of readings alone nothing moves
+        speed = trial.port_motion(view.port, motion.added)[1][:: trial.parts]
+        turning.append(np.r_[False, np.diff(speed > 0.0)])
+    return [never, turning] if any(flips.any() for flips in turning) else [never]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import TrialKind
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.ported import PortedSystem, shows_ports
 from discrepancy.verdict import GapWindow, Moment
 
@@ -61,7 +61,7 @@ def gap_windows(
     at[port] = search.rough(port)
     found = _most_telling(at[port])
     law = law_at_port(search, fit, port)
-    best = events(found.view, found.motions, found.process, -np.inf if law is None else law.seen.evidence)
+    best = events(found.view, found.process, -np.inf if law is None else law.seen.evidence)
     shown = [
         trial.readings(trial.pushed(found.view.port, motion.force), found.view.port, motion.force)
         for trial, motion in zip(found.view.trials, found.motions, strict=True)
@@ -86,7 +86,7 @@ def residual_windows(
     for item, series in zip(residuals.trials, white, strict=True):
         if item.trial.kind in kinds and item.used.any() and len(series) > 1:
             one, pattern = of_series(item.trial.name, item.trial.time, series, item.used)
-            best = events(one.view, one.motions, one.process)
+            best = events(one.view, one.process)
             shown = one.motions[0].force[:, None] * pattern
             found += _windows(best, [item.trial.channels], [shown], with_effect=with_effect)
     return found
@@ -124,11 +124,13 @@ def of_series(name: str, time: FloatArray, series: FloatArray, used: BoolArray) 
     """Return residuals in noises (N, C) as a record of one reading: their largest pattern (C,), which too."""
     series = np.where(used, series, 0.0)
     pattern = np.linalg.svd(series, full_matrices=False)[2][:1]
+    deviation = 1.0 + np.sqrt((series.shape[1] - 1) / len(time))  # of the largest pattern of noise alone
     none, columns = np.zeros((1, 0)), np.zeros((0, len(time), 1))
     still = np.zeros((len(time), 1))
     system = PortedSystem(np.zeros((0, 0)), ("readings",), none, none, none, none, -np.ones((1, 1)))
     trial = SeenTrial(
-        name, time, series @ pattern.T, np.any(used, axis=1).reshape(-1, 1), np.ones(1), (),
+        name, time, series @ pattern.T / deviation, np.any(used, axis=1).reshape(-1, 1),
+        np.array([deviation]), (),
         columns, columns, np.zeros(0), system, (), 1, still, still, False,
     )  # fmt: skip
     size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)

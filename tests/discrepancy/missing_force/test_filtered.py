@@ -84,7 +84,7 @@ def dense(
         nearest[k, int(place)], nearest[k, int(place) + 1] = 1.0 - place % 1.0, place % 1.0
         if now in window:  # what begins or ends at a sample does so before it
             nearest[k] = 0.0
-            nearest[k, int(round(now / step))] = 1.0
+            nearest[k, round(now / step)] = 1.0
         answers[k, 0] = x
         answers[k, 1] = generator[1, 0] * x + generator[1, 1] * v - nearest[k]
     rows = (answers / trial.deviation[:, None]).reshape(-1, len(moments))
