@@ -101,6 +101,7 @@ class EventSearch:
         on = discretised(wide[0], wide[1], lengths / parts)
         wide[:2, f, :] = wide[:2, :, f] = 0.0
         off = discretised(wide[0], wide[1], lengths / parts)
+        # kinds of steps: the force is off, begins at the end, ends there, is on
         moves, noises = (np.stack((no, no, yes, yes)) for no, yes in zip(off, on, strict=True))
         moves[:3, :, f] = 0.0
         noises[:3, :, f], noises[:3, :, :, f] = 0.0, 0.0
@@ -182,8 +183,7 @@ class EventSearch:
         simplex = np.vstack((np.zeros(4), np.eye(4)))
         options = {"xatol": 0.05, "fatol": 0.2, "maxfev": passes, "initial_simplex": simplex}
         found = minimize(objective, simplex[0], method="Nelder-Mead", options=options)
-        price = sum(len(changes(on)) * change_price(len(on)) for on in paths)
-        return acting(found.x), -float(found.fun) - price
+        return acting(found.x), -float(found.fun) - prices(paths)
 
     def turned(self, acting: Acting, paths: Sequence[BoolArray]) -> list[BoolArray]:
         """Return paths with stretches turned on or off, one after the other, each of which pays."""
@@ -278,6 +278,11 @@ def change_price(count: int) -> float:
     return float(np.log(count)) + CHANGE_PRICE
 
 
+def prices(paths: Sequence[BoolArray]) -> float:
+    """Return what all changes cost [nat]."""
+    return sum(len(changes(on)) * change_price(len(on)) for on in paths)
+
+
 @dataclass(frozen=True, eq=False)
 class Events:
     """Events at a view's port: whether the force acts from each sample on, by trial.
@@ -350,19 +355,22 @@ def events(view: View, process: Process, least: float = -np.inf) -> Events:
         if again.score < best.score + LEAST_GAIN:
             break
         best = again
-    steady = max(always, key=lambda item: item[0].score)
+    steady, never = max(always, key=lambda item: item[0].score)
+    if every > 1:
+        best, steady = _in_full(best, view, turning, every), _in_full(steady, view, never, every)
     changed = any(len(changes(on)) for on in best.paths)
-    if not changed or best.score <= max(least, steady[0].score):
-        best, turning = steady
-    if every == 1:
-        return best
-    whole = EventSearch(view, process, turns(view)[turning])
+    return best if changed and best.score > max(least, steady.score) else steady
+
+
+def _in_full(found: Events, view: View, turning: int, every: int) -> Events:
+    """Return events found in a part of the readings, placed among all."""
+    search = EventSearch(view, found.search.process, turns(view)[turning])
     paths = [
-        np.repeat(on, every)[: len(trial.time)] for on, trial in zip(best.paths, view.trials, strict=True)
+        np.repeat(on, every)[: len(trial.time)] for on, trial in zip(found.paths, view.trials, strict=True)
     ]
     for number in range(len(paths)):
-        paths[number] = whole.record(number, best.acting, paths, 1).placed(paths[number])
-    return Events(whole, best.acting, paths, best.score)
+        paths[number] = search.record(number, found.acting, paths, 1).placed(paths[number])
+    return Events(search, found.acting, paths, search.total(found.acting, paths) - prices(paths))
 
 
 def thinned(view: View, every: int) -> View:

@@ -141,7 +141,7 @@ def _missing(problem: Problem, fit: CandidateFit, effects: Sequence[Effect]) -> 
     strained = np.abs(fit.point.shared[problem.shared.precision > 0.0]).max(initial=0.0) > FAR
     believed = len(patch) > 0 and not strained
     at = search.locate(fit.point if believed else None)
-    nothing = max(_of_nothing(one) for one in at.values())
+    nothing = max(of_nothing(one) for one in at.values())
     evidence = {name: one.evidence - nothing for name, one in at.items()}
     port = max(at, key=lambda name: at[name].evidence)
     if evidence[port] < GROUND:
@@ -164,7 +164,7 @@ def _missing(problem: Problem, fit: CandidateFit, effects: Sequence[Effect]) -> 
     return _told(search, drawn.port(at), drawn, evidence)
 
 
-def _of_nothing(found: Seen) -> float:
+def of_nothing(found: Seen) -> float:
     """Return the evidence [nat] without any missing force."""
     return found.view.solve(replace(found.process, size=1e-9 * found.process.size)).evidence
 

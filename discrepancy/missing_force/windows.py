@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import TrialKind
+from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.ported import PortedSystem, shows_ports
 from discrepancy.verdict import GapWindow, Moment
 
-from .events import MOST_EVENTS, Events, changes, events
+from .events import GROUND, MOST_EVENTS, Events, changes, events
 from .filtered import Process
-from .force import law_at_port
+from .force import law_at_port, of_nothing
 from .naming import ForceSearch, Seen, seen
 from .trial import SeenTrial
 from .view import View
@@ -55,19 +56,29 @@ def gap_windows(
     dynamic = tuple(item.trial for item in residuals.trials if item.trial.is_dynamic)
     if not dynamic or not shows_ports(problem.model.inner):
         return residual_windows(residuals, seed=seed)
-    search = ForceSearch(problem.with_trials(dynamic))
+    try:
+        found = _of_force(problem.with_trials(dynamic), fit)
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # no verdict rests on it
+        return residual_windows(residuals, seed=seed)
+    return found + residual_windows(residuals, seed=seed, kinds=frozenset({TrialKind.FLIGHT}))
+
+
+def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
+    """Return when a force is missing at the port, or the reading, that tells most."""
+    search = ForceSearch(problem)
     at = search.locate()
     port = max(at, key=lambda name: at[name].evidence)
     at[port] = search.rough(port)
     found = _most_telling(at[port])
+    if found.evidence < of_nothing(found) + GROUND:
+        return ()
     law = law_at_port(search, fit, port)
     best = events(found.view, found.process, -np.inf if law is None else law.seen.evidence)
     shown = [
         trial.readings(trial.pushed(found.view.port, motion.force), found.view.port, motion.force)
         for trial, motion in zip(found.view.trials, found.motions, strict=True)
     ]
-    windows = _windows(best, [trial.channels for trial in dynamic], shown, with_effect=False)
-    return windows + residual_windows(residuals, seed=seed, kinds=frozenset({TrialKind.FLIGHT}))
+    return _windows(best, [data.trial.channels for data in problem.trials], shown, with_effect=False)
 
 
 def residual_windows(
@@ -86,6 +97,8 @@ def residual_windows(
     for item, series in zip(residuals.trials, white, strict=True):
         if item.trial.kind in kinds and item.used.any() and len(series) > 1:
             one, pattern = of_series(item.trial.name, item.trial.time, series, item.used)
+            if one.evidence < of_nothing(one) + GROUND:
+                continue
             best = events(one.view, one.process)
             shown = one.motions[0].force[:, None] * pattern
             found += _windows(best, [item.trial.channels], [shown], with_effect=with_effect)
