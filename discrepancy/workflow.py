@@ -31,11 +31,11 @@ from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
 from discrepancy.judgement.when import acting_sentence, begins_inside, when_sentence
-from discrepancy.location.change_points import GapWindow, gap_windows
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.force import MissingForce, missing_force
 from discrepancy.missing_force.naming import ForceSearch, key_of, sees_forces
+from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wrapped import innermost
@@ -47,7 +47,7 @@ from reporting.words import be
 from .errors import CampaignDataError, DiscrepancyError
 from .model_choice import load_model
 from .search_settings import SEARCH
-from .verdict import Experiment, NotFitted, Proof, Verdict, VerdictKind
+from .verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
 
 DRAWS = 400
 IMPLAUSIBLE = 4.0
@@ -202,9 +202,9 @@ def investigate(
     if thorough:
         with stage("Locating the gap", "locate"):
             location = locate(before, seed=seed)
-            windows = location.windows
+            windows = gap_windows(problem, fit, before, seed=seed)
             if after is not before:
-                windows += gap_windows(after, seed=seed, with_effect=True)
+                windows += residual_windows(after, seed=seed, with_effect=True)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     missing = None

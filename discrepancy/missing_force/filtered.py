@@ -23,7 +23,7 @@ LATER = 200
 """Samples after which more of them tell nothing of a moment."""
 
 callable_when_compiled(kernels.is_steady)
-_discretised = compiled(kernels.discretised)
+discretised = compiled(kernels.discretised)
 _covariances = compiled(kernels.covariances)
 _whitened = compiled(kernels.whitened)
 _smoothed = compiled(kernels.smoothed)
@@ -99,7 +99,7 @@ class Filtered:
         return [begin + sum(counts[:number]) for number in range(len(counts))]
 
     @cached_property
-    def _white(self) -> FloatArray:
+    def white(self) -> FloatArray:
         """Deviation (C,) of each channel's noise over that of what is white of it."""
         found = np.ones(len(self.trial.deviation))
         for channel, share, _ in self.trial.coloured:
@@ -107,7 +107,7 @@ class Filtered:
         return found
 
     @cached_property
-    def _system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Generator, noise intensity, rows of the readings, covariance at the first sample."""
         trial = self.trial
         n, units, noises = len(trial.system.generator), self._scale, len(trial.coloured)
@@ -131,12 +131,12 @@ class Filtered:
         for at, (channel, share, rate) in enumerate(trial.coloured, begin):
             generator[at, at], intensity[at, at], start[at, at] = -rate, 2.0 * rate, 1.0
             rows[channel, at] = np.sqrt(share)
-        rows *= self._white[:, None]
+        rows *= self.white[:, None]
         return generator, intensity, rows, start
 
     def _steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return transitions and noises (J, n, n) of steps (J,) [s]."""
-        return _discretised(*self._system[:2], lengths)
+        return discretised(*self.system[:2], lengths)
 
     @cached_property
     def _passed(
@@ -144,7 +144,7 @@ class Filtered:
     ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         lengths, which = self.trial.steps
         moves, noises = self._steps(lengths)
-        _, _, rows, start = self._system
+        _, _, rows, start = self.system
         return moves, *_covariances(moves, noises, which, rows, self.trial.used, start)
 
     @property
@@ -156,16 +156,16 @@ class Filtered:
     def log_determinant(self) -> float:
         """Half the sum of the logarithms of the readings' variances given those before [nat]."""
         _, slot, _, sizes, _, _ = self._passed
-        white = np.sum(self.trial.used * np.log(self._white))
+        white = np.sum(self.trial.used * np.log(self.white))
         return 0.5 * float(np.sum(np.log(sizes[slot]) * self.trial.used)) - float(white)
 
     def whitened(self, columns: FloatArray) -> FloatArray:
         """Return columns (K, N, C) as independent numbers of variance one (N C, K)."""
         moves, slot, gains, sizes, _, _ = self._passed
         given = np.moveaxis(columns, 0, -1)
-        given = np.ascontiguousarray(given * self._white[:, None] if self.trial.coloured else given)
+        given = np.ascontiguousarray(given * self.white[:, None] if self.trial.coloured else given)
         found = _whitened(
-            moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, given
+            moves, self.trial.steps[1], self.system[2], self.trial.used, slot, gains, sizes, given
         )
         return np.asarray(found.reshape(-1, found.shape[-1]))
 
@@ -173,7 +173,7 @@ class Filtered:
         """Return the added state (F, n) and the missing forces (P, F) at the fine stamps, given readings."""
         moves, slot, gains, sizes, _, filtered = self._passed
         lengths, which = self.trial.steps
-        rows = self._system[2]
+        rows = self.system[2]
         means, later = _smoothed(
             moves,
             which,
@@ -182,7 +182,7 @@ class Filtered:
             slot,
             gains,
             sizes,
-            np.ascontiguousarray(readings * self._white),
+            np.ascontiguousarray(readings * self.white),
         )
         parts = self.trial.parts
         fine = self._steps(lengths / parts)
@@ -193,13 +193,13 @@ class Filtered:
 
     def deviation(self, port: int) -> FloatArray:
         """Return the deviation (N,) of the missing force of a port at the samples, columns being known."""
-        shown = np.zeros(len(self._system[0]))
+        shown = np.zeros(len(self.system[0]))
         shown[self._places[list(self.processes).index(port)]] = self.processes[port].size
         return self._deviations(shown, slice(None))
 
     def speed_deviation(self, port: int) -> float:
         """Return that of a port's speed, at a sample with many that follow."""
-        shown = np.zeros(len(self._system[0]))
+        shown = np.zeros(len(self.system[0]))
         shown[: len(self._scale)] = self.trial.system.speeds[port] * self._scale
         return float(self._deviations(shown, slice(-LATER, None))[0])
 
@@ -207,6 +207,6 @@ class Filtered:
         """Return the smoothed deviation of a row (n,) of the state at last samples."""
         moves, slot, gains, sizes, predicted, _ = self._passed
         which, used = self.trial.steps[1][at], self.trial.used[at]
-        rows = self._system[2]
+        rows = self.system[2]
         found = _variances(moves, which, rows, used, slot[at], gains, sizes, predicted, shown[None])
         return np.asarray(np.sqrt(found[:, 0]))

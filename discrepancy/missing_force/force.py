@@ -106,7 +106,7 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
     It is that at the port of its law, or else at the one with the most evidence; the law is drawn through it
     if it acts at one port.
     """
-    nothing = max(_of_nothing(one) for one in search.at.values())
+    nothing = max(of_nothing(one) for one in search.at.values())
     evidence = {name: one.evidence - nothing for name, one in search.at.items()}
     if max(evidence.values()) < GROUND:
         return None
@@ -131,7 +131,7 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
     return MissingForce(port, of_state, evidence, time, courses, named, _share(courses) if named else None)
 
 
-def _of_nothing(found: Explained) -> float:
+def of_nothing(found: Explained) -> float:
     """Return the evidence [nat] without any missing force."""
     return found.view.solve(scaled(found.processes, 1e-9, 1.0)).evidence
 

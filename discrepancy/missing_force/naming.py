@@ -32,6 +32,7 @@ from .view import SHARES, Column, Motion, Processes, View, combined
 FloatArray = NDArray[np.float64]
 Key = tuple[tuple[str, str], ...]
 
+NOTHING, NO_VALUES = Candidate(), np.zeros(0)
 LEVELS = (-1.3, -0.4, 0.4, 1.3)
 """Standard normal values at which the numbers of an effect that are no magnitudes are tried."""
 MOST_VARIANTS = 16
@@ -203,8 +204,22 @@ class ForceSearch:
         begin: Processes,
         shares: Sequence[float] = SHARES,
     ) -> Explained:
-        processes, evidence = view.most_probable(self.about(begin), begin, shares)
-        return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))
+        return seen(view, self.about(begin), begin, shares, candidate, effect)
+
+    def rough(self, port: str) -> Explained:
+        """Return the missing force at a port as one that may jump, linear about the motion that it gives."""
+        found = self.at[port]
+        for _ in range(2):
+            self.point = self._point(found)
+            trials = [seen_trial(self.problem, number, self.point) for number in self.numbers]
+            self.columns = Columns(self.problem, self.numbers, self.point)
+            view = View(trials, self.problem.shared.precision)
+            for _ in range(2):
+                motions = view.smoothed(found.processes)[2]
+                view = replace(view, motions=motions, own=self._own(view, motions))
+            begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
+            found = self._seen(view, Candidate(), np.zeros(0), begin)
+        return found
 
     def _at(self, view: View, candidate: Candidate, effect: FloatArray, processes: Processes) -> Explained:
         evidence = view.evidence(self.about(processes), processes)
@@ -410,6 +425,19 @@ def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:
     free = sum(SHAPE_GAIN for term in terms if term.free_shape)
     share = (1.0 - SEARCH.prior_none) * SEARCH.set_shares[len(terms) - 1]
     return log(share / comb(count, len(terms))) - places - free
+
+
+def seen(
+    view: View,
+    about: Processes,
+    begin: Processes,
+    shares: Sequence[float] = SHARES,
+    candidate: Candidate = NOTHING,
+    effect: FloatArray = NO_VALUES,
+) -> Explained:
+    """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
+    processes, evidence = view.most_probable(about, begin, shares)
+    return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))
 
 
 def variants(term: Term) -> list[FloatArray]:

@@ -49,10 +49,16 @@ def trial_of(
     )  # fmt: skip
 
 
-def dense(trial: SeenTrial, process: Process, per_second: int = 4000) -> tuple[FloatArray, FloatArray]:
+def dense(
+    trial: SeenTrial,
+    process: Process,
+    per_second: int = 4000,
+    window: tuple[float, float] = (-np.inf, np.inf),
+) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (N C, N C) of the readings by the force, and of force and readings (N, N C).
 
-    By quadrature of what a kernel over all pairs of moments does to an impulse response; nothing is stepped.
+    By quadrature of what a kernel over all pairs of moments, those of a window, does to an impulse response;
+    nothing is stepped.
     """
     step = 1.0 / per_second
     moments = np.arange(0.0, trial.time[-1] + 0.5 * step, step) + 0.5 * step
@@ -63,6 +69,8 @@ def dense(trial: SeenTrial, process: Process, per_second: int = 4000) -> tuple[F
         kernel *= 1.0 + rate * apart
     else:
         kernel = process.size**2 * np.exp(-apart / process.time)
+    inside = (moments > window[0]) & (moments < window[1])
+    kernel *= np.outer(inside, inside)
     answers = np.zeros((len(trial.time), 2, len(moments)))
     nearest = np.zeros((len(trial.time), len(moments)))
     generator = trial.system.generator
@@ -74,6 +82,9 @@ def dense(trial: SeenTrial, process: Process, per_second: int = 4000) -> tuple[F
         v = -decay * (np.cos(turn * since) - RATIO * FREQUENCY / turn * np.sin(turn * since)) * step
         place = np.clip(now / step - 0.5, 0.0, len(moments) - 1.001)
         nearest[k, int(place)], nearest[k, int(place) + 1] = 1.0 - place % 1.0, place % 1.0
+        if now in window:  # what begins or ends at a sample does so before it
+            nearest[k] = 0.0
+            nearest[k, round(now / step)] = 1.0
         answers[k, 0] = x
         answers[k, 1] = generator[1, 0] * x + generator[1, 1] * v - nearest[k]
     rows = (answers / trial.deviation[:, None]).reshape(-1, len(moments))
