@@ -172,3 +172,20 @@ def holm(p_values: Sequence[float], level: float) -> tuple[bool, ...]:
             break
         rejected[index] = True
     return tuple(bool(value) for value in rejected)
+
+
+def benjamini_yekutieli(p_values: FloatArray, rate: float) -> NDArray[np.bool_]:
+    """Return which hypotheses are discoveries at a false discovery rate, under any dependence.
+
+    Benjamini and Yekutieli 2001, Annals of Statistics 29, 1165-1188, theorem 1.3.
+    """
+    count = p_values.size
+    found = np.zeros(count, dtype=bool)
+    if count == 0:
+        return found
+    order = np.argsort(p_values)
+    harmonic = float(np.sum(1.0 / np.arange(1, count + 1)))
+    below = np.flatnonzero(p_values[order] <= rate * np.arange(1, count + 1) / (count * harmonic))
+    if below.size:
+        found[order[: below[-1] + 1]] = True
+    return found

@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.linalg import block_diag
 
 from discrepancy.campaign.noise_tests import periodogram
-from discrepancy.location.features import features
+from discrepancy.location.map import features
 from discrepancy.location.modal_motion import MotionByMode, modal_motion
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 

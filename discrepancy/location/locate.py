@@ -15,6 +15,7 @@ from discrepancy.location.dependence import (
     mode_shares,
     predicted_frequencies,
 )
+from discrepancy.location.map import Cell, residual_map
 from discrepancy.location.omnibus_tests import (
     OmnibusTest,
     coloured_noise,
@@ -24,16 +25,23 @@ from discrepancy.location.omnibus_tests import (
     variance_test,
 )
 from discrepancy.location.patterns import SingularPattern, singular_patterns
-from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.location.residuals import FittedTrial, ResidualSet, at_own_scale
 
 FloatArray = NDArray[np.float64]
 
 GLOBAL_LEVEL = 0.01
 """Rate of false alarms of the global verdict."""
 
+MAP_RATE = 0.05
+"""False discovery rate of the map."""
+
 _TOO_SMALL = 1e-3  # p-value below which residuals are smaller than the noise record allows
 _FAR_OUT = 6.0  # noise deviations; 2e-9 of Gaussian samples lie beyond
 _MEDIAN = 0.6745  # of the magnitude of a standard normal variable
+_OWN_SCALE = (
+    "The model is so far off that nothing is left to judge beside the noise: the map judges each cell by the "
+    "size of what is left in its channel as a whole."
+)
 _WORTH_TELLING = 0.05  # share of the excess variance below which a dependence is not told
 _CLOSE = 0.02  # shares this close are not told apart
 
@@ -76,6 +84,8 @@ class Location:
         Global verdict: Holm at `GLOBAL_LEVEL` over the omnibus tests.
     tests : tuple of OmnibusTest
         Variance, Ljung-Box, cumulative periodogram, Fisher g.
+    cells : tuple of Cell
+        The map; significant at the false discovery rate `MAP_RATE`.
     patterns : tuple of SingularPattern
         Over the channels.
     explanations : tuple of Explanation
@@ -83,11 +93,13 @@ class Location:
     disagreements : tuple of Disagreement
         Findings in words, largest first; empty if nothing disagrees.
     remarks : tuple of str
-        Limits: a missing noise record, noise that is not white, residuals smaller than the noise.
+        Limits: a missing noise record, noise that is not white, residuals smaller than the noise, a map by
+        the residuals' own scale.
     """
 
     disagrees: bool
     tests: tuple[OmnibusTest, ...]
+    cells: tuple[Cell, ...]
     patterns: tuple[SingularPattern, ...]
     explanations: tuple[Explanation, ...]
     disagreements: tuple[Disagreement, ...]
@@ -136,13 +148,20 @@ def locate(
     patterns = singular_patterns(fitted, white, shapes or {}, generator)
     explained = explanations(fitted, frequencies)
     disagrees = any(rejected)
+    own: tuple[str, ...] = ()
+    cells = residual_map(fitted, white, MAP_RATE)
+    judged = any(cell.axis != "frequency" for cell in cells)
+    if not judged and (scaled := at_own_scale(fitted)) is not None:
+        cells = residual_map(scaled, scaled.white(generator), MAP_RATE)
+        own = (_OWN_SCALE,)
     return Location(
         disagrees=disagrees,
         tests=tests,
+        cells=cells,
         patterns=patterns,
         explanations=explained,
         disagreements=_disagreements(fitted, white, explained, patterns, frequencies) if disagrees else (),
-        remarks=(*coloured.values(), *_noise_remarks(fitted)),
+        remarks=(*coloured.values(), *_noise_remarks(fitted), *own),
     )
 
 

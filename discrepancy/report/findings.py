@@ -28,7 +28,7 @@ from discrepancy.report.text import (
 from discrepancy.verdict import NamedEffect, Proof, Scores, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Column, Page, Table
-from reporting.words import listing
+from reporting.words import counted, listing
 
 LEAST_SHARE = 0.05
 """Findings in words that explain less of the excess variance are left to the file."""
@@ -258,7 +258,13 @@ def add_location(page: Page, investigation: Investigation) -> None:
             "No global test finds a disagreement between the model as it was and the fitted trials."
         )
     else:
-        page.add_paragraph("The model as it was disagrees with the fitted trials.")
+        significant = sum(cell.significant for cell in location.cells)
+        page.add_paragraph(
+            f"The model as it was disagrees with the fitted trials; {significant} of "
+            f"{counted(len(location.cells), 'cell')} of the map (channel, trial, and bin of time, amplitude, "
+            f"frequency or load) {'is a discovery' if significant == 1 else 'are discoveries'} at a false "
+            "discovery rate of 5 %."
+        )
     findings = [item for item in location.disagreements if item.share >= LEAST_SHARE][:SHOWN_FINDINGS]
     for item in findings:
         page.add_paragraph(f"• {item.sentence}")

@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from discrepancy.campaign.noise_tests import (
+    benjamini_yekutieli,
     combine,
     cumulative_periodogram,
     fisher_g,
@@ -67,10 +68,16 @@ def test_serial_tests_see_what_they_are_for() -> None:
     assert share == pytest.approx(0.18 / 1.18, rel=0.5)
 
 
-def test_holm_by_hand() -> None:
+def test_holm_and_benjamini_yekutieli_by_hand() -> None:
     assert holm([0.004, 0.011, 0.03, np.nan], 0.03) == (True, True, True, False)
     assert holm([0.011, 0.02, 0.03], 0.03) == (False, False, False)
     assert holm([], 0.01) == ()
+    # c(4) = 25/12: limits are 0.006, 0.012, 0.018, 0.024 for a rate of 0.05.
+    assert benjamini_yekutieli(np.array([0.5, 0.007, 0.0115, 0.0179]), 0.05).tolist() == [
+        False, True, True, True,
+    ]  # fmt: skip
+    assert not benjamini_yekutieli(np.array([0.0061, 0.5, 0.5, 0.5]), 0.05).any()
+    assert benjamini_yekutieli(np.zeros(0), 0.05).size == 0
 
 
 def test_combined_p_values_are_valid() -> None:
