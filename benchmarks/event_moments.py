@@ -67,7 +67,7 @@ def record(
 def found_in(time: FloatArray, values: FloatArray) -> Events:
     """Return the events of a record."""
     one, _ = of_series("record", time, values[:, None], np.ones((len(values), 1), bool))
-    return events(one.view, one.process)
+    return events(one.view, 0, one.processes[0])
 
 
 def main() -> None:

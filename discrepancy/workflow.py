@@ -245,6 +245,9 @@ def _missing(problem: Problem, search: Search, fit: CandidateFit) -> MissingForc
     """Return the missing force, with the law of a verdict drawn through it; None where none can be seen."""
     try:
         force = search.force
+        terms = fit.candidate.terms
+        if terms and not any(term.place in problem.model.ports() for term in terms):
+            return None
         if force is None:
             if not sees_forces(problem):
                 return None
@@ -252,7 +255,7 @@ def _missing(problem: Problem, search: Search, fit: CandidateFit) -> MissingForc
             force.locate()
         key = key_of(fit.candidate)
         found = next((item for item in search.forces if key_of(item.candidate) == key), None)
-        if found is None and fit.candidate.terms:
+        if found is None and terms:
             found = force.followed(force.whole, fit.candidate, fit.point.effect)
         return missing_force(force, force.whole if found is None else found)
     except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # it is shown, and no verdict rests on it

@@ -403,9 +403,8 @@ class ForceSearch:
 def sees_forces(problem: Problem) -> bool:
     """Whether missing forces can be seen: in trials in motion, of a model that tells how its ports move."""
     model = problem.model.inner
-    return (
-        shows_ports(model) and bool(model.ports()) and all(data.trial.is_dynamic for data in problem.trials)
-    )
+    moving = any(data.trial.is_dynamic for data in problem.trials)
+    return moving and shows_ports(model) and bool(model.ports())
 
 
 def key_of(candidate: Candidate) -> Key:

@@ -236,6 +236,12 @@ class View:
                         found, greatest = best, value
         return found, greatest
 
+    @cached_property
+    def times(self) -> tuple[float, float]:
+        """Shortest and longest correlation time [s]: that of a sample, and that of a record."""
+        stamps = [trial.time for trial in self.trials]
+        return min(float(np.median(np.diff(t))) for t in stamps), max(float(t[-1] - t[0]) for t in stamps)
+
     def evidence(self, about: Processes, processes: Processes) -> float:
         """Return the evidence of processes times their prior, as a logarithm [nat]."""
         away = [
@@ -245,7 +251,9 @@ class View:
             )
             for port, one in processes.items()
         ]
-        if np.abs(away).max() > FARTHEST or not all(one.is_sound for one in self.filtered(processes)):
+        shortest, longest = self.times
+        outside = any(not shortest <= one.time <= longest for one in processes.values())
+        if outside or np.abs(away).max() > FARTHEST or not all(one.is_sound for one in self.filtered(processes)):
             return -np.inf
         return float(self.solve(processes).evidence - 0.5 * np.sum(np.square(away)))
 
@@ -258,6 +266,8 @@ class View:
             size, time = np.exp(logs)
             return {**processes, port: replace(processes[port], size=float(size), time=float(time))}
 
+        low, high = np.log(self.times)
+        first = np.array([first[0], np.clip(first[1], low, high - 0.7)])
         simplex = first + np.array([[0.0, 0.0], [0.9, 0.0], [0.0, 0.7]])
         options = {"xatol": 0.05, "fatol": 0.2, "maxfev": MOST_PASSES, "initial_simplex": simplex}
         found = minimize(

@@ -116,7 +116,7 @@ def residual_windows(
 
 
 def _most_telling(port: int, at: Explained) -> tuple[int, Explained]:
-    """Return the missing force, or what one channel shows beside the model where that tells more; its port."""
+    """Return the missing force, or what one channel shows where that tells more, and its port first."""
     view, best = at.view, (port, at)
     trials = view.trials
     for channel in range(min(trial.residual.shape[1] for trial in trials)):
@@ -141,7 +141,7 @@ def _reading(trial: SeenTrial, channel: int) -> SeenTrial:
     system = replace(
         trial.system, ports=("reading",), actions=none, positions=none, speeds=none, through=shown
     )
-    return replace(trial, system=system, positions=still, speeds=still)
+    return replace(trial, system=system, positions=still, speeds=still, by_unknowns=())
 
 
 def of_series(

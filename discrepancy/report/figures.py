@@ -82,8 +82,8 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         ) else ""  # fmt: skip
         add(
             "time_line", time_line_figure(windows), "When the gap is there",
-            "Bars: something acts that the model lacks; the colour is the root mean square of what it does to "
-            f"the readings over the noise. Brackets are 90 % intervals of begin and end.{left}",
+            "Bars: something acts that the model lacks; the colour is the root mean square of what it does "
+            f"to the readings over the noise. Brackets are 90 % intervals of begin and end.{left}",
         )  # fmt: skip
         _add_worst_record(before, after, add)
         _add_motion(before, after, add, found)

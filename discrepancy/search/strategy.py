@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.windowed import in_events
+from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
@@ -168,25 +169,33 @@ class Search(Hypotheses):
             if move.needed(self):
                 move.make(self)
 
-    def by_force(self) -> None:
-        """Fit what the missing force may be: the sets of effects that follow it best."""
+    def by_force(self) -> bool:
+        """Fit the sets of effects that follow the missing force best; False where that is not seen."""
+        if not sees_forces(self.problem) or not all(data.trial.is_dynamic for data in self.problem.trials):
+            return False
         self.tell("looking for the missing force")
-        self.force = ForceSearch(self.problem)
-        self.force.locate()
-        self.forces = self.force.name(self.effects)
-        best = self.force.score(self.forces[0], len(self.effects))
+        force = ForceSearch(self.problem)
+        try:
+            force.locate()
+            self.forces = force.name(self.effects)
+        except (ModelError, np.linalg.LinAlgError) as cause:
+            self.tell(f"the missing force cannot be seen: {cause}")
+            return False
+        self.force = force
+        best = force.score(self.forces[0], len(self.effects))
         close = [
             item
             for item in self.forces
-            if item.candidate.terms and self.force.score(item, len(self.effects)) > best - SEARCH.followed
+            if item.candidate.terms and force.score(item, len(self.effects)) > best - SEARCH.followed
         ][: SEARCH.far_fits]
         for number, item in enumerate(close):
             names = " and ".join(item.candidate.identifiers)
             self.tell(f"fitting {names} to the end, {len(close) - number - 1} more")
-            found = attempt(self.problem, item.candidate, self.force.whole_point(item))
+            found = attempt(self.problem, item.candidate, force.whole_point(item))
             if found is not None:
                 self.keep(found, exact=True)
         self.settle()
+        return True
 
     def unexplained(self) -> bool:
         """Whether the best candidate cannot be shown to explain the data."""
@@ -428,9 +437,7 @@ def search(
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
     usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)
-    if by_force and sees_forces(problem):
-        found.by_force()
-    else:
+    if not (by_force and found.by_force()):
         found.run()
     return found
 

@@ -33,7 +33,7 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven: bool) ->
     residual = random.standard_normal((40, 2)) * [3.0, 1.0]
     local = random.standard_normal((1, 40, 2))
     trial = trial_of(time, residual, local=local)
-    search = EventSearch(View([trial], 0, np.zeros(0)), EVENT, [np.zeros(40, dtype=bool)])
+    search = EventSearch(View([trial], np.zeros(0)), 0, EVENT, [np.zeros(40, dtype=bool)])
     steps = search.steps(0, Acting(EVENT, REST))
     starts, ends = np.array([0, 7, 20]), np.array([9, 26, 40])
     values = search.evidence(*search.ways(0, steps, np.zeros(40, dtype=bool), starts, ends))
@@ -57,7 +57,7 @@ def test_a_force_that_turns_is_one_that_does_not_turned() -> None:
     """Its readings before and after a turn have the opposite correlation; what they are alone is the same."""
     trial = trial_of(0.02 * np.arange(40), np.random.default_rng(5).standard_normal((40, 2)))
     never, turns = np.zeros(40, dtype=bool), np.arange(40) == 20
-    both = [EventSearch(View([trial], 0, np.zeros(0)), EVENT, [flips]) for flips in (never, turns)]
+    both = [EventSearch(View([trial], np.zeros(0)), 0, EVENT, [flips]) for flips in (never, turns)]
     acting = Acting(EVENT, Process(1e-6, 1.0, rough=True))
     for on, same in ((np.arange(40) < 20, True), (~never, False)):
         one, other = (search.total(acting, [on]) for search in both)

@@ -102,7 +102,7 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough: bool, uneven:
     used = random.uniform(size=(40, 2)) > 0.2
     trial = trial_of(time, residual, used=used)
     process = Process(2.0, 0.15, rough)
-    filtered = Filtered(trial, 0, process)
+    filtered = Filtered(trial, {0: process})
     covariance, cross = dense(trial, process)
     at = np.flatnonzero(used.ravel())
     covariance = covariance[np.ix_(at, at)] + np.eye(len(at))
@@ -111,46 +111,46 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough: bool, uneven:
     found = filtered.whitened(trial.residual[None])
     value = -0.5 * float(np.sum(found**2)) - filtered.log_determinant
     assert value == pytest.approx(wanted, abs=0.05 if rough else 0.02)
-    _, force = filtered.smoothed(trial.residual)
+    force = filtered.smoothed(trial.residual)[1][0]
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
     np.testing.assert_allclose(force[::PARTS], mean, atol=0.02 * process.size)
     variance = process.size**2 - np.einsum(
         "nk,kn->n", cross[:, at], np.linalg.solve(covariance, cross[:, at].T)
     )
-    np.testing.assert_allclose(filtered.deviation(), np.sqrt(variance), atol=0.02 * process.size)
+    np.testing.assert_allclose(filtered.deviation(0), np.sqrt(variance), atol=0.02 * process.size)
 
 
 def test_steady_gains_are_those_of_every_step() -> None:
     random = np.random.default_rng(4)
     time = 0.02 * np.arange(900)
     trial = trial_of(time, random.standard_normal((900, 2)))
-    filtered = Filtered(trial, 0, PROCESS)
+    filtered = Filtered(trial, {0: PROCESS})
     slots = filtered._passed[1]
     assert slots[-1] < 450  # most steps share one
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
     object.__setattr__(jittered, "steps", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
-    every = Filtered(jittered, 0, PROCESS)
+    every = Filtered(jittered, {0: PROCESS})
     assert every._passed[1][-1] == 899
     np.testing.assert_allclose(
         filtered.whitened(trial.residual[None]), every.whitened(trial.residual[None]), atol=1e-7
     )
     np.testing.assert_allclose(
-        filtered.smoothed(trial.residual)[1], every.smoothed(trial.residual)[1], atol=1e-7
+        filtered.smoothed(trial.residual)[1][0], every.smoothed(trial.residual)[1][0], atol=1e-7
     )
-    np.testing.assert_allclose(filtered.deviation(), every.deviation(), atol=1e-8)
+    np.testing.assert_allclose(filtered.deviation(0), every.deviation(0), atol=1e-8)
 
 
 def test_the_state_between_samples_is_that_of_samples_in_between() -> None:
     random = np.random.default_rng(5)
     count = 30
     residual = random.standard_normal((count, 2))
-    coarse = Filtered(trial_of(0.04 * np.arange(count), residual), 0, PROCESS)
+    coarse = Filtered(trial_of(0.04 * np.arange(count), residual), {0: PROCESS})
     dense_count = (count - 1) * PARTS + 1
     filled, used = np.zeros((dense_count, 2)), np.zeros((dense_count, 2), dtype=bool)
     filled[::PARTS], used[::PARTS] = residual, True
-    fine = Filtered(trial_of(0.04 / PARTS * np.arange(dense_count), filled, used=used), 0, PROCESS)
-    added, force = coarse.smoothed(residual)
-    other, again = fine.smoothed(filled)
+    fine = Filtered(trial_of(0.04 / PARTS * np.arange(dense_count), filled, used=used), {0: PROCESS})
+    added, (force,) = coarse.smoothed(residual)
+    other, (again,) = fine.smoothed(filled)
     np.testing.assert_allclose(force, again[::PARTS], atol=1e-9)
     np.testing.assert_allclose(added, other[::PARTS], atol=1e-9)
 
@@ -162,7 +162,7 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
     local = random.standard_normal((2, 60, 2))
     share, rate = 0.8, 12.0
     trial = trial_of(time, residual, local=local, coloured=((0, share, rate),))
-    found = regression([Filtered(trial, 0, PROCESS)], [residual], [np.zeros((0, 60, 2))])
+    found = regression([Filtered(trial, {0: PROCESS})], [residual], [np.zeros((0, 60, 2))])
     value = -0.5 * found.products[0, 0] - found.log_determinant
     covariance, _ = dense(trial, PROCESS)
     noise = np.eye(120)
@@ -179,7 +179,7 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
 def test_a_long_correlation_within_a_short_step_stays_finite() -> None:
     """Backwards the force would grow by e^1000 within a step."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
-    filtered = Filtered(trial, 0, Process(1.0, 1e-3))
+    filtered = Filtered(trial, {0: Process(1.0, 1e-3)})
     assert np.isfinite(filtered.log_determinant)
     assert np.all(np.isfinite(filtered.smoothed(trial.residual)[1]))
 
