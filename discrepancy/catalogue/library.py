@@ -3,37 +3,45 @@
 import re
 from collections import Counter
 from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 
-from discrepancy.catalogue import (
-    clock_and_lines,
-    damping,
-    hysteresis,
-    loads,
-    outflow,
-    sensors,
-    stiffness,
-    structure,
-)
+from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, ShapeParameter
-from discrepancy.catalogue.user_entries import effects_of_entry_points, effects_of_file
 from discrepancy.errors import CatalogueError
 
+THEMES = (
+    "structure", "damping", "stiffness", "hysteresis", "outflow", "sensors", "loads", "clock_and_lines",
+)  # fmt: skip
+"""Files of the effects that come with the package, in their order."""
+GROUP = "uav_twin.effects"
+"""Group of the entry points: each a function without arguments that returns an Effect or several."""
 _IDENTIFIER = re.compile(r"[a-z][a-z0-9_]*")
 
 
+@cache
 def library() -> tuple[Effect, ...]:
     """Return the effects that come with the package, by theme."""
-    return (
-        *structure.EFFECTS,
-        *damping.EFFECTS,
-        *stiffness.EFFECTS,
-        *hysteresis.EFFECTS,
-        *outflow.EFFECTS,
-        *sensors.EFFECTS,
-        *loads.EFFECTS,
-        *clock_and_lines.EFFECTS,
-    )
+    folder = Path(__file__).parent
+    return tuple(effect for theme in THEMES for effect in effects_of_file(folder / f"{theme}.toml"))
+
+
+def effects_of_entry_points() -> tuple[Effect, ...]:
+    """Return the effects of installed packages; raises `CatalogueError` naming the entry point at fault."""
+    found: list[Effect] = []
+    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+        where = f"The entry point {point.name!r} of the group {GROUP!r}"
+        try:
+            given = point.load()()
+        except Exception as cause:
+            raise CatalogueError(f"{where} failed: {type(cause).__name__}: {cause}.") from cause
+        effects = tuple(given) if isinstance(given, Iterable) else (given,)
+        for effect in effects:
+            if not isinstance(effect, Effect):
+                raise CatalogueError(f"{where} must return effects, but returned a {type(effect).__name__}.")
+        found += effects
+    return tuple(found)
 
 
 def load_catalogue(extra: Iterable[Effect | Path] = (), *, installed: bool = True) -> tuple[Effect, ...]:
@@ -42,7 +50,7 @@ def load_catalogue(extra: Iterable[Effect | Path] = (), *, installed: bool = Tru
     Parameters
     ----------
     extra : iterable of Effect or Path
-        Further effects, or TOML files of them (`discrepancy.catalogue.user_entries`).
+        Further effects, or TOML files of them (`discrepancy.catalogue.effect_file`).
     installed : bool
         Whether the entry points of the group "uav_twin.effects" are asked as well.
 

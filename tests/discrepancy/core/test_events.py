@@ -18,9 +18,9 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
+from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
-from discrepancy.catalogue.user_entries import effects_of_file
 from discrepancy.catalogue.windowed import in_events
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit

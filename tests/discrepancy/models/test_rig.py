@@ -22,10 +22,8 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.catalogue.damping import QUADRATIC_DAMPING
 from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.hysteresis import BOUC_WEN_HYSTERESIS, JOINT_MICRO_SLIP
-from discrepancy.catalogue.stiffness import BREATHING_CRACK, CUBIC_STIFFNESS, FREE_PLAY
+from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
 from discrepancy.models.input_course import Course, Drive
 from discrepancy.models.interface import Conditions
@@ -504,9 +502,11 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
     given = Campaign("", {"height": channel}, (falls,), None, {}, "")
     setting = Setting(given, model, model.scales(given))
     assert not setting.scales.ports["air"].turns
-    for effect in (JOINT_MICRO_SLIP, BOUC_WEN_HYSTERESIS, CUBIC_STIFFNESS, FREE_PLAY, BREATHING_CRACK):
-        assert "motion that turns" in (effect.unavailable(setting) or "")
-    assert QUADRATIC_DAMPING.unavailable(setting) is None
+    for name in (
+        "joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack",
+    ):  # fmt: skip
+        assert "motion that turns" in (effect_by_identifier(name, library()).unavailable(setting) or "")
+    assert effect_by_identifier("quadratic_damping", library()).unavailable(setting) is None
     still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
     assert model.scales(still).ports["air"].turns
 
