@@ -1,36 +1,17 @@
 """Numbers and sentences of the report and of the summary on the terminal."""
 
 import re
+import tomllib
 from math import floor, isfinite, isnan, log10
+from pathlib import Path
+from typing import Any
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.verdict import Estimate, ExplainedShare, Hypothesis, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 
-MEANING = {
-    VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed: what the model leaves is noise.",
-    VerdictKind.NAMED: "The name has the probability, the evidence and the fit that a name needs: it passed "
-    "every gate that could be applied.",
-    VerdictKind.NAMED_IN_PART: "The name is the most probable one and closes most of the gap on trials that "
-    "it did not see, but what it leaves is more than noise and has no name: the numbers hold as far as that.",
-    VerdictKind.FAMILY: "The kind of the effect is known, its exact law is not one of the catalogue: the "
-    "shape below was fitted.",
-    VerdictKind.GROUP: "Something is missing. Each member of the group fits the data; the figures after "
-    "adding an effect are those of its most probable member, which is no name.",
-    VerdictKind.UNEXPLAINED: "There is a gap, and nothing in the catalogue fits it well enough to be named.",
-    VerdictKind.DATA_ERROR: "The data are at fault; nothing was fitted. Mend them, do not correct them to "
-    "fit the model.",
-    VerdictKind.BELOW_LIMIT: "The data do not decide between noise and a small effect.",
-}
-"""What each kind of verdict means, in a sentence, where the channels have noise records."""
-
-UNJUDGED = {
-    VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed. Whether what the model leaves is "
-    "noise could not be judged.",
-    VerdictKind.NAMED: "The name has the probability and the evidence that a name needs. The gate of "
-    "absolute fit could not be applied: it is not known whether that is all.",
-}
-"""The same, where the absolute fit could not be judged: no noise record, or too few readings."""
+WORDS: dict[str, Any] = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+"""What each kind of verdict means, also where the absolute fit could not be judged, and words of figures."""
 
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
 """Verdicts that say what is missing, if not all of it."""
@@ -159,7 +140,8 @@ def remainders_sentence(verdict: Verdict) -> str:
 def meaning(verdict: Verdict) -> str:
     """Return what the verdict means, in a sentence."""
     judged = all(gate.passed is not None for gate in verdict.gates if gate.name == "absolute fit")
-    return MEANING[verdict.kind] if judged else UNJUDGED.get(verdict.kind, MEANING[verdict.kind])
+    told: str = WORDS["meaning"][verdict.kind]
+    return told if judged else WORDS["unjudged"].get(verdict.kind, told)
 
 
 def hypothesis_name(hypothesis: Hypothesis) -> str:

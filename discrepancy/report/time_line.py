@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from discrepancy.location.change_points import GapWindow, Moment
-from discrepancy.report.residual_figures import scale_of
+from discrepancy.report.kit import scale_of
 from reporting.figures import LEVELS, OBSERVED, REFERENCE, new_figure, publication_style
 
 MOST_RECORDS = 12
