@@ -4,10 +4,10 @@
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -308,6 +308,37 @@ class Trial:
     inputs: tuple[RecordedInput, ...] = ()
     hold: Hold | None = None
     file: str = field(default="", compare=False)
+
+    @classmethod
+    def plain(
+        cls, name: str, kind: TrialKind, channels: tuple[str, ...], time: FloatArray, **given: Any
+    ) -> "Trial":
+        """Return a trial of which only this is said; `given` are further fields.
+
+        Without them it has no readings yet (zeros, all used), no force and no load factor, is healthy and at
+        the reference temperature, and starts at zero.
+        """
+        zeros, shape, pair = np.zeros(len(time)), (len(time), len(channels)), np.zeros((len(time), 2))
+        usual = {
+            "values": np.zeros(shape), "used": np.ones(shape, dtype=bool), "force": zeros,
+            "load_factor": zeros, "load_place": "tip_load", "temperature": zeros, "start": 0.0, "run": "",
+            "health": pair, "health_deviation": pair,
+        }  # fmt: skip
+        return cls(name=name, kind=kind, channels=channels, time=time, **{**usual, **given})
+
+    def rows(self, rows: BoolArray, **changes: Any) -> "Trial":
+        """Return the trial with some of its rows (N,) only, and other fields changed."""
+        parts = (
+            "values",
+            "used",
+            "time",
+            "force",
+            "load_factor",
+            "temperature",
+            "health",
+            "health_deviation",
+        )
+        return replace(self, **{part: getattr(self, part)[rows] for part in parts}, **changes)
 
     @property
     def input_names(self) -> tuple[str, ...]:

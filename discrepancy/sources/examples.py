@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -159,7 +159,7 @@ def plan_for(
         interval=period / 50.0,
         load_place=load_place,
     )
-    trial = _blank("", TrialKind.STATIC, plan, np.array([plan.force]), start=0.0, run="")
+    trial = _blank("", TrialKind.STATIC, plan, np.array([plan.force]), 0.0)
     bare = Campaign("", {channel.name: channel for channel in channels}, (), None, {}, "")
     seen = np.abs(observe(model, bare, trial, ModelPatch(), prior_mean(bare, model, trial)).values[0])
     sized = []
@@ -279,36 +279,13 @@ def _trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
 
 
 def _blank(
-    name: str,
-    kind: TrialKind,
-    plan: ExamplePlan,
-    rows: np.ndarray,
-    *,
-    start: float,
-    run: str,
-    release: Release | None = None,
-    held_out: bool = False,
+    name: str, kind: TrialKind, plan: ExamplePlan, rows: np.ndarray, start: float, **given: Any
 ) -> Trial:
     """Return a trial without readings; `rows` are forces, load factors or times."""
-    names, count = plan.names(kind), len(rows)
-    zeros = np.zeros(count)
-    return Trial(
-        name=name,
-        kind=kind,
-        channels=names,
-        values=np.zeros((count, len(names))),
-        used=np.ones((count, len(names)), dtype=bool),
-        time=rows if kind is TrialKind.RINGDOWN else np.full(count, start),
-        force=rows if kind is TrialKind.STATIC else zeros,
-        load_factor=rows if kind is TrialKind.FLIGHT else zeros,
-        load_place=plan.load_place,
-        temperature=zeros,
-        start=start,
-        run=run,
-        health=np.zeros((count, 2)),
-        health_deviation=np.zeros((count, 2)),
-        release=release,
-        held_out=held_out,
+    time = rows if kind is TrialKind.RINGDOWN else np.full(len(rows), start)
+    what = {TrialKind.STATIC: {"force": rows}, TrialKind.FLIGHT: {"load_factor": rows}}.get(kind, {})
+    return Trial.plain(
+        name, kind, plan.names(kind), time, load_place=plan.load_place, start=start, **what, **given
     )
 
 
