@@ -344,14 +344,7 @@ def outcomes(found: SelfCalibration, *, null: bool) -> list[str]:
     """Return the outcomes that occurred, "right" and "wrong" always, in a fixed order."""
     counts = Counter(case.outcome for case in found.cases if (case.hidden == NOTHING) is null)
     order = (
-        "right",
-        "wrong",
-        "group",
-        "in part",
-        "family",
-        "missed",
-        "unexplained",
-        "below detectability",
+        "right", "wrong", "group", "in part", "family", "missed", "unexplained", "below detectability",
         "data error",
-    )
+    )  # fmt: skip
     return [name for name in order if counts[name] or name in ("right", "wrong")]

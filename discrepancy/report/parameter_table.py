@@ -3,7 +3,7 @@
 from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.report.text import added_label, rounded, unit_text
 from discrepancy.workflow import Investigation
-from reporting.page import Column, Page, Table
+from reporting.page import Page, Table, columns, numbers
 
 NINETY = 1.6449
 """Normal quantile at 95 %: half of a 90 % interval in standard deviations."""
@@ -37,8 +37,8 @@ def add_parameters(page: Page, investigation: Investigation) -> None:
     rows = parameter_rows(investigation)
     if not rows:
         return
-    heads = [Column("parameter"), Column("unit"), Column("calibration", numeric=True)]
-    heads += [Column("model as it was", numeric=True), Column("with the effect", numeric=True)]
+    values = map(numbers, ("calibration", "model as it was", "with the effect"))
+    heads = columns("parameter", "unit", *values)
     added = added_label(investigation)
     page.add_table(
         Table(heads[: len(rows[0])], rows),
