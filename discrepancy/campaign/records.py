@@ -189,6 +189,10 @@ class Channel:
     column: str = field(default="", compare=False)
     unit: str = field(default="", compare=False)
 
+    def noise_in(self, trial: "Trial") -> float:
+        """Return the deviation of its noise in a trial [its unit], 0 where it is not known."""
+        return 0.0 if self.noise is None else self.noise.standard_deviation * trial.noise_factor
+
 
 @dataclass(frozen=True)
 class Release:
@@ -313,18 +317,14 @@ class Trial:
     def plain(
         cls, name: str, kind: TrialKind, channels: tuple[str, ...], time: FloatArray, **given: Any
     ) -> "Trial":
-        """Return a trial of which only this is said; `given` are further fields.
-
-        Without them it has no readings yet (zeros, all used), no force and no load factor, is healthy and at
-        the reference temperature, and starts at zero.
-        """
+        """Return a trial of which only this and `given` are said: readings of zero, no force, healthy."""
         zeros, shape, pair = np.zeros(len(time)), (len(time), len(channels)), np.zeros((len(time), 2))
         usual = {
             "values": np.zeros(shape), "used": np.ones(shape, dtype=bool), "force": zeros,
             "load_factor": zeros, "load_place": "tip_load", "temperature": zeros, "start": 0.0, "run": "",
             "health": pair, "health_deviation": pair,
         }  # fmt: skip
-        return cls(name=name, kind=kind, channels=channels, time=time, **{**usual, **given})
+        return cls(name, kind, channels, time=time, **{**usual, **given})
 
     def rows(self, rows: BoolArray, **changes: Any) -> "Trial":
         """Return the trial with some of its rows (N,) only, and other fields changed."""

@@ -23,13 +23,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Response
 from fe.runtime.patch import SENSORS, ModelPatch, PortForce, Primitive
 
-KIND_NAMES = {
-    TrialKind.STATIC: "static",
-    TrialKind.RINGDOWN: "ring-down",
-    TrialKind.FORCED: "forced",
-    TrialKind.DRIVEN: "driven",
-    TrialKind.FLIGHT: "flight",
-}
+KIND_NAMES = {kind: kind.value for kind in TrialKind} | {TrialKind.RINGDOWN: "ring-down"}
 """How a kind of trial is called in a sentence."""
 NO_PORT = "has no port where an internal force can act"
 """Reason against effects that are forces within a structure or between it and the ground."""

@@ -71,7 +71,7 @@ def write_residuals(path: Path, residuals: ResidualSet, attributes: Mapping[str,
         if channel.noise is not None and channel.noise.samples is not None:
             groups[f"noise/channel_{number:03d}"] = xr.Dataset(
                 {"noise": ("sample", channel.noise.samples, {"units": UNITS[channel.quantity].si})},
-                attrs={"channel": name, "interval": _or_nan(channel.noise.interval)},
+                attrs={"channel": name, "interval": channel.noise.interval or float("nan")},
             )
     return atomic_write_bytes(path, bytes(xr.DataTree.from_dict(groups).to_netcdf(engine="h5netcdf")))
 
@@ -112,10 +112,6 @@ def _residuals(tree: xr.DataTree) -> ResidualSet:
     }
     channels = {row["name"]: _channel(row, noise) for row in json.loads(tree.attrs["channels"])}
     return ResidualSet(channels, tuple(_trial(groups[name]) for name in sorted(groups)))
-
-
-def _or_nan(value: float | None) -> float:
-    return float("nan") if value is None else value
 
 
 def _channel_row(channel: Channel) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Channel, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Channel, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.report.kit import Shown, draw_noise, models, name_cells, panels, scale_of, size_bar, titles
@@ -54,12 +54,11 @@ def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray
     for place, item in enumerate(residuals.trials):
         for column, name in enumerate(item.trial.channels):
             table[channels.index(name), place] = size(item, column)
-    return channels, [_with_role(item.trial) for item in residuals.trials], table
-
-
-def _with_role(trial: Trial) -> str:
-    """Return the name of a trial, which says whether it is held out."""
-    return f"{trial.name} (held out)" if trial.held_out and "held out" not in trial.name else trial.name
+    names = [
+        f"{trial.name} (held out)" if trial.held_out and "held out" not in trial.name else trial.name
+        for trial in (item.trial for item in residuals.trials)
+    ]
+    return channels, names, table
 
 
 def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, tuple[float, float]]:

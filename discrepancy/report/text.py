@@ -170,11 +170,8 @@ def added_label(investigation: Investigation) -> str:
 
 def catalogue_of(investigation: Investigation) -> dict[str, Effect]:
     """Return the effects that could be tested, by identifier."""
-    return (
-        {}
-        if investigation.search is None
-        else {item.identifier: item for item in investigation.search.effects}
-    )
+    effects = () if investigation.search is None else investigation.search.effects
+    return {item.identifier: item for item in effects}
 
 
 _GREEK = {

@@ -306,7 +306,7 @@ def _measure(
     for column, name in enumerate(trial.channels):
         channel = campaign.channels[name]
         zero = channel.offset_deviation if np.isfinite(channel.offset_deviation) else 0.0
-        noise = 0.0 if channel.noise is None else channel.noise.standard_deviation * trial.noise_factor
+        noise = channel.noise_in(trial)
         values[:, column] = values[:, column] * gains[name] + zero * generator.normal()
         values[:, column] += noise * generator.normal(size=len(values))
     return replace(trial, values=values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -17,9 +18,7 @@ from discrepancy.checks.quality import (
     check_against_model,
     check_data,
     mark_outliers,
-    require_sound,
 )
-from discrepancy.errors import CampaignDataError
 from discrepancy.sources.examples import ExamplePlan, example_campaign
 from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain
 
@@ -118,8 +117,7 @@ def test_unit_slips(oscillator, campaign, name: str, factor: float, guess: str) 
         faults = check_against_model(replace(slipped, channels=channels), oscillator)
         assert (FaultKind.UNIT_SLIP, name) in found(faults)
         assert {fault.channel for fault in faults} == {name}
-        with pytest.raises(CampaignDataError, match=guess):
-            require_sound(faults)
+        assert re.search(guess, " ".join(fault.sentence for fault in faults if fault.fatal))
 
 
 def test_no_slip_between_units_that_the_quantity_does_not_have(oscillator, campaign) -> None:
@@ -269,7 +267,6 @@ def test_noise_records(campaign) -> None:
 
     (fault,) = check_data(with_noise(None))
     assert (fault.kind, fault.channel, fault.fatal) == (FaultKind.NO_NOISE_RECORD, "g0", False)
-    require_sound((fault,))
     (fault,) = check_data(with_noise(NoiseRecord(1e-5, 200.0)))
     assert fault.kind is FaultKind.NOISE_LABEL
     assert "says 1e-05" in fault.sentence
