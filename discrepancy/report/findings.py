@@ -9,6 +9,7 @@ from discrepancy.report.content import ReportInput
 from discrepancy.report.sizes import definite_unit, size_sentence
 from discrepancy.report.text import (
     NAMING,
+    WORDS,
     added_label,
     catalogue_of,
     estimate_text,
@@ -78,11 +79,7 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
         Table(
             columns("effect", "place", "parameter", *map(numbers, ("value", "90 % interval")), "unit"), rows
         ),
-        {
-            VerdictKind.NAMED: "Most probable values and 90 % intervals.",
-            VerdictKind.NAMED_IN_PART: "Most probable values and 90 % intervals, wider for what is left.",
-            VerdictKind.FAMILY: "Most probable values and 90 % intervals; the shape was fitted.",
-        }.get(verdict.kind, "Most probable values and 90 % intervals of each, were it there alone."),
+        WORDS["sizes"].get(verdict.kind, WORDS["sizes"]["other"]),
         title="What is added" if verdict.kind in NAMING else "What could be added",
     )
     _add_primitives(page, content)

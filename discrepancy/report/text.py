@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections.abc import Callable
 from math import floor, isfinite, isnan, log10
 from pathlib import Path
 from typing import Any
@@ -30,31 +31,27 @@ def estimate_text(estimate: Estimate) -> tuple[str, str]:
     return show(estimate.value), f"{show(estimate.low)} to {show(estimate.high)}"
 
 
-class rounded:  # noqa: N801 - used as a function
-    """Format numbers alike: two significant digits of a spread.
+def rounded(value: float, spread: float) -> Callable[[float], str]:
+    """Return what formats numbers alike: with two significant digits of a spread.
 
     Parameters
     ----------
     value, spread : float
         Typical value and its uncertainty.
     """
+    largest, power, decimals = max(abs(value), abs(spread)), 0, 3
+    if largest > 0.0 and not 1e-3 <= largest < 1e5:
+        power = floor(log10(largest))
+    if spread > 0.0 and isfinite(spread):
+        decimals = min(max(1 - floor(log10(spread)) + power, 0), 9)
 
-    def __init__(self, value: float, spread: float) -> None:
-        largest = max(abs(value), abs(spread))
-        self._power = 0
-        if largest > 0.0 and not 1e-3 <= largest < 1e5:
-            self._power = floor(log10(largest))
-        if spread > 0.0 and isfinite(spread):
-            self._decimals = min(max(1 - floor(log10(spread)) + self._power, 0), 9)
-        else:
-            self._decimals = 3
-
-    def __call__(self, value: float) -> str:
-        """Return the number as text."""
+    def show(value: float) -> str:
         if not isfinite(value):
             return "not known" if isnan(value) else "unbounded"
-        text = f"{value / 10.0**self._power:.{self._decimals}f}".replace("-", "\N{MINUS SIGN}")
-        return text + (f"e{self._power}" if self._power else "")
+        text = f"{value / 10.0**power:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+        return text + (f"e{power}" if power else "")
+
+    return show
 
 
 def probability_text(probability: float) -> str:
@@ -99,12 +96,7 @@ def headline(verdict: Verdict) -> str:
         text = re.sub(whole, lambda _, name=name: name, text)  # type: ignore[misc]
     if isnan(verdict.probability) or "probability" in text:
         return text + "."
-    about = {
-        VerdictKind.NOTHING_MISSING: "probability that nothing is missing",
-        VerdictKind.GROUP: "together they have the probability",
-        VerdictKind.FAMILY: "probability",
-        VerdictKind.BELOW_LIMIT: "together with none they have the probability",
-    }.get(verdict.kind)
+    about = WORDS["probability"].get(verdict.kind)
     if about is None:
         return text + "."
     return f"{text} ({about} {probability_text(verdict.probability)})."

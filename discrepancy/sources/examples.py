@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -53,8 +53,8 @@ class ExamplePlan:
         Of a ring-down and its samples [s].
     load_place : str or tuple of float
         Where the force acts.
-    static_channels, dynamic_channels, flight_channels : tuple of str
-        Names of the channels that each kind of trial measures; empty: all.
+    flight_channels : tuple of str
+        Names of the channels that flights measure; empty: all.
     """
 
     channels: tuple[Channel, ...]
@@ -64,16 +64,11 @@ class ExamplePlan:
     duration: float = 2.0
     interval: float = 0.002
     load_place: str | tuple[float, float] = "tip_load"
-    static_channels: tuple[str, ...] = ()
-    dynamic_channels: tuple[str, ...] = ()
-    flight_channels: tuple[str, ...] = field(default=())
+    flight_channels: tuple[str, ...] = ()
 
     def names(self, kind: TrialKind) -> tuple[str, ...]:
         """Return the names of the channels that a kind of trial measures."""
-        chosen = {
-            TrialKind.STATIC: self.static_channels,
-            TrialKind.FLIGHT: self.flight_channels,
-        }.get(kind, self.dynamic_channels)
+        chosen = self.flight_channels if kind is TrialKind.FLIGHT else ()
         return chosen or tuple(channel.name for channel in self.channels)
 
 
