@@ -198,13 +198,9 @@ def test_outputs_and_lengths(oscillator, campaign) -> None:
     release = next(trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN)
 
     def cut(count: int, step: int = 1) -> Campaign:
-        rows = slice(0, count, step)
-        short = replace(
-            release, values=release.values[rows], used=release.used[rows], time=release.time[rows],
-            force=release.force[rows], load_factor=release.load_factor[rows],
-            temperature=release.temperature[rows],
-        )  # fmt: skip
-        return replace(campaign, trials=(short,))
+        rows = np.arange(len(release.time)) % step == 0
+        rows[count:] = False
+        return replace(campaign, trials=(release.rows(rows),))
 
     assert (FaultKind.TOO_SHORT, "") in found(check_against_model(cut(100), oscillator))
     assert found(check_against_model(cut(401), oscillator)) == set()
@@ -277,12 +273,9 @@ def test_noise_label_against_repeats() -> None:
     rows = 6
 
     def trial(number: int) -> Trial:
-        zeros = np.zeros(rows)
-        return Trial(
-            str(number), TrialKind.STATIC, ("x",), (np.arange(rows) + rng.normal(size=rows))[:, None],
-            np.ones((rows, 1), dtype=bool), zeros, np.arange(rows) * 1.0, zeros, "x", zeros, 0.0, "A",
-            np.zeros((rows, 2)), np.zeros((rows, 2)),
-        )  # fmt: skip
+        values = (np.arange(rows) + rng.normal(size=rows))[:, None]
+        force = np.arange(rows) * 1.0
+        return Trial.plain(str(number), TrialKind.STATIC, ("x",), np.zeros(rows), values=values, force=force)
 
     def campaign(stated: float) -> Campaign:
         channel = Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(stated, 100.0))
@@ -371,12 +364,8 @@ def test_rows_of_static_trials(campaign) -> None:
         values = 1e-3 * load + curve * load**2 + 5e-6 * np.random.default_rng(count).normal(size=count)
         if spoilt is not None:
             values[spoilt] += 1e-3
-        zeros = np.zeros(count)
-        return Trial(
-            name, TrialKind.STATIC, ("x",), values[:, None], np.ones((count, 1), dtype=bool), zeros, load,
-            zeros, "x", zeros, 0.0, "A",
-            np.zeros((count, 2)), np.zeros((count, 2)),
-        )  # fmt: skip
+        zeros, column = np.zeros(count), values[:, None]
+        return Trial.plain(name, TrialKind.STATIC, ("x",), zeros, values=column, force=load, run="A")
 
     def left_out(*trials: Trial, noise: float | None = 5e-6) -> list[list[int]]:
         record = None if noise is None else NoiseRecord(noise, 100.0)

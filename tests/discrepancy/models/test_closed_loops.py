@@ -98,11 +98,7 @@ def model_of(text: str) -> LumpedModel:
 
 
 def driven(time: FloatArray, item: RecordedInput, begins: Start = Start.STILL) -> Trial:
-    zero, pair = np.zeros(len(time)), np.zeros((len(time), 2))
-    return Trial(
-        "driven", TrialKind.DRIVEN, ("a", "b"), pair, pair == 0.0, time, zero, zero, "tip_load", zero,
-        0.0, "", pair, pair, begins=begins, inputs=(item,),
-    )  # fmt: skip
+    return Trial.plain("driven", TrialKind.DRIVEN, ("a", "b"), time, begins=begins, inputs=(item,))
 
 
 def integrated(rate: Any, time: FloatArray, first: FloatArray) -> FloatArray:

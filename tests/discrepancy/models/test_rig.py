@@ -162,16 +162,8 @@ def model_of(text: str) -> LumpedModel:
 
 
 def trial(time: FloatArray, *inputs: RecordedInput, **changes: Any) -> Trial:
-    count = len(time)
-    base: dict[str, Any] = {
-        "name": "a trial", "kind": TrialKind.DRIVEN, "channels": (), "values": np.zeros((count, 0)),
-        "used": np.ones((count, 0), bool), "time": time, "force": np.zeros(count),
-        "load_factor": np.zeros(count), "load_place": "tip_load",
-        "temperature": np.zeros(count), "start": 0.0,
-        "run": "A", "health": np.zeros((1, 2)), "health_deviation": np.zeros((1, 2)), "begins": Start.STILL,
-        "inputs": inputs,
-    }  # fmt: skip
-    return Trial(**{**base, **changes})
+    said: dict[str, Any] = {"kind": TrialKind.DRIVEN, "begins": Start.STILL, "inputs": inputs, **changes}
+    return Trial.plain("a trial", said.pop("kind"), said.pop("channels", ()), time, **said)
 
 
 def shown(
