@@ -265,9 +265,7 @@ def _investigated(
     generator = np.random.default_rng(seed)
     try:
         campaign = simulator.simulate(hidden, generator)
-    except (
-        ModelError
-    ):  # at the edge of what the structure carries: the effect at its mean conditions is known to go
+    except ModelError:  # at the edge of what the structure carries: it goes at its mean conditions
         generator = np.random.default_rng(seed.spawn(1)[0])
         campaign = simulator.simulate(hidden, generator)
     found = investigate(campaign, simulator.model, effects, thorough=False).verdict

@@ -12,15 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.reading import CAMPAIGN_FILE
-from discrepancy.campaign.records import (
-    Campaign,
-    Channel,
-    Hold,
-    RecordedInput,
-    Start,
-    Trial,
-    TrialKind,
-)
+from discrepancy.campaign.records import Campaign, Channel, Hold, RecordedInput, Start, Trial, TrialKind
 from discrepancy.campaign.schema import FORMAT, input_columns
 from discrepancy.campaign.units import UNITS, in_unit, sum_text
 from discrepancy.errors import CampaignFileError

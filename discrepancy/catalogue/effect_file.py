@@ -65,6 +65,13 @@ from reporting.toml_file import read_toml
 Text = Annotated[str, Field(min_length=0)]
 
 
+_AS_WRITTEN = (
+    "name", "family", "equation", "signature", "reference", "acts_on", "parameters", "shape", "confusable",
+    "spectral",
+)  # fmt: skip
+"""Keys that an effect has as they are written."""
+
+
 class EffectSection(Section):
     """`[[effect]]`, or the whole of a file with one."""
 
@@ -119,28 +126,15 @@ def _effect(row: object, where: str) -> Effect:
     )
     _check_in_time(recipes, section.acts_on)
     word = section.places if isinstance(section.places, str) else ""
-    needing = Needing(
-        section.id,
-        section.acts_on,
-        tuple(PRIMITIVES[recipe.kind] for recipe in recipes),
-        frozenset().union(*(recipe.moments for recipe in recipes)),
-        word,
-    )
+    primitives = tuple(PRIMITIVES[recipe.kind] for recipe in recipes)
+    used = frozenset().union(*(recipe.moments for recipe in recipes))
+    needing = Needing(section.id, section.acts_on, primitives, used, word)
     return Effect(
-        section.id,
-        section.name,
-        section.family,
-        section.equation,
-        section.signature,
-        section.reference,
-        section.acts_on,
-        section.parameters,
-        partial(_build, recipes, section.acts_on, word),
-        section.shape,
-        partial(_places, section.places, section.acts_on, section.preferred),
-        partial(first_reason, section.needs, needing),
-        section.confusable,
-        section.spectral,
+        identifier=section.id,
+        build=partial(_build, recipes, section.acts_on, word),
+        places=partial(_places, section.places, section.acts_on, section.preferred),
+        unavailable=partial(first_reason, section.needs, needing),
+        **{key: getattr(section, key) for key in _AS_WRITTEN},
     )
 
 
@@ -263,13 +257,9 @@ def _recipe(
             else:
                 numeric = isinstance(value, str) and types[name] is not str
                 values[name] = Expression(text, known, place) if numeric else value
-        _primitive_of(  # whether all values are there, with numbers in the place of expressions
-            kind,
-            {
-                name: ("1" if name in primitive.courses else 1.0) if isinstance(value, Expression) else value
-                for name, value in values.items()
-            },
-        )
+        # whether all values are there, with numbers in the place of expressions
+        one = {name: "1" if name in primitive.courses else 1.0 for name in values}
+        _primitive_of(kind, {n: one[n] if isinstance(v, Expression) else v for n, v in values.items()})
     except InvalidPatchError as cause:
         message = str(cause)
         raise CatalogueError(message if message.startswith(where) else f"{where}: {message}") from cause

@@ -256,12 +256,9 @@ def _swaps_of(
             used = trial.used[:, own]
             noise = channel.noise_in(trial)
             for place, other in enumerate(columns):
+                predicted, offset = predictions[trial.name][used, other], channel.offset_deviation
                 misfit[row, place] += _misfit(
-                    trial.values[used, own],
-                    predictions[trial.name][used, other],
-                    noise,
-                    trial.is_dynamic,
-                    channel.offset_deviation,
+                    trial.values[used, own], predicted, noise, trial.is_dynamic, offset
                 )
     _, assigned = linear_sum_assignment(misfit)
     for row, place in enumerate(assigned):

@@ -87,10 +87,7 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
     if found is not None:
         ratio = (found.standard_deviation / stated) ** 2
         freedom = min(record.degrees_of_freedom, 1e9)
-        tail = min(
-            fisher.sf(ratio, found.degrees_of_freedom, freedom),
-            fisher.cdf(ratio, found.degrees_of_freedom, freedom),
-        )
+        tail = min(side(ratio, found.degrees_of_freedom, freedom) for side in (fisher.sf, fisher.cdf))
         if 2.0 * tail < _ALPHA and not 1.0 / _NOISE_FACTOR**2 < ratio < _NOISE_FACTOR**2:
             yield _noise_fault(channel, stated, found.standard_deviation, "repeated trials scatter")
             return

@@ -11,12 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from discrepancy.campaign.records import TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
-from discrepancy.location.backbone import (
-    Backbone,
-    RestoringForceSurface,
-    backbones,
-    restoring_force_surface,
-)
+from discrepancy.location.backbone import Backbone, RestoringForceSurface, backbones, restoring_force_surface
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.report.kit import models, panels, plain_powers
 from discrepancy.report.motion_figures import mode_frequencies

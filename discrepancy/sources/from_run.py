@@ -36,12 +36,8 @@ from reporting.words import counted
 FloatArray = NDArray[np.float64]
 
 RUN_FILE, CONFIG_FILE = "run.nc", "config.json"
-DESIGN_FILE, CALIBRATION_FILE, BINDING_FILE = (
-    "asset/design.toml",
-    "asset/calibration.nc",
-    "asset/binding.toml",
-)
-MODEL_PATCH_FILE = "asset/model_patch.json"
+DESIGN_FILE, CALIBRATION_FILE = "asset/design.toml", "asset/calibration.nc"
+BINDING_FILE, MODEL_PATCH_FILE = "asset/binding.toml", "asset/model_patch.json"
 PATCH_NAME, PATCH_STEP = "model_patch", "model_patch_from_step"
 """Attributes of `run.nc` where a watch adopted a patch on the way: its file, and the first step with it."""
 STRAIN = "strain"

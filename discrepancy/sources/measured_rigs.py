@@ -89,12 +89,6 @@ def _table(names: Sequence[str], columns: Sequence[FloatArray]) -> str:
     return "\n".join([",".join(names), *(",".join(row) for row in rows)]) + "\n"
 
 
-def _means(table: FloatArray, joined: int) -> FloatArray:
-    """Return the means of so many rows each, (N // joined, C); what is left over at the end is dropped."""
-    whole = len(table) // joined
-    return np.asarray(table[: whole * joined].reshape(whole, joined, -1).mean(axis=1))
-
-
 def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
     """Return times [s] from the release and readings z [m/s^2] of the longest fall in a record."""
     data = _numbers(file, ("time", "x", "y", "z"))
@@ -138,7 +132,8 @@ def _pendulum(data: Path) -> dict[str, str]:
     for name in ("pd_trajectory", "ilqr"):
         table = _numbers(data / f"{name}.csv", ("time", "position", "velocity", "torque"))
         joined = max(round(STEP / float(np.median(np.diff(table[:, 0])))), 1)
-        time, angle, _, torque = _means(table, joined).T
+        whole = len(table) // joined * joined  # what is left over at the end is dropped
+        time, angle, _, torque = table[:whole].reshape(-1, joined, table.shape[1]).mean(axis=1).T
         angle = savgol_filter(angle, 2 * round(0.5 * SMOOTHED / STEP) + 1, 3)
         tables[f"{name}.csv"] = _table(("time", "angle", "torque"), (np.round(time, 9), angle, torque))
     return tables

@@ -13,12 +13,7 @@ from hypothesis import strategies as st
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.checks.outliers import sample_outliers, wrong_ends
-from discrepancy.checks.quality import (
-    FaultKind,
-    check_against_model,
-    check_data,
-    mark_outliers,
-)
+from discrepancy.checks.quality import FaultKind, check_against_model, check_data, mark_outliers
 from discrepancy.sources.examples import ExamplePlan, example_campaign
 from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain
 
