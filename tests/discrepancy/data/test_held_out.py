@@ -19,7 +19,7 @@ def trial(name: str, kind: TrialKind, top: float, count: int = 4, run: str = "A"
         TrialKind.RINGDOWN: {"release": Release(top)},
         TrialKind.STATIC: {"force": rows},
         TrialKind.FLIGHT: {"load_factor": rows},
-    }[kind]
+    }.get(kind, {})
     values = np.arange(float(count * len(channels))).reshape(count, len(channels))
     return Trial.plain(name, kind, tuple(channels), rows, values=values, load_place="x", run=run, **drive)
 
