@@ -13,9 +13,9 @@ import numpy as np
 from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
-from discrepancy.catalogue.building import NO_PORT
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import load_catalogue
+from discrepancy.catalogue.needs import NO_PORT
 from discrepancy.checks.fault import DataFault
 from discrepancy.checks.outliers import wrong_ends
 from discrepancy.checks.quality import check_against_model, check_data, mark_outliers

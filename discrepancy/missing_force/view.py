@@ -253,7 +253,9 @@ class View:
         ]
         shortest, longest = self.times
         outside = any(not shortest <= one.time <= longest for one in processes.values())
-        if outside or np.abs(away).max() > FARTHEST or not all(one.is_sound for one in self.filtered(processes)):
+        if outside or np.abs(away).max() > FARTHEST:
+            return -np.inf
+        if not all(one.is_sound for one in self.filtered(processes)):
             return -np.inf
         return float(self.solve(processes).evidence - 0.5 * np.sum(np.square(away)))
 

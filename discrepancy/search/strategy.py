@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.catalogue.windowed import in_events
+from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
