@@ -147,7 +147,8 @@ def found_in(case: Case) -> FloatArray:
     search = ForceSearch(problem_of(case))
     at = search.locate()
     one = search.rough(max(at, key=lambda name: at[name].evidence))
-    return events(one.view, 0, one.processes[0]).moments(0)
+    ((port, process),) = one.processes.items()
+    return events(one.view, port, process).moments(0)
 
 
 def counted(case: Case, found: FloatArray) -> Counter[str]:

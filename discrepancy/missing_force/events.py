@@ -180,7 +180,10 @@ class EventSearch:
 
         def objective(move: FloatArray) -> float:
             prior = float(0.5 * np.sum(((first + move * REACH) / DOUBTS) ** 2))
-            return prior - self.total(acting(move), paths)
+            try:
+                return prior - self.total(acting(move), paths)
+            except np.linalg.LinAlgError:  # a force far larger than what is read
+                return np.inf
 
         simplex = np.vstack((np.zeros(4), np.eye(4)))
         options = {"xatol": 0.05, "fatol": 0.2, "maxfev": passes, "initial_simplex": simplex}
