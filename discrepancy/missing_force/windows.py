@@ -120,7 +120,8 @@ def _most_telling(port: int, at: Explained) -> tuple[int, Explained]:
     view, best = at.view, (port, at)
     trials = view.trials
     for channel in range(min(trial.residual.shape[1] for trial in trials)):
-        on_reading = replace(view, trials=[_reading(trial, channel) for trial in trials])
+        motions = [replace(motion, forces={}, left={}) for motion in view.motions]
+        on_reading = replace(view, trials=[_reading(trial, channel) for trial in trials], motions=motions)
         length = max(float(np.ptp(trial.time)) for trial in trials)
         processes = [
             {0: Process(size, time * length, rough=True)}
