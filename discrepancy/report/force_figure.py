@@ -28,9 +28,9 @@ def missing_force_figure(missing: MissingForce) -> Figure:
     """Draw the missing force, with its law and what is left where an effect was named."""
     rows = 2 if missing.law else 1
     with publication_style():
-        figure = new_figure(2.4 * rows + 0.3)
+        figure = new_figure(2.4 * rows + 0.5)
         grid = figure.add_gridspec(
-            rows, 3, left=0.085, right=0.985, bottom=0.21 / rows, top=1.0 - 0.1 / rows, wspace=0.3, hspace=0.5
+            rows, 3, left=0.085, right=0.985, bottom=0.2 / rows, top=1.0 - 0.17 / rows, wspace=0.3, hspace=0.5
         )
         shared: Axes | None = None
         for row in range(rows):
@@ -39,6 +39,8 @@ def missing_force_figure(missing: MissingForce) -> Figure:
                 shared = shared if row else shared or axes
                 _draw(axes, missing, column, left=bool(row))
                 panel_label(axes, "abcdef"[3 * row + column], ("missing force", "what is left")[row])
+        drawn = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*drawn, loc="upper right", ncols=2, markerscale=3.0)
     return figure
 
 
@@ -67,8 +69,6 @@ def _draw_over(axes: Axes, missing: MissingForce, column: int, *, left: bool) ->
     if missing.law and not left:
         law = np.concatenate([item.law[::stride] for item in missing.courses if item.law is not None])
         axes.plot(along, law, ".", color=PREDICTION, ms=1.2, alpha=0.7, label=missing.law)
-        if column == 0:
-            axes.legend(loc="best", markerscale=3.0)
     if missing.of_state:
         axes.set_xlabel(("integral of the state", "state")[column])
     else:
