@@ -34,7 +34,11 @@ def run() -> list[Measurement]:
         isolated = _asset(path, binding, isolated=True)
         opening = median_seconds(lambda: _open_and_close(path, binding), repeats=5)
     damage = itertools.cycle(range(LEVELS))
-    alone = _microseconds(lambda: model.static_response(1.0, (0.001 * next(damage), 0.2), 3.0))
+    alone = _microseconds(
+        lambda: model.static_response(
+            young_modulus_factor=1.0, stiffness_loss=(0.001 * next(damage), 0.2), load_factor=3.0
+        )
+    )
     lists = "fmpy, lists, no checks"
     return [
         Measurement("FMU step in process", in_process, "us", 60.0, lists, plain),

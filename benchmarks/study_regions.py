@@ -189,7 +189,7 @@ def _wing_errors(operators: AffineOperators, model: ReducedModel, states: int) -
     for _ in range(states):
         e, *losses = rng.uniform(*model.validity_box[: 1 + len(model.regions)].T).tolist()
         wanted = solve_static(operators, e, tuple(losses), 3.0).strain
-        found = model.static_response(e, tuple(losses), 3.0)
+        found = model.static_response(young_modulus_factor=e, stiffness_loss=tuple(losses), load_factor=3.0)
         missed, size = float(np.abs(found.strain - wanted).max()), float(np.abs(wanted).max())
         strain, bound = max(strain, missed / size), max(bound, found.strain_error_bound / size)
         broken += missed > found.strain_error_bound

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from calibration.wing.result import CalibrationResult
     from fe.reduction.structure_basis import StructureReduction
     from fe.runtime.patch_arrays import PatchArrays
-    from fe.runtime.structure_model import StructureModel
+    from fe.runtime.reduced import ReducedModel
     from fe.structure.operators import Structure
 
 LEVELS = (0, 20, 40, 60, 80)
@@ -396,7 +396,7 @@ def coarse_plate(plate_file: Path) -> Structure:
 
 
 @pytest.fixture(scope="session")
-def plate_model(coarse_plate: Structure) -> StructureModel:
+def plate_model(coarse_plate: Structure) -> ReducedModel:
     """Its reduced model."""
     from fe.reduction.structure_cache import reduced
 

@@ -68,14 +68,13 @@ def wing_record(design: "WingDesign", model: "ReducedModel") -> dict[str, Any]:
     from fe.runtime.state import DigitalState
 
     state = DigitalState()
-    masses = (state.servo_mass, state.pitot_mass)
-    modes = model.modes(state.young_modulus_factor, state.stiffness_loss, *masses)
+    modes = model.modes(state.values, state.stiffness_loss)
     structure = structural_mass(design)
     return {
         "design": design.name,
         "design_hash": design.hash,
         "structural_mass": structure,
-        "mass": structure + 2 * masses[0] + masses[1],
+        "mass": structure + 2 * state.servo_mass + state.pitot_mass,
         "tip_stiffness": float(model.tip_stiffness(state.young_modulus_factor)),
         "modes": [
             {"number": index + 1, "frequency": float(frequency), "shape": mode_name(modes, index)}
@@ -87,7 +86,7 @@ def wing_record(design: "WingDesign", model: "ReducedModel") -> dict[str, Any]:
 def mode_name(modes: "Modes", index: int) -> str:
     """Return the name of a mode that is followed by its shape, or nothing."""
     names = ("first flapwise bending", "second flapwise bending")
-    return dict(zip(modes.flapwise, names, strict=True)).get(index, "")
+    return dict(zip(modes.followed, names, strict=True)).get(index, "")
 
 
 def structural_mass(design: "WingDesign") -> float:

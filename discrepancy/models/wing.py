@@ -45,7 +45,7 @@ from fe.runtime.patch import (
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import LOAD_PLACE, PORTS, PatchedWing
 from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
-from fe.runtime.reduced_arrays import parameter_names
+from fe.runtime.state import wing_names
 from fe.wing.design import load_design
 
 FloatArray = NDArray[np.float64]
@@ -87,7 +87,7 @@ class WingModel:
         self.wing = PatchedWing(arrays)
         self._name = name
         prior = prior or SHIPPED_PRIOR
-        box = dict(zip(parameter_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
+        box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         limits = {key: (low, high) for key, (low, high) in box.items()} | DAMPING_LIMITS
         self._parameters = tuple(
             ModelParameter(item.name, *prior[item.name], item.unit, *limits[item.name]) for item in STATE

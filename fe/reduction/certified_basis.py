@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import ceil
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,13 +24,12 @@ from fe.full.subspace import (
     OrthonormalBasis,
     conjugate_gradients,
 )
-from fe.runtime.reduced_arrays import AffineArrays
+from fe.runtime.reduced import ReducedModel
 
 from .dual_solutions import DualData, DualProblem, beside
 
 FloatArray = npt.NDArray[np.float64]
 State = tuple[float, ...]
-_Model = TypeVar("_Model", bound=AffineArrays)
 
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
@@ -70,7 +69,7 @@ class AffineProblem:
 
 
 @dataclass(frozen=True)
-class Judgement(Generic[_Model]):
+class Judgement:
     """How a reduced model is judged at a state: its solutions (N,) to each load alone, and its largest bound.
 
     Attributes
@@ -81,8 +80,8 @@ class Judgement(Generic[_Model]):
         Certified bound relative to the largest output, of the load where that is largest.
     """
 
-    solutions: Callable[[_Model, State], list[FloatArray]]
-    bound: Callable[[_Model, State], float]
+    solutions: Callable[[ReducedModel, State], list[FloatArray]]
+    bound: Callable[[ReducedModel, State], float]
 
 
 class StaticReduction:
@@ -209,7 +208,7 @@ class StaticReduction:
         )
 
     def arrays(self) -> dict[str, Any]:
-        """Return the static fields of `AffineArrays`, and `cross_mass` with the static basis alone."""
+        """Return the static fields of `ReducedArrays`, and `cross_mass` with the static basis alone."""
         problem, basis = self.problem, self.basis.vectors
         return {
             "static_stiffness": 0.5 * (self.in_basis + self.in_basis.transpose(0, 2, 1)),
@@ -242,8 +241,8 @@ class StaticReduction:
 
 def greedy(
     static: StaticReduction,
-    model: Callable[[], _Model],
-    judgement: Judgement[_Model],
+    model: Callable[[], ReducedModel],
+    judgement: Judgement,
     states: list[State],
     *,
     tolerance: float,
@@ -290,7 +289,7 @@ def greedy(
             worst = int(bounds.argmax())
             return float(bounds[worst]), mus[worst]
 
-        def _bounds(self, present: _Model, mus: list[Any]) -> FloatArray:
+        def _bounds(self, present: ReducedModel, mus: list[Any]) -> FloatArray:
             """Return the bounds; of many states, where they were largest, and zeros, until they are small."""
             bounds, first = np.zeros(len(mus)), 0
             if self.rounds == 1:

@@ -30,7 +30,7 @@ MOST_COLUMNS = 48
 
 @dataclass(frozen=True)
 class DualData:
-    """Approximate dual solutions: whitened products with X (A or M, n, O), the rest as in `AffineArrays`."""
+    """Approximate dual solutions: whitened products with X (A or M, n, O), the rest as in `ReducedArrays`."""
 
     products: FloatArray
     factors: FloatArray

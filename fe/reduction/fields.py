@@ -192,7 +192,10 @@ def write_wing_vtu(
         If the file cannot be written.
     """
     coordinates = wing.model.static_response(
-        young_modulus_factor, stiffness_loss, load_factor, tip_force
+        stiffness_loss=stiffness_loss,
+        young_modulus_factor=young_modulus_factor,
+        load_factor=load_factor,
+        tip_force=tip_force,
     ).coordinates
     basis = wing.basis
     strain = basis.static_strain @ coordinates
@@ -228,7 +231,12 @@ def write_modes_vtu(
     Parameters and errors are those of `write_wing_vtu`; the masses [kg] are as of
     `fe.runtime.state.DigitalState`.
     """
-    modes = wing.model.modes(young_modulus_factor, stiffness_loss, servo_mass, pitot_mass)
+    modes = wing.model.modes(
+        stiffness_loss=stiffness_loss,
+        young_modulus_factor=young_modulus_factor,
+        servo_mass=servo_mass,
+        pitot_mass=pitot_mass,
+    )
     shapes = wing.basis.modal_displacement @ modes.shape
     _write(
         Path(path),

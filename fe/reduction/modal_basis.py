@@ -36,7 +36,7 @@ class ModalData:
     basis: FloatArray
     stiffness: FloatArray
     mass: FloatArray
-    flapwise_reference: FloatArray
+    followed_shapes: FloatArray
     mode_count: int
 
 
@@ -112,7 +112,7 @@ def sampled_states(box: FloatArray) -> list[ModalState]:
 
     Each entry holds the coefficients of the stiffness terms (K + 2,) and of the mass terms (3,).
     """
-    e, losses, (servo, pitot) = box[0], box[1:-4], box[-2:]
+    e, losses, (servo, pitot) = box[0], box[1:-4], box[-4:-2]
     states = []
     for number, ends in enumerate(loss_corners(len(losses))):
         remaining = [1.0 - loss[end] for loss, end in zip(losses, ends, strict=True)]
@@ -134,7 +134,7 @@ def compression_states(box: FloatArray) -> list[ModalState]:
 
     With more than `MOST_GRID_REGIONS` the losses are `loss_corners`, the same halfway.
     """
-    e, losses, (servo, pitot) = box[0], box[1:-4], box[-2:]
+    e, losses, (servo, pitot) = box[0], box[1:-4], box[-4:-2]
     levels = [(loss[0], loss.mean(), loss[1]) for loss in losses]
     if len(losses) <= MOST_GRID_REGIONS:
         choices = list(itertools.product((0, 1, 2), repeat=len(losses)))
@@ -174,7 +174,7 @@ def reduce_modes(
     reference : (K + 1,) ndarray
         (e, 1 - z1, ...) of the norm.
     box : (K + 5, 2) ndarray
-        Validity box, `fe.runtime.reduced_arrays.parameter_names`.
+        Validity box, `fe.runtime.state.wing_names`.
     nominal_masses : tuple of float
         Servo and pitot mass at which the flapwise modes are named, at e = 1 and no loss [kg].
     settings : ModalSettings
@@ -192,7 +192,7 @@ def reduce_modes(
     basis, stiffness, mass = modal_basis(
         system,
         norm,
-        np.array((1.0, *np.mean(box[-2:], axis=1))),
+        np.array((1.0, *np.mean(box[-4:-2], axis=1))),
         sampled_states(box),
         compression_states(box),
         settings,

@@ -12,6 +12,7 @@ from fe.full.affine import AffineSystem, affine_sum
 from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import DigitalState
 from reporting.words import counted
 
 from .certified_basis import AffineProblem, StaticReduction, greedy
@@ -149,9 +150,22 @@ def _model(
 ) -> ReducedModel:
     """Return the reduced model of the present bases."""
     regions, counts = len(system.regions), settings.anchors(len(system.regions))
+    state = DigitalState()
     return ReducedModel(
         design_hash=system.design_hash,
+        name="uav_wing",
         region_names=" ".join(system.regions),
+        parameter_names="young_modulus_factor",
+        mass_names="servo_mass pitot_mass",
+        control_names="load_factor tip_force",
+        control_units="1 N",
+        gauge_names=" ".join(f"gauge_{number}" for number in range(1, system.gauge_output.shape[0] + 1)),
+        displacement_names="tip",
+        acceleration_names="",
+        nominal=np.array((1.0, *(0.0,) * regions, state.servo_mass, state.pitot_mass, 1.0, 0.0)),
+        damping=np.array((state.damping_alpha, state.damping_beta)),
+        stiffness_factors=np.array([(1, 0), *((0, region + 1) for region in range(regions)), (0, 0)]),
+        load_factors=np.array([(1, 0), (2, 0)]),
         validity_box=settings.validity_box(regions),
         dual_counts=np.array(counts, dtype=np.int64),
         dual_split=np.concatenate([loss_splits(settings.stiffness_loss, count) for count in counts]),
@@ -160,7 +174,7 @@ def _model(
         modal_load=static.problem.loads.T @ modal.basis,
         modal_output=static.problem.outputs.T @ modal.basis,
         cross_mass=static.cross_mass(modal.basis),
-        flapwise_reference=modal.flapwise_reference,
+        followed_shapes=modal.followed_shapes,
         mode_count=modal.mode_count,
         **static.arrays(),
     )

@@ -77,10 +77,10 @@ class ReductionSettings:
     modal: ModalSettings = field(default_factory=ModalSettings)
 
     def validity_box(self, regions: int) -> FloatArray:
-        """Return the ranges (K + 5, 2) for K regions, as `fe.runtime.reduced_arrays.parameter_names`."""
+        """Return the ranges (K + 5, 2) for K regions, as `fe.runtime.state.wing_names`."""
         losses = (self.stiffness_loss,) * regions
-        loads_and_masses = (self.load_factor, self.tip_force, self.servo_mass, self.pitot_mass)
-        return np.array((self.young_modulus_factor, *losses, *loads_and_masses), dtype=np.float64)
+        masses_and_loads = (self.servo_mass, self.pitot_mass, self.load_factor, self.tip_force)
+        return np.array((self.young_modulus_factor, *losses, *masses_and_loads), dtype=np.float64)
 
     def reference(self, regions: int) -> FloatArray:
         """Return the values (K + 1,) of (e, 1 - z1, ...) whose stiffness is the norm of the error bound."""

@@ -1,4 +1,4 @@
-"""Offline: make the `StructureModel` of a structure from its full model.
+"""Offline: make the `ReducedModel` of a structure from its full model.
 
 The certified search and the modes are those of the wing; see `docs/reduced_model.md`.
 """
@@ -15,7 +15,7 @@ from scipy.stats import qmc
 from fe.full.affine import affine_sum
 from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure
 from fe.structure.design import ReductionLimits, StructureDesign
 from reporting.words import counted
@@ -76,7 +76,7 @@ class StructureSettings:
 class StructureReduction:
     """A reduced structure with the bases that made it, as `fe.reduction.reduced_basis.Reduction`."""
 
-    model: StructureModel
+    model: ReducedModel
     static_basis: FloatArray
     modal_basis: FloatArray
     snapshots: tuple[State, ...]
@@ -330,12 +330,12 @@ def _model(
     name: str,
     modes: tuple[FloatArray, FloatArray, FloatArray],
     mode_count: int,
-) -> StructureModel:
+) -> ReducedModel:
     """Return the reduced model of the present bases."""
     structure, problem, basis = terms.structure, terms.problem, modes[0]
     chosen = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
     nominal = structure.parameters | structure.masses | structure.controls
-    return StructureModel(
+    return ReducedModel(
         design_hash=structure.design_hash,
         name=name,
         region_names=" ".join(structure.regions),
@@ -361,6 +361,7 @@ def _model(
         modal_output=np.concatenate((problem.outputs.T @ basis, structure.acceleration_output @ basis)),
         cross_mass=static.cross_mass(basis),
         mode_count=mode_count,
+        followed_shapes=np.empty((0, basis.shape[1])),
         **static.arrays(),
     )
 
@@ -380,19 +381,19 @@ def _least(terms: _Terms, norm: Norm) -> FloatArray:
     return np.array(found)
 
 
-def _judgement(terms: _Terms, least: FloatArray) -> Judgement[StructureModel]:
+def _judgement(terms: _Terms, least: FloatArray) -> Judgement:
     """Return how the model is judged: each load alone, gauges and displacements each by their largest."""
     unit = np.eye(len(terms.load_factors))
 
-    def vector(model: StructureModel, state: State) -> FloatArray:
+    def vector(model: ReducedModel, state: State) -> FloatArray:
         found = model.nominal.copy()
         found[: len(state)] = state
         return found
 
-    def bound(model: StructureModel, state: State) -> float:
+    def bound(model: ReducedModel, state: State) -> float:
         chosen, worst = vector(model, state), 0.0
         for number, load in enumerate(unit):
-            found = model.static_response(chosen, load)
+            found = model.static_response(chosen, load=load)
             kinds = (
                 (found.strain, found.strain_error_bound),
                 (found.displacement, found.displacement_error_bound),
@@ -402,8 +403,8 @@ def _judgement(terms: _Terms, least: FloatArray) -> Judgement[StructureModel]:
                 worst = max(worst, error / max(float(np.abs(values).max()), floor))
         return worst
 
-    def solutions(model: StructureModel, state: State) -> list[FloatArray]:
+    def solutions(model: ReducedModel, state: State) -> list[FloatArray]:
         chosen = vector(model, state)
-        return [model.static_response(chosen, load).coordinates for load in unit]
+        return [model.static_response(chosen, load=load).coordinates for load in unit]
 
     return Judgement(solutions, bound)

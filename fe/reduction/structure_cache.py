@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from fe.runtime.archive import write_bytes_atomically
 from fe.runtime.errors import ReducedModelFileError
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 
 from .built_once import built_once, cache_folder
 from .model_cache import MODELLING_ROOMS, modelling_hash
@@ -24,7 +24,7 @@ def reduced_structure(
     progress: "Progress | None" = None,
     *,
     memory_limit: float | None = None,
-) -> StructureModel:
+) -> ReducedModel:
     """Return the reduced model of a structure file, from the cache if it is there.
 
     A build works in one thread, so that the same files give the same bytes on a machine.
@@ -48,13 +48,13 @@ def reduced_structure(
     file = Path(file)
     settings, design_hash, path = _place(file, settings)
 
-    def load() -> StructureModel:
-        model = StructureModel.load(path)
+    def load() -> ReducedModel:
+        model = ReducedModel.load(path)
         if model.design_hash != design_hash:
             raise ReducedModelFileError(f"{path} holds the model of another structure; delete it.")
         return model
 
-    def build() -> StructureModel:
+    def build() -> ReducedModel:
         from fe.structure.operators import load_and_assemble
 
         from .stages import stage_of
@@ -101,7 +101,7 @@ def _place(file: Path, settings: "StructureSettings | None" = None) -> tuple["St
 
 def reduced(
     structure: "Structure", settings: "StructureSettings | None" = None, progress: "Progress | None" = None
-) -> StructureModel:
+) -> ReducedModel:
     """Reduce an assembled structure in one thread, without the cache; see `reduced_structure`."""
     from threadpoolctl import threadpool_limits
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure
 
 
@@ -37,7 +37,7 @@ class MeasuredErrors:
 
 
 def measured_errors(
-    structure: AffineStructure, model: StructureModel, states: int, seed: int = 2021
+    structure: AffineStructure, model: ReducedModel, states: int, seed: int = 2021
 ) -> MeasuredErrors:
     """Compare a reduced model with the full one, each control at its nominal value, or one where that is 0.
 
@@ -45,7 +45,7 @@ def measured_errors(
     ----------
     structure : AffineStructure
         The full model.
-    model : StructureModel
+    model : ReducedModel
         Its reduced model.
     states : int
         Random states, uniform in the ranges; each costs a factorisation.

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import ReducedModelFileError
-from .reduced_arrays import RegionArrays, parameter_names
+from .reduced_arrays import RegionArrays
+from .state import wing_names
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -34,7 +35,7 @@ class PatchArrays(RegionArrays):
     Attributes
     ----------
     validity_box : (K + 5, 2) ndarray
-        Least and largest value of each of `fe.runtime.reduced_arrays.parameter_names`, SI units.
+        Least and largest value of each of `fe.runtime.state.wing_names`, SI units.
     largest_loss, largest_compliance, largest_mass : float
         Stiffness loss of a strip [1], root compliance [rad/(N m)] and point mass [kg] up to which the basis
         was made; the accuracy falls slowly beyond.
@@ -156,7 +157,7 @@ class PatchArrays(RegionArrays):
     def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
         n, p, t = self.stiffness.shape[-1], len(self.stations), len(self.strip_of)
         return {
-            "validity_box": (len(parameter_names(self.regions)), 2),
+            "validity_box": (len(wing_names(self.regions)), 2),
             "stiffness": (len(self.regions) + 2, n, n),
             "mass": (3, n, n),
             "strip_lines": (len(self.strip_lines),),

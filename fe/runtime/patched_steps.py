@@ -132,9 +132,14 @@ class PatchedSteps:
     def _plain_outputs(self, load_factor: float, tip_force: float) -> FloatArray:
         """Strains, tip displacement and load point displacement (G + 2,) of the reduced model."""
         e, stiffness_loss, *_ = self._state
-        static = self._model.static_response(e, stiffness_loss, load_factor, tip_force)
+        static = self._model.static_response(
+            stiffness_loss=stiffness_loss,
+            young_modulus_factor=e,
+            load_factor=load_factor,
+            tip_force=tip_force,
+        )
         point = self._model.static_load[1] @ static.coordinates
-        return np.concatenate((static.strain, (static.tip_displacement, point)))
+        return np.concatenate((static.strain, static.displacement, (point,)))
 
     # ------------------------------------------------------------ at rest
 
@@ -406,7 +411,7 @@ class PatchedSteps:
         """
         modes = self._plain_modes
         count = len(modes.frequency)
-        deviation = (state.displacement - before.at_rest(*state.load.tolist()).displacement)[:count]
+        deviation = (state.displacement - before.at_rest(state.load).displacement)[:count]
         place = modes.shapes @ deviation + self._plain_answers @ state.load
         velocity = modes.shapes @ state.velocity[:count]
         return self._carried(place, velocity, state.load, self._laws.memory())
@@ -414,7 +419,7 @@ class PatchedSteps:
     def give_back(self, state: Sequence[float], after: ModalIntegrator) -> TransientState:
         """Return a state in the modes of the wing without patch, as `take_over_unpatched` takes it."""
         now, modes = self._unpacked(state), self._plain_modes
-        rest = after.at_rest(*now.loads.tolist())
+        rest = after.at_rest(now.loads)
         displacement, velocity = rest.displacement.copy(), rest.velocity.copy()
         count = min(len(displacement), len(modes.frequency))
         aside = self._place(now) - self._plain_answers @ now.loads

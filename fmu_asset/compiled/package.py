@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 from fe.runtime.reduced_arrays import ReducedArrays
-from fe.runtime.structure_arrays import StructureArrays
 from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
 from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError
@@ -59,7 +58,7 @@ HOST = "It is compiled C and needs nothing but the C library; its sources are in
 
 
 def compiled_members(
-    model: ReducedArrays | StructureArrays,
+    model: ReducedArrays,
     table: Sequence[FmuVariable],
     roles: Roles,
     *,
@@ -76,8 +75,8 @@ def compiled_members(
 
     Parameters
     ----------
-    model : ReducedArrays or StructureArrays
-        The reduced wing or structure.
+    model : ReducedArrays
+        The reduced structure.
     table : sequence of FmuVariable
         The variables, in order of their value reference.
     roles : Roles

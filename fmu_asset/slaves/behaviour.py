@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from fe.runtime.damping import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator, TransientState
 
 from .variables import TRANSIENT
@@ -97,8 +98,8 @@ class WingBehaviour:
             self._integrator, self._transient = None, None
         else:
             integrator = self._make_integrator(parameters, inputs)
-            load_factor, *_, tip_force = inputs
-            transient = integrator.released(parameters.initial_tip_displacement, load_factor, tip_force)
+            load = (inputs[0], inputs[-1])
+            transient = integrator.released(parameters.initial_tip_displacement, load, TIP_FORCE)
             response = self._read(integrator, transient)
             self._integrator, self._transient, self._bound = integrator, transient, None
         self._parameters, self._inputs = parameters, tuple(inputs)
@@ -136,12 +137,9 @@ class WingBehaviour:
         if self._parameters is None:
             raise RuntimeError("the wing was not initialised")
         if self._integrator is not None and self._transient is not None:
-            return self._integrator.load_point_displacement(self._transient)
-        load_factor, *losses, tip_force = self._inputs
-        static = self._model.static_response(
-            self._parameters.young_modulus_factor, tuple(losses), load_factor, tip_force
-        )
-        return float(self._model.static_load[1] @ static.coordinates)
+            return self._integrator.point_displacement(self._transient, TIP_FORCE)
+        static = self._model.static_response(self._vector(self._parameters, self._inputs))
+        return float(self._model.static_load[TIP_FORCE] @ static.coordinates)
 
     def modal_data(self) -> tuple[list[float], list[float]]:
         """Return natural frequencies [Hz] and damping ratios [1] under the last inputs."""
@@ -151,11 +149,7 @@ class WingBehaviour:
         if self._integrator is not None:
             frequency, ratio = self._integrator.modes.frequency, self._integrator.damping_ratio
         else:
-            losses = self._inputs[1:-1]
-            modes = self._model.modes(
-                parameters.young_modulus_factor, losses, parameters.servo_mass, parameters.pitot_mass
-            )
-            frequency = modes.frequency
+            frequency = self._model.modes(self._vector(parameters, self._inputs)).frequency
             ratio = rayleigh_damping_ratio(parameters.damping_alpha, parameters.damping_beta, frequency)
         return frequency[: self._mode_count].tolist(), ratio[: self._mode_count].tolist()
 
@@ -172,31 +166,26 @@ class WingBehaviour:
         integrator, transient = None, None
         if moving:
             integrator = self._make_integrator(parameters, inputs)
-            transient = TransientState.from_list(values[2 + self.input_count :])
+            transient = TransientState.from_list(values[2 + self.input_count :], self._model.mode_count)
         self._parameters = parameters if started else None
         self._inputs = inputs if started else ()
         self._integrator, self._transient, self._bound = integrator, transient, None
 
     def _equilibrium(self, parameters: WingParameters, inputs: Sequence[float]) -> Response:
-        load_factor, *losses, tip_force = inputs
-        static = self._model.static_response(
-            parameters.young_modulus_factor, tuple(losses), load_factor, tip_force
-        )
+        static = self._model.static_response(self._vector(parameters, inputs))
         self._bound = static.strain_error_bound
-        return Response(static.strain, static.tip_displacement)
+        return Response(static.strain, float(static.displacement[0]))
 
     def _make_integrator(self, parameters: WingParameters, inputs: Sequence[float]) -> ModalIntegrator:
-        return ModalIntegrator(
-            self._model,
-            young_modulus_factor=parameters.young_modulus_factor,
-            stiffness_loss=tuple(inputs[1:-1]),
-            servo_mass=parameters.servo_mass,
-            pitot_mass=parameters.pitot_mass,
-            damping_alpha=parameters.damping_alpha,
-            damping_beta=parameters.damping_beta,
-        )
+        vector = self._vector(parameters, inputs)
+        return ModalIntegrator(self._model, vector, parameters.damping_alpha, parameters.damping_beta)
+
+    @staticmethod
+    def _vector(parameters: WingParameters, inputs: Sequence[float]) -> npt.NDArray[np.float64]:
+        masses = (parameters.servo_mass, parameters.pitot_mass)
+        return np.array((parameters.young_modulus_factor, *inputs[1:-1], *masses, inputs[0], inputs[-1]))
 
     @staticmethod
     def _read(integrator: ModalIntegrator, transient: TransientState) -> Response:
-        response = integrator.response(transient)
-        return Response(response.strain, response.tip_displacement)
+        outputs = integrator.outputs(transient)
+        return Response(outputs[:-1], float(outputs[-1]))

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fe.runtime.damping import rayleigh_damping_ratio
-from fe.runtime.structure_model import StructureModel
-from fe.runtime.structure_motion import StructureMotion, StructureMotionState
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.transient import ModalIntegrator, TransientState
 
 from ..slaves.variables import TRANSIENT
 
@@ -27,17 +27,17 @@ class StructureBehaviour:
 
     Parameters
     ----------
-    model : StructureModel
+    model : ReducedModel
         The reduced structure.
     """
 
-    def __init__(self, model: StructureModel) -> None:
+    def __init__(self, model: ReducedModel) -> None:
         self._model = model
         self._parameters: dict[str, float] = {}
         self._inputs: tuple[float, ...] = ()
         self._vector = model.nominal
-        self._motion: StructureMotion | None = None
-        self._state: StructureMotionState | None = None
+        self._motion: ModalIntegrator | None = None
+        self._state: TransientState | None = None
 
     def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> list[float]:
         """Begin in equilibrium under the inputs."""
@@ -86,7 +86,7 @@ class StructureBehaviour:
         motion = found = None
         if moving:
             motion = self._motion_at(kept, vector)
-            found = StructureMotionState.from_list(moving, self._model.mode_count)
+            found = TransientState.from_list(moving, self._model.mode_count)
         self._parameters, self._inputs, self._vector = kept, inputs, vector
         self._motion, self._state = motion, found
 
@@ -105,11 +105,11 @@ class StructureBehaviour:
     def _damping(parameters: Mapping[str, float]) -> tuple[float, float]:
         return parameters["damping.alpha"], parameters["damping.beta"]
 
-    def _motion_at(self, parameters: Mapping[str, float], vector: FloatArray) -> StructureMotion:
-        return StructureMotion(self._model, vector, *self._damping(parameters))
+    def _motion_at(self, parameters: Mapping[str, float], vector: FloatArray) -> ModalIntegrator:
+        return ModalIntegrator(self._model, vector, *self._damping(parameters))
 
     def _outputs(
-        self, vector: FloatArray, motion: StructureMotion | None, state: StructureMotionState | None
+        self, vector: FloatArray, motion: ModalIntegrator | None, state: TransientState | None
     ) -> list[float]:
         static = self._model.static_response(vector)
         if motion is not None and state is not None:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 from fe.structure.design import StructureDesign
 from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.errors import BindingError
@@ -24,7 +24,7 @@ class StructureNames(NamedTuple):
     accelerations: tuple[str, ...]
 
 
-def names_of_model(model: StructureModel) -> StructureNames:
+def names_of_model(model: ReducedModel) -> StructureNames:
     """Return the names of a reduced structure."""
     return StructureNames(
         model.name,

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from importlib.resources import files
 
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
 from fmu_asset.compiled.package import FmiVersion, compiled_members
 from fmu_asset.compiled.variable_header import Roles
@@ -34,7 +34,7 @@ _ACCELERATION = Unit("m/s2", (("m", 1), ("s", -2)))
 
 
 def build_structure_fmu(
-    model: StructureModel,
+    model: ReducedModel,
     path: str | os.PathLike[str],
     *,
     kind: FmuKind = "python",
@@ -46,7 +46,7 @@ def build_structure_fmu(
 
     Parameters
     ----------
-    model : StructureModel
+    model : ReducedModel
         The structure.
     path : path-like
         Where to write, with the suffix .fmu.
@@ -70,14 +70,14 @@ def build_structure_fmu(
     return write_fmu(target, content, content_hash, stem_of(model), model.design_hash)
 
 
-def stem_of(model: StructureModel) -> str:
+def stem_of(model: ReducedModel) -> str:
     """Return the name of a structure as an identifier of C."""
     plain = re.sub(r"[^A-Za-z0-9]+", "_", model.name).strip("_")[:40]
     return plain if plain[:1].isalpha() else f"structure_{plain}".rstrip("_")
 
 
 def structure_fmu_bytes(
-    model: StructureModel,
+    model: ReducedModel,
     start: Mapping[str, float] | None = None,
     kind: FmuKind = "python",
     fmi: FmiVersion = 2,
@@ -114,7 +114,7 @@ def structure_fmu_bytes(
 
 
 def _python_template(
-    model: StructureModel,
+    model: ReducedModel,
     table: tuple[FmuVariable, ...],
     start: Mapping[str, float],
     name: str,
@@ -144,7 +144,7 @@ def _python_template(
     return members
 
 
-def _roles_of(model: StructureModel) -> Roles:
+def _roles_of(model: ReducedModel) -> Roles:
     """Return which variables of a structure are what."""
     return Roles(
         chosen=(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 
 from ..companions.slave import CompanionSlave
 from ..slaves.base import INSTANTIATED, REFUSED, Contents
@@ -18,7 +18,7 @@ from .table import structure_table
 
 def load_contents(resources: Path) -> Contents:
     """Return table and behaviour of the structure that was packed."""
-    model = StructureModel.load(resources / "structure.npz")
+    model = ReducedModel.load(resources / "structure.npz")
     start = json.loads((resources / "start.json").read_text(encoding="utf-8"))
     return Contents(structure_table(model, start), lambda: StructureBehaviour(model))
 

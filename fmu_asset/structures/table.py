@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 
 from ..companions.table import Table
 from ..slaves.variables import QUASI_STATIC, TRANSIENT, FmuVariable
@@ -13,12 +13,12 @@ RESERVED = ("response", "status", "strain_error_bound", "displacement_error_boun
 """Names that controls and parameters of a structure cannot have: its FMU has variables of that name."""
 
 
-def structure_table(model: StructureModel, start: Mapping[str, float]) -> tuple[FmuVariable, ...]:
+def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[FmuVariable, ...]:
     """Return the table: controls and health as inputs, parameters, outputs by name, modal outputs, status.
 
     Parameters
     ----------
-    model : StructureModel
+    model : ReducedModel
         The reduced structure.
     start : mapping of str to float
         Start values by variable name that take the place of the nominal ones.

@@ -40,7 +40,7 @@ from twin_master.scenario.asset import BeliefSection, FileSection
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
-    from fe.runtime.structure_model import StructureModel
+    from fe.runtime.reduced import ReducedModel
     from fe.structure.design import StructureDesign
     from fmu_asset.door.binding import Binding
     from fmu_asset.door.session import FmiAsset
@@ -133,7 +133,7 @@ class StructureFmuSource(FmuSource):
     """The FMU that is packed of a structure."""
 
     _section: StructureSection
-    _model: "StructureModel | None" = None
+    _model: "ReducedModel | None" = None
 
     @property
     def origin(self) -> FlownAndBelieved:
@@ -244,7 +244,7 @@ class StructureSource:
     def __init__(self, scenario: Scenario, section: StructureBelief) -> None:
         self._scenario = scenario
         self._places = named_files(scenario, section)
-        self._model: StructureModel | None = None
+        self._model: ReducedModel | None = None
         self._mean: dict[str, float] = {}
 
     @property
@@ -307,7 +307,7 @@ class StructureSource:
         return {"design": self._model.design_hash}
 
     @property
-    def _prepared(self) -> "StructureModel":
+    def _prepared(self) -> "ReducedModel":
         if self._model is None:
             raise MissionInputError("the model was not prepared: call `prepare` first.")
         return self._model

@@ -217,6 +217,10 @@ def test_a_real_build_is_reproducible_in_any_number_of_threads(
     assert wing.basis.to_bytes() == coarse_wing.basis.to_bytes()
     assert len(list(own_cache.glob("*.npz"))) == 2
     np.testing.assert_array_equal(
-        reduced_model(coarse_design).static_response(1.0, (0.1, 0.2), 3.0).strain,
-        wing.model.static_response(1.0, (0.1, 0.2), 3.0).strain,
+        reduced_model(coarse_design)
+        .static_response(young_modulus_factor=1.0, stiffness_loss=(0.1, 0.2), load_factor=3.0)
+        .strain,
+        wing.model.static_response(
+            young_modulus_factor=1.0, stiffness_loss=(0.1, 0.2), load_factor=3.0
+        ).strain,
     )

@@ -18,12 +18,12 @@ from fe.reduction.structure_basis import StructureSettings
 from fe.reduction.structure_cache import reduced, reduced_structure
 from fe.reduction.structure_errors import measured_errors
 from fe.runtime.errors import ReductionError
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 from fe.structure.design import load_structure, structure_hash
 from fe.structure.operators import Structure, load_and_assemble
 
 
-def test_four_regions_around_a_hole(coarse_plate: Structure, plate_model: StructureModel) -> None:
+def test_four_regions_around_a_hole(coarse_plate: Structure, plate_model: ReducedModel) -> None:
     """The bound holds at random states, nearly as asked for, and tells the error within a few times."""
     errors = measured_errors(coarse_plate, plate_model, 20)
     assert max(errors.strain, errors.displacement) <= errors.bound < 8e-3

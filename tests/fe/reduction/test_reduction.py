@@ -128,16 +128,20 @@ def test_bound_holds_where_the_error_is_large(
     rough: ReducedModel, state: tuple[float, float, float], load: tuple[float, float]
 ) -> None:
     e, z1, z2 = state
-    reduced = rough.static_response(e, (z1, z2), *load)
+    reduced = rough.static_response(
+        rough.vector(stiffness_loss=(z1, z2), young_modulus_factor=e), load=np.array(load)
+    )
     full = full_outputs(e, z1, z2, load)
     assert np.abs(reduced.strain - full[:-1]).max() <= reduced.strain_error_bound
-    assert abs(reduced.tip_displacement - full[-1]) <= reduced.tip_displacement_error_bound
+    assert abs(reduced.displacement[0] - full[-1]) <= reduced.displacement_error_bound
 
 
 def test_bound_is_not_wildly_pessimistic(rough: ReducedModel) -> None:
     ratios = []
     for state in training_set(SETTINGS, 2)[::5]:
-        reduced = rough.static_response(state[0], state[1:], 1.0, 0.0)
+        reduced = rough.static_response(
+            young_modulus_factor=state[0], stiffness_loss=state[1:], load_factor=1.0, tip_force=0.0
+        )
         error = np.abs(reduced.strain - full_outputs(*state, (1.0, 0.0))[:-1]).max()
         ratios.append(reduced.strain_error_bound / error)
     assert min(ratios) >= 1.0
@@ -148,8 +152,11 @@ def test_bound_is_not_wildly_pessimistic(rough: ReducedModel) -> None:
 @given(state=parameters)
 def test_asked_accuracy_is_reached(reduction: Reduction, state: tuple[float, float, float]) -> None:
     e, z1, z2 = state
+    model = reduction.model
     for load in ((1.0, 0.0), (0.0, 1.0)):
-        reduced = reduction.model.static_response(e, (z1, z2), *load)
+        reduced = model.static_response(
+            model.vector(stiffness_loss=(z1, z2), young_modulus_factor=e), load=np.array(load)
+        )
         full = full_outputs(e, z1, z2, load)
         error = np.abs(reduced.strain - full[:-1]).max()
         largest = np.abs(full[:-1]).max()
@@ -163,7 +170,12 @@ def test_the_rounding_that_was_measured_is_allowed_for(reduction: Reduction) -> 
     model = reduce_model(chain(root=root), replace(SETTINGS, bound_tolerance=1e-2)).model
     # in doubles a displacement of all is known to 2^-53 of itself, and moves by (pull / stretch) / root
     assert 5e-6 < model.rounding_allowance < 2.0**-53 / root * 60 * 8
-    assert model.static_response(1.0, (0.0, 0.0), 1.0, 0.0).strain_error_bound > 5e-6
+    assert (
+        model.static_response(
+            young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), load_factor=1.0, tip_force=0.0
+        ).strain_error_bound
+        > 5e-6
+    )
 
 
 def test_pymor_reduces_and_bounds_alike(reduction: Reduction) -> None:
@@ -187,7 +199,7 @@ def test_pymor_reduces_and_bounds_alike(reduction: Reduction) -> None:
     for e, z1, z2 in training_set(SETTINGS, 2)[::17]:
         theta = np.array((e, 1 - z1, 1 - z2, 1.0))
         mu = reduced.parameters.parse({"theta": theta})
-        ours = model.static_response(e, (z1, z2), 1.0)
+        ours = model.static_response(young_modulus_factor=e, stiffness_loss=(z1, z2), load_factor=1.0)
         np.testing.assert_allclose(reduced.solve(mu).to_numpy().ravel(), ours.coordinates, rtol=1e-8)
         residual = model.residual_load[:, 0] - np.einsum(
             "rqj,q,j->r", model.residual_stiffness, theta, ours.coordinates
@@ -228,7 +240,11 @@ def test_frequencies_of_the_chain_are_kept(reduction: Reduction) -> None:
         mass = affine_sum((1.0, servo, pitot), SYSTEM.mass_terms).toarray()
         square = np.sort(np.linalg.eigvals(np.linalg.solve(mass, stiffness)).real)[: model.mode_count]
         np.testing.assert_allclose(
-            model.modes(e, (z1, z2), servo, pitot).frequency, np.sqrt(square) / (2 * np.pi), rtol=1e-4
+            model.modes(
+                young_modulus_factor=e, stiffness_loss=(z1, z2), servo_mass=servo, pitot_mass=pitot
+            ).frequency,
+            np.sqrt(square) / (2 * np.pi),
+            rtol=1e-4,
         )
 
 
@@ -332,15 +348,20 @@ def test_any_number_of_regions_is_reduced_with_a_certified_bound(regions: int) -
             wanted = system.gauge_output @ np.linalg.solve(
                 matrix, lift * system.load_lift + force * system.load_tip
             )
-            seen = model.static_response(e, tuple(loss), lift, force)
+            seen = model.static_response(
+                young_modulus_factor=e, stiffness_loss=tuple(loss), load_factor=lift, tip_force=force
+            )
             error = float(np.abs(seen.strain - wanted).max())
             assert error <= seen.strain_error_bound
             assert seen.strain_error_bound <= 0.05 * np.abs(wanted).max()
         strains.append(seen.strain)
         mass = affine_sum((1.0, 0.2, 0.1), system.mass_terms).toarray()
         frequency = np.sqrt(eigh(matrix, mass, eigvals_only=True)[:4]) / (2.0 * np.pi)
-        assert model.modes(e, tuple(loss), 0.2, 0.1).frequency == pytest.approx(frequency, rel=2e-3)
+        assert model.modes(
+            young_modulus_factor=e, stiffness_loss=tuple(loss), servo_mass=0.2, pitot_mass=0.1
+        ).frequency == pytest.approx(frequency, rel=2e-3)
     together = np.array(states)
-    assert model.static_strains(together[:, 0], together[:, 1:], 3.0, -20.0) == pytest.approx(
-        np.array(strains), rel=1e-12
-    )
+    names = ("young_modulus_factor", *model.regions)
+    columns = dict(zip(names, together.T, strict=True)) | {"load_factor": 3.0, "tip_force": -20.0}
+    outputs = model.static_outputs(model.vectors(columns))
+    assert outputs[:, :-1] == pytest.approx(np.array(strains), rel=1e-12)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fe.reduction.structure_basis import StructureReduction
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 from fmu_asset.check import check_fmu
 from fmu_asset.packing.wing_fmu import recorded_content_hash
 from fmu_asset.structures.build import build_structure_fmu
@@ -23,13 +23,13 @@ DRIVER = Path(__file__).with_name("driver.c")
 
 
 @pytest.fixture(scope="module")
-def beam_model(beam_reduction: StructureReduction) -> StructureModel:
+def beam_model(beam_reduction: StructureReduction) -> ReducedModel:
     return beam_reduction.model
 
 
 @pytest.fixture(scope="module")
 def pair(
-    compiler: list[str], beam_model: StructureModel, tmp_path_factory: pytest.TempPathFactory
+    compiler: list[str], beam_model: ReducedModel, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path]:
     """The beam as a compiled FMU, and as one that runs in Python."""
     folder = tmp_path_factory.mktemp("pair")
@@ -37,7 +37,7 @@ def pair(
     return compiled, build_structure_fmu(beam_model, folder / "python.fmu").path
 
 
-def _fly(slave: Any, model: StructureModel, seed: int, response: int) -> list[list[float]]:
+def _fly(slave: Any, model: ReducedModel, seed: int, response: int) -> list[list[float]]:
     """Parameters, inputs and steps at random: health mostly stays, a load is often none at all."""
     rng = np.random.default_rng(seed)
     inputs = [v for v in slave.description.variables if v.causality == "input"]
@@ -67,7 +67,7 @@ def _fly(slave: Any, model: StructureModel, seed: int, response: int) -> list[li
 
 
 def test_outputs_equal_those_of_the_python_fmu(
-    pair: tuple[Path, Path], beam_model: StructureModel, open_slave: Callable[..., Any]
+    pair: tuple[Path, Path], beam_model: ReducedModel, open_slave: Callable[..., Any]
 ) -> None:
     """Strains, displacements, accelerations, both bounds, frequencies, damping ratios: to 1e-12."""
     slaves = [open_slave(path) for path in pair]
@@ -92,7 +92,7 @@ def test_outputs_equal_those_of_the_python_fmu(
 
 
 def test_a_compiled_fmu_bounds_as_python_does(
-    compiler: list[str], plate_model: StructureModel, tmp_path: Path, open_slave: Any
+    compiler: list[str], plate_model: ReducedModel, tmp_path: Path, open_slave: Any
 ) -> None:
     compiled = build_structure_fmu(plate_model, tmp_path / "compiled.fmu", kind="compiled").path
     slave, rng = open_slave(compiled), np.random.default_rng(3)

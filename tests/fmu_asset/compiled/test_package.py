@@ -95,7 +95,9 @@ def test_start_values_come_from_the_state(
         assert slave.everything()[1:3] == [0.1, 1.0 / 3.0]
         assert slave.fmu.getReal([slave.reference["young_modulus_factor"]]) == [1.0 + 1e-15]
         assert slave.start() == 0
-        expected = model.static_response(1.0 + 1e-15, (0.1, 1.0 / 3.0), 1.0)
+        expected = model.static_response(
+            young_modulus_factor=1.0 + 1e-15, stiffness_loss=(0.1, 1.0 / 3.0), load_factor=1.0
+        )
         np.testing.assert_allclose(slave.everything()[10:34], expected.strain, rtol=1e-12)
     finally:
         slave.close()
