@@ -25,7 +25,7 @@ from discrepancy.model_choice import load_model
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
-from fe.reduction.structure_cache import reduced_structure
+from fe.reduction.model_cache import reduced_structure
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.structure.design import load_structure

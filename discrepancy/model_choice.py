@@ -26,8 +26,8 @@ from discrepancy.sources.from_run import (
     run_model,
 )
 from fe.reduction.built_once import cache_folder
+from fe.reduction.model_cache import reduced_structure
 from fe.reduction.stages import Progress
-from fe.reduction.structure_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import load_structure
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design

@@ -45,7 +45,7 @@ def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool
 
 def reduced(file: Path, memory_limit: float | None) -> "ReducedModel":
     """Return the reduced model, from the cache where it is there."""
-    from fe.reduction.structure_cache import reduced_structure
+    from fe.reduction.model_cache import reduced_structure
 
     return reduced_structure(located(file), progress=terminal.progress(), memory_limit=_bytes(memory_limit))
 

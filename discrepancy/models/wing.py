@@ -25,7 +25,7 @@ from discrepancy.models.interface import (
 from discrepancy.models.memory import Memory
 from discrepancy.models.ported import PortedSystem
 from discrepancy.models.wing_structure import MovingWing, Outputs, Stiffness, WingStructure
-from fe.reduction.patch_cache import patch_arrays
+from fe.reduction.model_cache import patch_arrays
 from fe.reduction.stages import Progress
 from fe.runtime.errors import FiniteElementError, InvalidPatchError, SolutionError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from fe.runtime.reduced import ReducedModel, StaticResponse
+from fe.runtime.reduced import ReducedModel
 
 from .certified_basis import Judgement, State
 
@@ -81,23 +81,3 @@ def fewest_directions(
         else:
             low = middle + 1
     return np.asarray(directions[:, :low])
-
-
-def relative_bound(model: ReducedModel, parameters: State) -> float:
-    """Return the larger relative bound of a wing's strains under either load; of its largest strain."""
-    worst = 0.0
-    for response in _responses(model, parameters):
-        worst = max(worst, response.strain_error_bound / float(np.abs(response.strain).max()))
-    return worst
-
-
-def _responses(model: ReducedModel, parameters: State) -> list[StaticResponse]:
-    e, *losses = parameters
-    vector = model.vector(stiffness_loss=losses, young_modulus_factor=e)
-    return [model.static_response(vector, load=load) for load in np.eye(2)]
-
-
-WING_JUDGEMENT = Judgement(
-    lambda model, state: [response.coordinates for response in _responses(model, state)], relative_bound
-)
-"""Of a wing: its strains under lift alone and under tip force alone."""

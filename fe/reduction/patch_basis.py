@@ -199,7 +199,7 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
     return PatchArrays(
         design_hash=operators.design_hash,
         region_names=" ".join(operators.regions),
-        validity_box=settings.ranges.validity_box(len(operators.regions)),
+        validity_box=np.array(list(settings.ranges.named_ranges(operators.regions).values())),
         largest_loss=settings.largest_loss,
         largest_compliance=settings.compliance_share * compliance / place**2,
         largest_mass=settings.largest_mass,

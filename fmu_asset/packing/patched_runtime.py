@@ -77,7 +77,7 @@ def patched_members(
         if arrays is None:
             raise PatchFileError(
                 "The patch changes structure or loads, for which the FMU needs the wing in the basis for "
-                "patches: give `arrays`, as `fe.reduction.patch_cache.patch_arrays` returns them."
+                "patches: give `arrays`, as `fe.reduction.model_cache.patch_arrays` returns them."
             )
         _check_arrays(model, arrays, patch)
         if not len(patch.of(LocalStiffnessLoss)):

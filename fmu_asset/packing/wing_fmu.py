@@ -92,7 +92,7 @@ def build_fmu(
     activate : bool
         Whether these are switched on from the start.
     arrays : PatchArrays, optional
-        The wing in the basis for patches (`fe.reduction.patch_cache.patch_arrays`); needed where an effect
+        The wing in the basis for patches (`fe.reduction.model_cache.patch_arrays`); needed where an effect
         changes structure or loads, or turns a gauge.
     fmi : {2, 3}
         Version of FMI; 3 for the kinds in C.

@@ -4,8 +4,7 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from fe.reduction.model_cache import reduced_model
-from fe.reduction.patch_cache import patch_arrays
+from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign

@@ -11,8 +11,7 @@ import pytest
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
-from fe.reduction.model_cache import reduced_model
-from fe.reduction.patch_cache import patch_arrays
+from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.patch import FreePlay, LocalStiffnessLoss, MicroSlip, ModelPatch
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.state import DigitalState

@@ -155,7 +155,7 @@ class StructureFmuSource(FmuSource):
             A file cannot be read or is wrong, the mesh does not hold what the structure names, or the
             scenario speaks of what the structure does not have.
         """
-        from fe.reduction.structure_cache import check_structure
+        from fe.reduction.model_cache import check_structure
         from fmu_asset.compiled.compiler import find_compiler
         from fmu_asset.door.binding import load_binding
         from fmu_asset.structures.binding import names_of_design, structure_binding
@@ -186,7 +186,7 @@ class StructureFmuSource(FmuSource):
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
-        from fe.reduction.structure_cache import reduced_structure
+        from fe.reduction.model_cache import reduced_structure
         from fmu_asset.structures.binding import names_of_model, structure_binding_text
         from fmu_asset.structures.build import build_structure_fmu
 
@@ -268,7 +268,7 @@ class StructureSource:
         MissingObservationModelError
             The scenario's states, controls or sensors are not those of the structure.
         """
-        from fe.reduction.structure_cache import check_structure
+        from fe.reduction.model_cache import check_structure
 
         self.files()
         design, scenario = self._design(), self._scenario
@@ -299,7 +299,7 @@ class StructureSource:
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Copy what is given into the run folder and reduce the structure; return the hash of its design."""
-        from fe.reduction.structure_cache import reduced_structure
+        from fe.reduction.model_cache import reduced_structure
 
         keep_files(folder, self.files())
         self._places = {copy: folder / copy for copy in self._places}

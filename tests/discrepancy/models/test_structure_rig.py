@@ -14,7 +14,7 @@ from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_excitation import Excitation
 from discrepancy.models.interface import Conditions
-from fe.reduction.structure_basis import reduce_structure
+from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch import ModelPatch, PowerStiffness
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.transient import ModalIntegrator

@@ -14,8 +14,8 @@ from benchmarks.study_regions import bracket, plate, tube
 from fe.full.affine import AffineSum
 from fe.full.subspace import Norm
 from fe.reduction.dual_solutions import DualProblem
-from fe.reduction.structure_basis import StructureSettings
-from fe.reduction.structure_cache import reduced, reduced_structure
+from fe.reduction.model_cache import reduced, reduced_structure
+from fe.reduction.settings import StructureSettings
 from fe.reduction.structure_errors import measured_errors
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel

@@ -11,8 +11,8 @@ from scipy.linalg import expm
 
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
-from fe.reduction.structure_basis import StructureReduction, reduce_structure
-from fe.reduction.structure_cache import reduced_structure
+from fe.reduction.model_cache import reduced_structure
+from fe.reduction.reduced_basis import Reduction, reduce_structure
 from fe.reduction.structure_errors import measured_errors
 from fe.runtime.errors import MeshError, OutsideModelError, ReducedModelFileError, ReductionError
 from fe.runtime.reduced import ReducedModel
@@ -22,14 +22,14 @@ from fe.structure.operators import Structure, load_and_assemble
 HURT = {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 3.0, "push": -120.0}
 
 
-def test_random_states_against_the_full_model(beam: Structure, beam_reduction: StructureReduction) -> None:
+def test_random_states_against_the_full_model(beam: Structure, beam_reduction: Reduction) -> None:
     """Strains and displacements err by less than their bound, which keeps its tolerance; modes by 2e-5."""
     errors = measured_errors(beam, beam_reduction.model, 6, seed=7)
     assert max(errors.strain, errors.displacement) < errors.bound < 1e-3
     assert errors.frequency < 2e-5
 
 
-def test_a_state_in_all_its_parts(beam: Structure, beam_reduction: StructureReduction) -> None:
+def test_a_state_in_all_its_parts(beam: Structure, beam_reduction: Reduction) -> None:
     """Parameter times loss, controls, and the weight of a free mass are those of the full sums."""
     model = beam_reduction.model
     stiffness = beam.stiffness({"e": 1.05}, {"z1": 0.6, "z2": 0.3})
@@ -47,7 +47,7 @@ def test_a_state_in_all_its_parts(beam: Structure, beam_reduction: StructureRedu
     np.testing.assert_allclose(np.abs(modes.output[:4]), wanted, atol=2e-3 * wanted.max())
 
 
-def test_many_states_at_once_are_the_same(beam_reduction: StructureReduction) -> None:
+def test_many_states_at_once_are_the_same(beam_reduction: Reduction) -> None:
     model = beam_reduction.model
     low, high = model.validity_box.T
     vectors = low + (high - low) * np.random.default_rng(3).random((5, len(low)))
@@ -56,7 +56,7 @@ def test_many_states_at_once_are_the_same(beam_reduction: StructureReduction) ->
         np.testing.assert_allclose(outputs, [*single.strain, *single.displacement], rtol=1e-11, atol=1e-16)
 
 
-def test_a_released_beam_moves_as_the_full_model(beam: Structure, beam_reduction: StructureReduction) -> None:
+def test_a_released_beam_moves_as_the_full_model(beam: Structure, beam_reduction: Reduction) -> None:
     """Ring-down after a push: once the high modes have died away, strain, position and acceleration agree."""
     model = beam_reduction.model
     vector = model.vector({**HURT, "load_factor": 0.0, "push": 100.0})
@@ -92,7 +92,7 @@ def test_a_released_beam_moves_as_the_full_model(beam: Structure, beam_reduction
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
 
 
-def test_the_file_gives_the_model_back(beam_reduction: StructureReduction) -> None:
+def test_the_file_gives_the_model_back(beam_reduction: Reduction) -> None:
     content = beam_reduction.model.to_bytes()
     again = ReducedModel.from_bytes(content)
     assert again.to_bytes() == content
@@ -121,7 +121,7 @@ def test_a_load_that_no_output_sees(write_beam: Callable[..., Path], tmp_path: P
     ],
 )
 def test_values_outside_are_refused(
-    beam_reduction: StructureReduction, values: dict[str, float], sentence: str
+    beam_reduction: Reduction, values: dict[str, float], sentence: str
 ) -> None:
     with pytest.raises(OutsideModelError, match=sentence):
         beam_reduction.model.static_response(values)

@@ -336,7 +336,7 @@ def test_incomplete_or_foreign_files_are_refused(model: ReducedModel) -> None:
 def test_arrays_of_a_wrong_kind_are_refused(model: ReducedModel, value: np.ndarray) -> None:
     arrays = arrays_from_bytes(model.to_bytes(), "the model")
     numbers = {"format", "mode_count", "residual_allowance", "rounding_allowance"}
-    for name in set(arrays) - {"design_hash", "name"}:
+    for name in set(arrays) - {item.name for item in fields(model) if item.type is str}:
         if name in numbers and value.shape == () and value.dtype.kind == "f":
             continue
         with pytest.raises(ReducedModelFileError):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fe.reduction.structure_basis import StructureReduction
+from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.check import check_fmu
 from fmu_asset.packing.wing_fmu import recorded_content_hash
@@ -23,7 +23,7 @@ DRIVER = Path(__file__).with_name("driver.c")
 
 
 @pytest.fixture(scope="module")
-def beam_model(beam_reduction: StructureReduction) -> ReducedModel:
+def beam_model(beam_reduction: Reduction) -> ReducedModel:
     return beam_reduction.model
 
 

@@ -16,7 +16,7 @@ from fmpy.fmi3 import FMU3Slave, fmi3IntermediateUpdateCallback, fmi3LogMessageC
 from fmpy.validation import validate_fmu
 from scipy.linalg import eigh
 
-from fe.reduction.structure_basis import StructureReduction
+from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.check import check_fmu
@@ -168,7 +168,7 @@ def test_the_sources_are_clean_and_export_all_of_fmi_3(
     assert "structure_fmi2.c" not in {path.name for path in (tmp_path / "sources").iterdir()}
 
 
-def test_a_structure_has_arrays_too(beam_reduction: StructureReduction, tmp_path: Path) -> None:
+def test_a_structure_has_arrays_too(beam_reduction: Reduction, tmp_path: Path) -> None:
     path = build_structure_fmu(beam_reduction.model, tmp_path / "beam.fmu", kind="source", fmi=3).path
     assert validate_fmu(str(path)) == []
     with zipfile.ZipFile(path) as archive:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe.reduction.structure_basis import StructureReduction
+from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.transient import ModalIntegrator
 from fmu_asset.archive.fmu_file import read_fmu
@@ -19,7 +19,7 @@ from fmu_asset.structures.build import build_structure_fmu, structure_fmu_bytes
 
 
 @pytest.fixture(scope="module")
-def model(beam_reduction: StructureReduction) -> ReducedModel:
+def model(beam_reduction: Reduction) -> ReducedModel:
     """The reduced beam."""
     return beam_reduction.model
 
