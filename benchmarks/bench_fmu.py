@@ -15,7 +15,7 @@ from fe.reduction.model_cache import reduced_model
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 BINDING = Path(__file__).parents[1] / "scenarios" / "bindings" / "uav_wing.toml"
 # Many short batches: on a busy machine an interruption spoils one of them and not the median.

@@ -29,8 +29,7 @@ from fe.reduction.structure_errors import MeasuredErrors, measured_errors
 from fe.runtime.reduced import ReducedModel
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import WingDesign, load_design
-from fmu_asset.packing.wing_fmu import build_fmu
-from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from scenarios import structure_files
 from scenarios.structures.make_meshes import hexahedra
 
@@ -206,7 +205,7 @@ def measured(name: str, regions: int, states: int, folder: Path) -> dict[str, fl
     else:
         full = load_and_assemble({"plate": plate, "tube": tube, "bracket": bracket}[name](folder, regions))
         reduction = reduce_structure(full, name)
-        build_structure_fmu(reduction.model, folder / f"{name}.fmu")
+        build_fmu(reduction.model, folder / f"{name}.fmu")
     found = {
         "regions": regions,
         "unknowns": full.unknowns,

@@ -34,7 +34,7 @@ from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from fmu_asset.archive.design_record import packed_design_hash
 from fmu_asset.errors import FmuError
 from fmu_asset.folders import plain_folder, remove_folder
-from fmu_asset.structures.build import structure_fmu_bytes
+from fmu_asset.packing.structure_fmu import fmu_bytes
 from fmu_asset.structures.rig import rig_text
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes
@@ -254,7 +254,7 @@ def _structure(path: Path, progress: Progress | None) -> ModelChoice:
     """Return a structure by its FMU, which is kept beside the reduced models."""
     try:
         reduced = reduced_structure(path, progress=progress)
-        content, content_hash = structure_fmu_bytes(reduced)
+        content, content_hash = fmu_bytes(reduced)
         name = f"structure_{content_hash[:32]}.fmu"
         text = rig_text(load_structure(path), name)
         folder = _folder_with(name, content)

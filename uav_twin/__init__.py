@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from fe.structure.solution import natural_frequencies, static_responses
     from fe.wing.design import load_design
     from fmu_asset.door.session import FmiAsset
-    from fmu_asset.packing.wing_fmu import build_fmu
+    from fmu_asset.packing.structure_fmu import build_fmu
     from scenarios import structure_files
     from twin_master.environment import ScenarioEnvironment
     from twin_master.fleet.flight import fly_fleet
@@ -102,7 +102,7 @@ _HOMES = {
     "apply_verdict": "discrepancy.application",
     "assemble": "fe.full.operators",
     "assemble_structure": "fe.structure.operators:load_and_assemble",
-    "build_fmu": "fmu_asset.packing.wing_fmu",
+    "build_fmu": "fmu_asset.packing.structure_fmu",
     "calibrate": "calibration.wing.three_steps:calibrate_wing",
     "eigenmodes": "fe.full.modes",
     "filter_sequence": "twin_master.network.inference",

@@ -38,9 +38,8 @@ def fmu(
     from fe.structure.design import load_structure
     from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.packing.contents import checked_target
-    from fmu_asset.packing.wing_fmu import check_version
+    from fmu_asset.packing.structure_fmu import build_fmu, check_version
     from fmu_asset.structures.binding import names_of_model, structure_binding_text
-    from fmu_asset.structures.build import build_structure_fmu
     from fmu_asset.structures.rig import rig_text
     from reporting.files import atomic_write_text
 
@@ -56,7 +55,7 @@ def fmu(
     if kind == "compiled":
         find_compiler()  # before the structure is reduced, which can take minutes
     model = reduced(file, memory_limit)
-    info = build_structure_fmu(model, target, kind=kind, fmi=version, replace=replace)
+    info = build_fmu(model, target, kind=kind, fmi=version, replace=replace)
     terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
     if binding is not None:
         atomic_write_text(binding, structure_binding_text(names_of_model(model)))

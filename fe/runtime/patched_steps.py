@@ -20,7 +20,6 @@ from .patch import LOADS, LoadGain, ModelPatch, PointMass
 from .patched_structure import Modes, PatchedStructure
 from .patched_wing import LOAD_PLACE, ON_MODES, PatchedWing
 from .reduced import ReducedModel
-from .state import Losses
 from .transient import ModalIntegrator, TransientState
 
 FloatArray = npt.NDArray[np.float64]
@@ -55,8 +54,10 @@ class PatchedSteps:
         The wing without a patch.
     wing : PatchedWing
         The same wing in the basis for patches.
-    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass, damping_alpha, damping_beta
-        As of `fe.runtime.transient.ModalIntegrator`.
+    vector : (V,) ndarray
+        Values of all that can be chosen of the model; those of the controls do not matter.
+    damping : tuple of float
+        Rayleigh's alpha [1/s] and beta [s].
     patch : ModelPatch
         Primitives of sensors are passed over.
     temperature : float
@@ -74,19 +75,16 @@ class PatchedSteps:
         self,
         model: ReducedModel,
         wing: PatchedWing,
+        vector: FloatArray,
         *,
-        young_modulus_factor: float,
-        stiffness_loss: Losses,
-        servo_mass: float,
-        pitot_mass: float,
-        damping_alpha: float,
-        damping_beta: float,
+        damping: tuple[float, float],
         patch: ModelPatch,
         temperature: float = 0.0,
     ) -> None:
-        self._model, self._wing = model, wing
-        self._state = (young_modulus_factor, stiffness_loss, servo_mass, pitot_mass)
-        self._rayleigh = damping_alpha, damping_beta
+        self._model, self._wing, self._vector = model, wing, vector
+        e, *losses, servo_mass, pitot_mass = vector[:-2].tolist()
+        self._state = (e, tuple(losses), servo_mass, pitot_mass)
+        self._rayleigh = damping
         self._loads = patch.of(*LOADS)
         self._laws: Laws = laws_of(wing.internal_forces(patch), wing.port_rows)
         self._patched = wing.structure(*self._state, patch, temperature)
@@ -131,13 +129,9 @@ class PatchedSteps:
 
     def _plain_outputs(self, load_factor: float, tip_force: float) -> FloatArray:
         """Strains, tip displacement and load point displacement (G + 2,) of the reduced model."""
-        e, stiffness_loss, *_ = self._state
-        static = self._model.static_response(
-            stiffness_loss=stiffness_loss,
-            young_modulus_factor=e,
-            load_factor=load_factor,
-            tip_force=tip_force,
-        )
+        vector = self._vector.copy()
+        vector[-2:] = load_factor, tip_force
+        static = self._model.static_response(vector)
         point = self._model.static_load[1] @ static.coordinates
         return np.concatenate((static.strain, static.displacement, (point,)))
 

@@ -21,6 +21,9 @@ def region_names(count: int) -> tuple[str, ...]:
     return tuple(f"z{number}" for number in range(1, count + 1))
 
 
+WING = "uav_wing"
+"""Name of the reduced model of a wing."""
+
 LIFT, TIP_FORCE = 0, 1
 """Numbers of the loads of a wing."""
 

@@ -21,7 +21,6 @@ from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable, Unit
 
 from . import damage_growth, strain_gauges
 
-_OWN_FILES = ("slave.py", "table.py")
 _STATUS = tuple(enumeration for enumeration in ENUMERATIONS if enumeration.name == "Status")
 _UNITS = (
     Unit("1", (), (("microstrain", 1e6), ("%", 100.0))),
@@ -29,13 +28,17 @@ _UNITS = (
     Unit("1/s", (("s", -1),), (("microstrain/s", 1e6),)),
 )
 
-_IMPORTS = """from functools import partial
+_IMPORTS = """import json
 
 from .companions import {name} as companion
-from .companions.slave import CompanionSlave as _Slave
-from .companions.slave import contents_of
+from .slaves.base import Contents
 
-load_contents = partial(contents_of, companion)
+
+def load_contents(resources):
+    \"\"\"Return what the setting that was packed describes.\"\"\"
+    setting = json.loads((resources / "setting.json").read_text(encoding="utf-8"))
+    return Contents(companion.variable_table(setting), lambda: companion.behaviour(setting))
+
 """
 
 
@@ -139,6 +142,5 @@ def _members(
         host="It runs in any Python host; the standard library is enough.",
     )
     members[f"{folder}/__init__.py"] = b'"""What the FMU does."""\n'
-    for name in (*_OWN_FILES, f"{companion.name}.py"):
-        members[f"{folder}/{name}"] = (own / name).read_bytes()
+    members[f"{folder}/{companion.name}.py"] = (own / f"{companion.name}.py").read_bytes()
     return members

@@ -12,6 +12,7 @@ from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
 from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface
+from fmu_asset.slaves.table import Roles
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .arrays import arrays_of
@@ -19,7 +20,7 @@ from .compiler import PLATFORM, Platform, compile_library
 from .data_file import data_file_bytes
 from .description3 import build_description, model_description3
 from .exchange import exchange_table
-from .variable_header import Roles, variable_sources
+from .variable_header import variable_sources
 
 DATA_FILE = "resources/reduced_model.bin"
 

@@ -15,7 +15,7 @@ from reporting.progress import Progress, SilentProgress
 
 from .contents import FmuInfo
 from .patch_file import PatchFile
-from .wing_fmu import FmuKind, build_fmu
+from .structure_fmu import FmuKind, build_fmu
 
 
 class Tailoring(Protocol):
@@ -59,7 +59,7 @@ def pack_wing(
     tailoring : Tailoring, optional
         The calibration: the FMU starts at its means and carries its record.
     kind, patch, activate, fmi, interface, platforms, replace
-        See `fmu_asset.packing.wing_fmu.build_fmu`.
+        See `fmu_asset.packing.structure_fmu.build_fmu`.
     progress : Progress, optional
         Shows what takes long.
 
@@ -68,7 +68,7 @@ def pack_wing(
     FiniteElementError
         The design cannot be modelled.
     FmuBuildError, PatchFileError
-        See `fmu_asset.packing.wing_fmu.build_fmu`.
+        See `fmu_asset.packing.structure_fmu.build_fmu`.
     """
     progress = progress or SilentProgress()
     return build_fmu(

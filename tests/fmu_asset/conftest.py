@@ -15,7 +15,7 @@ import pytest
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.door.binding import Binding, load_binding, parse_binding
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 ROOT = Path(__file__).parents[2]
 NODES = 16

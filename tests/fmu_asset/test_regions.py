@@ -10,7 +10,7 @@ from fe.runtime.state import TIP_FORCE, DigitalState
 from fe.runtime.transient import ModalIntegrator
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.packing.wing_fmu import FmuKind, build_fmu
+from fmu_asset.packing.structure_fmu import FmuKind, build_fmu
 from tests.wings import wing_integrator
 
 from .conftest import chain_model

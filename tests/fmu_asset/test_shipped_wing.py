@@ -20,7 +20,7 @@ from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from fmu_asset.packing.patched_runtime import output_channels
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 

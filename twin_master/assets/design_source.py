@@ -201,7 +201,7 @@ class WingFmuSource(FmuSource):
         """
         from fmu_asset.compiled.compiler import find_compiler
         from fmu_asset.door.binding import load_binding
-        from fmu_asset.packing.wing_fmu import check_kind
+        from fmu_asset.packing.structure_fmu import check_kind
 
         read_calibration(self._scenario.calibration)
         self.files()

@@ -187,15 +187,15 @@ class StructureFmuSource(FmuSource):
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
         from fe.reduction.model_cache import reduced_structure
+        from fmu_asset.packing.structure_fmu import build_fmu
         from fmu_asset.structures.binding import names_of_model, structure_binding_text
-        from fmu_asset.structures.build import build_structure_fmu
 
         model = reduced_structure(self._path(FLOWN_COPY), progress=progress)
         if not self._path(BINDING_COPY).exists():
             text = structure_binding_text(names_of_model(model), frequencies_observed(self._scenario))
             atomic_write_text(self._path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):
-            build_structure_fmu(model, self.fmu_path(), kind=self._section.packed, replace=True)
+            build_fmu(model, self.fmu_path(), kind=self._section.packed, replace=True)
         self._model = model
         return {FLOWN_DESIGN_HASH: model.design_hash, "fmu": hash_file(self.fmu_path())}
 

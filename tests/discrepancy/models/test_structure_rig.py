@@ -21,7 +21,7 @@ from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.structures.rig import rig_text
 
 OUTPUTS = (("tip", Quantity.DISPLACEMENT), ("g1", Quantity.STRAIN), ("shake", Quantity.ACCELERATION))
@@ -41,7 +41,7 @@ def pair(
     folder = tmp_path_factory.mktemp("rig")
     file = write_beam(folder, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
     reduced = reduce_structure(load_and_assemble(file), "beam").model
-    fmu = build_structure_fmu(reduced, folder / "beam.fmu").path
+    fmu = build_fmu(reduced, folder / "beam.fmu").path
     path = folder / "rig.toml"
     path.write_text(rig_text(load_structure(file), os.path.relpath(fmu, folder)), encoding="utf-8")
     model = FmuModel.load(path)

@@ -20,19 +20,14 @@ from fe.full.affine import affine_sum
 from fe.full.operators import AffineOperators
 from fe.full.subspace import Norm, OrthonormalBasis, conjugate_gradients
 from fe.reduction.compression import compressed
-from fe.reduction.reduced_basis import (
-    Reduction,
-    ReductionTerms,
-    judgement_of,
-    reduce_model,
-    wing_structure,
-)
+from fe.reduction.reduced_basis import Reduction, ReductionTerms, judgement_of
 from fe.reduction.settings import (
     ModalSettings,
     ReductionSettings,
     loss_splits,
     remaining_levels,
 )
+from fe.reduction.wing_basis import reduce_model, wing_structure
 from fe.runtime.errors import ReductionError, SolutionError
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import region_names

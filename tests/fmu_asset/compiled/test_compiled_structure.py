@@ -15,8 +15,7 @@ import pytest
 from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.check import check_fmu
-from fmu_asset.packing.wing_fmu import recorded_content_hash
-from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
 
 OK, DISCARD, ERROR = 0, 2, 3
 DRIVER = Path(__file__).with_name("driver.c")
@@ -33,8 +32,8 @@ def pair(
 ) -> tuple[Path, Path]:
     """The beam as a compiled FMU, and as one that runs in Python."""
     folder = tmp_path_factory.mktemp("pair")
-    compiled = build_structure_fmu(beam_model, folder / "compiled.fmu", kind="compiled").path
-    return compiled, build_structure_fmu(beam_model, folder / "python.fmu").path
+    compiled = build_fmu(beam_model, folder / "compiled.fmu", kind="compiled").path
+    return compiled, build_fmu(beam_model, folder / "python.fmu").path
 
 
 def _fly(slave: Any, model: ReducedModel, seed: int, response: int) -> list[list[float]]:
@@ -94,7 +93,7 @@ def test_outputs_equal_those_of_the_python_fmu(
 def test_a_compiled_fmu_bounds_as_python_does(
     compiler: list[str], plate_model: ReducedModel, tmp_path: Path, open_slave: Any
 ) -> None:
-    compiled = build_structure_fmu(plate_model, tmp_path / "compiled.fmu", kind="compiled").path
+    compiled = build_fmu(plate_model, tmp_path / "compiled.fmu", kind="compiled").path
     slave, rng = open_slave(compiled), np.random.default_rng(3)
     assert slave.start(response=1) == 0, slave.log
     place, names = slave.reference, [v.name for v in slave.description.variables if v.kind == "Real"]

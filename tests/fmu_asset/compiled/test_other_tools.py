@@ -18,7 +18,7 @@ import pytest
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.compiled.compiler import CROSS_COMPILER
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 COURSE = [(1.0 + 0.25 * k, 0.1 * (k // 3), 0.2, -5.0 if k % 2 else 0.0) for k in range(9)]
 

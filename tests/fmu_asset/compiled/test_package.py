@@ -24,7 +24,7 @@ from fmu_asset.compiled.compiler import compile_library, find_compiler
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError, FmuCallError, FmuUnsupportedError
-from fmu_asset.packing.wing_fmu import build_fmu, recorded_content_hash
+from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
 from tests.command_line import command
 
 BIN = Path(sys.executable).parent

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from fe.runtime.damping import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
-from fmu_asset.slaves.base import Contents
-from fmu_asset.slaves.behaviour import WingBehaviour
+from fmu_asset.slaves.base import Contents, Slave
+from fmu_asset.slaves.behaviour import StructureBehaviour, later_outputs
+from fmu_asset.slaves.table import structure_table
 from fmu_asset.slaves.variables import (
     STATUS_BAD_CALL,
     STATUS_BAD_STATE,
@@ -24,9 +25,7 @@ from fmu_asset.slaves.variables import (
     STATUS_NOT_FINITE,
     STATUS_OK,
     STATUS_OUTSIDE_RANGE,
-    variable_table,
 )
-from fmu_asset.slaves.wing_slave import WingSlave
 
 START = {"mass.servo": 0.17, "mass.pitot": 0.13, "damping.alpha": 1.0, "damping.beta": 1e-4}
 N, Z1, Z2, FORCE = range(4)
@@ -41,14 +40,16 @@ class Bare:
 
 @pytest.fixture(scope="session")
 def make_slave(model: ReducedModel) -> Callable[..., Any]:
-    table = variable_table(
-        gauge_count=24, mode_count=6, regions=model.regions, validity=model.validity, start=START
-    )
+    table, roles = structure_table(model, START)
     reference = {row.name: row.reference for row in table}
 
-    class Wing(WingSlave, Bare):
+    class Wing(Slave, Bare):
         content_tag = "tag"
-        load_contents = staticmethod(lambda _: Contents(table, lambda: WingBehaviour(model, 6)))
+        load_contents = staticmethod(
+            lambda _: Contents(
+                table, lambda: StructureBehaviour(model, table, roles), later_outputs(table, roles)
+            )
+        )
 
         def of(self, name: str) -> float:
             index = reference[name]
@@ -176,7 +177,6 @@ def test_calls_in_the_wrong_phase(make_slave: Any) -> None:
         assert len(given) == len(unknown)
         assert math.isnan(given[-1])
     assert wing.get_real([]) == []
-    assert wing.get_boolean([0]) == [False]
     assert wing.get_string([0]) == [""]
     assert wing.do_step(0.0, 1.0) is True
     wing.terminate()

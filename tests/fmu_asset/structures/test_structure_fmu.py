@@ -14,8 +14,8 @@ from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.check.file import check_file
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.packing.structure_fmu import build_fmu, fmu_bytes
 from fmu_asset.structures.binding import names_of_model, structure_binding
-from fmu_asset.structures.build import build_structure_fmu, structure_fmu_bytes
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def model(beam_reduction: Reduction) -> ReducedModel:
 @pytest.fixture(scope="module")
 def fmu(model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its FMU."""
-    return build_structure_fmu(model, tmp_path_factory.mktemp("fmu") / "beam.fmu").path
+    return build_fmu(model, tmp_path_factory.mktemp("fmu") / "beam.fmu").path
 
 
 def _inputs(model: ReducedModel, steps: int) -> list[dict[str, float]]:
@@ -104,8 +104,8 @@ def test_the_check_of_the_file_finds_nothing(fmu: Path) -> None:
 
 
 def test_equal_models_make_equal_bytes_and_bad_starts_are_refused(model: ReducedModel, fmu: Path) -> None:
-    assert structure_fmu_bytes(model)[0] == fmu.read_bytes()
+    assert fmu_bytes(model)[0] == fmu.read_bytes()
     with pytest.raises(FmuBuildError, match="'z9'"):
-        structure_fmu_bytes(model, {"z9": 1.0})
+        fmu_bytes(model, start={"z9": 1.0})
     with pytest.raises(FmuBuildError, match=r"health\.z1"):
-        structure_fmu_bytes(model, {"health.z1": 0.9})
+        fmu_bytes(model, start={"health.z1": 0.9})

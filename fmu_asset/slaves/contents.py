@@ -1,0 +1,50 @@
+"""What the FMU of a structure holds in its resources: its table of variables and its behaviour.
+
+This file is copied into the FMU, as `behaviour`.
+"""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from fe.runtime.reduced import ReducedModel
+
+from .base import Contents
+from .behaviour import StructureBehaviour, later_outputs
+from .table import structure_table
+
+
+def load_contents(resources: Path) -> Contents:
+    """Return what the files that `fmu_asset.packing.structure_fmu` packed describe."""
+    model, start = ReducedModel.load(resources / "reduced_model.npz"), _read(resources / "start.json")
+    own = {name: value for name, value in start.items() if not name.startswith("effect.")}
+    if not (resources / "effects.json").is_file():
+        table, roles = structure_table(model, own)
+        return Contents(table, lambda: StructureBehaviour(model, table, roles), later_outputs(table, roles))
+    # a plain structure needs nothing of these
+    from .effect_variables import TEMPERATURE, effect_rows
+    from .patched_behaviour import PatchedBehaviour
+
+    temperature = own.pop(TEMPERATURE, 0.0)
+    table, roles = structure_table(model, own)
+    record = _read(resources / "effects.json")
+    effects, channels = record["effects"], tuple((name, quantity) for name, quantity in record["channels"])
+    steps = None
+    arrays = resources / "patch_arrays.npz"
+    if arrays.is_file():
+        from fe.runtime.patch_arrays import PatchArrays
+        from fe.runtime.patched_steps import PatchedSteps
+        from fe.runtime.patched_wing import PatchedWing
+
+        steps = partial(PatchedSteps, model, PatchedWing(PatchArrays.load(arrays)))
+    return Contents(
+        table + effect_rows(effects, len(table), {**start, TEMPERATURE: temperature}),
+        lambda: PatchedBehaviour(model, table, roles, effects, channels, steps),
+        later_outputs(table, roles),
+    )
+
+
+def _read(path: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return record
