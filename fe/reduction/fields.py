@@ -4,10 +4,9 @@ No equation of the full model is solved here: the reduced solution is spread ove
 basis, which takes milliseconds.
 """
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +14,8 @@ import numpy.typing as npt
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import Losses
+from fe.structure.elements import HEXAHEDRA_20
+from fe.structure.field import write_vtu
 
 if TYPE_CHECKING:
     from fe.full.operators import AffineOperators
@@ -25,15 +25,7 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-# Places of the nodes of a 20-node hexahedron in VTK's order: corners below, corners above, edges below,
-# edges above, upright edges.
-_VTK_CORNERS = np.array(
-    [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=np.float64
-)
-_VTK_EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
-_VTK_NODES = np.concatenate(
-    (_VTK_CORNERS, [0.5 * (_VTK_CORNERS[a] + _VTK_CORNERS[b]) for a, b in _VTK_EDGES])
-)
+_CELLS = HEXAHEDRA_20.file_type
 
 
 def _order(wanted: FloatArray, given: FloatArray) -> list[int]:
@@ -42,7 +34,7 @@ def _order(wanted: FloatArray, given: FloatArray) -> list[int]:
 
 
 # Node k of a cell seen in a mirror is node _MIRRORED[k] of the cell.
-_MIRRORED = _order(_VTK_NODES * [1.0, 1.0, -1.0] + [0.0, 0.0, 1.0], _VTK_NODES)
+_MIRRORED = _order(HEXAHEDRA_20.places * [1.0, 1.0, -1.0] + [0.0, 0.0, 1.0], HEXAHEDRA_20.places)
 
 
 @dataclass(frozen=True, repr=False)
@@ -135,7 +127,7 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
     from fe.full.assembly import global_gradients, strain_matrix
 
     discretisation = operators.discretisation
-    cells = discretisation.cell_nodes[:, _order(_VTK_NODES, ElementHexS2().doflocs)]
+    cells = discretisation.cell_nodes[:, _order(HEXAHEDRA_20.places, ElementHexS2().doflocs)]
     gradients, determinant = global_gradients(discretisation.corners, np.full((1, 3), 0.5))
     cells = np.where(determinant < 0.0, cells[:, _MIRRORED], cells)
     strain = strain_matrix(gradients[:, 0])
@@ -156,16 +148,8 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
     )
 
 
-def write_wing_vtu(
-    path: str | Path,
-    wing: WingFields,
-    *,
-    young_modulus_factor: float,
-    stiffness_loss: Losses,
-    load_factor: float,
-    tip_force: float = 0.0,
-) -> None:
-    """Write displacement, strain and damage of the wing under one load as a VTU file.
+def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> None:
+    """Write displacement, strain and damage of the wing at rest as a VTU file.
 
     Point data: `displacement` [m]. Cell data, at the centres of the cells: `strain` (xx, yy, zz, yz, xz, xy),
     `spanwise_strain` (yy, positive where compressed, as the gauges), `region` (as in `FieldBasis`),
@@ -177,12 +161,8 @@ def write_wing_vtu(
         The file; an existing one is replaced.
     wing : WingFields
         The wing, from `fe.reduction.model_cache.wing_fields`.
-    young_modulus_factor, stiffness_loss
-        As of `fe.runtime.state.DigitalState`.
-    load_factor : float
-        Load factor [1].
-    tip_force : float
-        Tip force [N].
+    vector : (V,) ndarray
+        Values of all that can be chosen, from `ReducedModel.vector`.
 
     Raises
     ------
@@ -191,80 +171,30 @@ def write_wing_vtu(
     OSError
         If the file cannot be written.
     """
-    coordinates = wing.model.static_response(
-        stiffness_loss=stiffness_loss,
-        young_modulus_factor=young_modulus_factor,
-        load_factor=load_factor,
-        tip_force=tip_force,
-    ).coordinates
-    basis = wing.basis
-    strain = basis.static_strain @ coordinates
-    loss = np.zeros(len(basis.region))
-    for number, value in enumerate(wing.model.losses(stiffness_loss), start=1):
-        loss[basis.region == number] = value
-    _write(
-        Path(path),
-        basis,
-        {"displacement": basis.static_displacement @ coordinates},
-        {
-            "strain": strain,
-            "spanwise_strain": -strain[:, 1],
-            "region": basis.region,
-            "stiffness_loss": loss,
-        },
-    )
+    coordinates, basis = wing.model.static_response(vector).coordinates, wing.basis
+    strain, loss = basis.static_strain @ coordinates, np.zeros(len(basis.region))
+    for number, name in enumerate(wing.model.regions, start=1):
+        loss[basis.region == number] = vector[wing.model.chosen.index(name)]
+    cells = {
+        "strain": strain,
+        "spanwise_strain": -strain[:, 1],
+        "region": basis.region,
+        "stiffness_loss": loss,
+    }
+    displacement = basis.static_displacement @ coordinates
+    write_vtu(path, basis.points, (_CELLS, basis.cells), {"displacement": displacement}, cells)
 
 
-def write_modes_vtu(
-    path: str | Path,
-    wing: WingFields,
-    *,
-    young_modulus_factor: float,
-    stiffness_loss: Losses,
-    servo_mass: float,
-    pitot_mass: float,
-) -> None:
+def write_modes_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> None:
     """Write the mode shapes of the wing as a VTU file.
 
     Point data: `mode_1_5.632Hz` and so on, mass-normalised displacements [kg^-1/2]. Cell data: `region`.
-
-    Parameters and errors are those of `write_wing_vtu`; the masses [kg] are as of
-    `fe.runtime.state.DigitalState`.
+    Parameters and errors are those of `write_wing_vtu`.
     """
-    modes = wing.model.modes(
-        stiffness_loss=stiffness_loss,
-        young_modulus_factor=young_modulus_factor,
-        servo_mass=servo_mass,
-        pitot_mass=pitot_mass,
-    )
-    shapes = wing.basis.modal_displacement @ modes.shape
-    _write(
-        Path(path),
-        wing.basis,
-        {
-            f"mode_{number + 1}_{frequency:.3f}Hz": np.ascontiguousarray(shapes[:, :, number])
-            for number, frequency in enumerate(modes.frequency)
-        },
-        {"region": wing.basis.region},
-    )
-
-
-def _write(
-    path: Path, basis: FieldBasis, point_data: dict[str, FloatArray], cell_data: dict[str, npt.NDArray[Any]]
-) -> None:
-    """Write a VTU file, whole or not at all."""
-    import meshio
-
-    mesh = meshio.Mesh(
-        basis.points,
-        [("hexahedron20", basis.cells)],
-        point_data=point_data,
-        cell_data={name: [values] for name, values in cell_data.items()},
-    )
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            temporary = Path(folder) / "wing.vtu"
-            meshio.write(temporary, mesh, file_format="vtu")
-            temporary.replace(path)
-    except OSError as error:  # with the name that was asked for, not that of the temporary file
-        raise OSError(error.errno, error.strerror, str(path)) from error
+    modes, basis = wing.model.modes(vector), wing.basis
+    shapes = basis.modal_displacement @ modes.shape
+    named = {
+        f"mode_{number + 1}_{frequency:.3f}Hz": np.ascontiguousarray(shapes[:, :, number])
+        for number, frequency in enumerate(modes.frequency)
+    }
+    write_vtu(path, basis.points, (_CELLS, basis.cells), named, {"region": basis.region})

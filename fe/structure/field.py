@@ -1,8 +1,9 @@
-"""The field of a structure as a VTU file for ParaView."""
+"""Fields as VTU files for ParaView."""
 
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,22 +74,34 @@ def write_structure_vtu(
     loss = np.zeros(len(structure.mesh.cells))
     for number, name in enumerate(structure.regions):
         loss[structure.region_of == number] = losses.get(name, 0.0)
-    meshio = meshio_with_wedges()
-    mesh = meshio.Mesh(
+    write_vtu(
+        path,
         structure.mesh.points,
-        [(structure.mesh.kind.file_type, structure.mesh.cells)],
-        point_data={"displacement": displacement},
-        cell_data={
-            "strain": [centre_strains(structure, displacement)],
-            "material": [structure.material_of + 1],
-            "region": [structure.region_of + 1],
-            "stiffness_loss": [loss],
+        (structure.mesh.kind.file_type, structure.mesh.cells),
+        {"displacement": displacement},
+        {
+            "strain": centre_strains(structure, displacement),
+            "material": structure.material_of + 1,
+            "region": structure.region_of + 1,
+            "stiffness_loss": loss,
         },
     )
-    path = Path(path)
+
+
+def write_vtu(
+    path: Path | str,
+    points: FloatArray,
+    cells: tuple[str, NDArray[np.int64]],
+    point_data: dict[str, FloatArray],
+    cell_data: dict[str, NDArray[Any]],
+) -> None:
+    """Write a VTU file, whole or not at all; `cells` are their kind in meshio and their nodes."""
+    meshio, path = meshio_with_wedges(), Path(path)
+    values = {name: [value] for name, value in cell_data.items()}
+    mesh = meshio.Mesh(points, [cells], point_data=point_data, cell_data=values)
     try:
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            temporary = Path(folder) / "structure.vtu"
+            temporary = Path(folder) / "field.vtu"
             meshio.write(temporary, mesh, file_format="vtu")
             temporary.replace(path)
     except OSError as error:  # with the name that was asked for, not that of the temporary file

@@ -65,9 +65,7 @@ def compiled_members(
     *,
     units: Sequence[Unit] = UNITS,
     model_name: str,
-    identifier: str,
-    guid: str,
-    content_tag: str,
+    placeholder: str,
     description: str,
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
@@ -84,10 +82,10 @@ def compiled_members(
         Which of them is what.
     units : sequence of Unit
         Units of the table.
-    model_name, identifier : str
-        Model name and model identifier.
-    guid, content_tag : str
-        GUID, and the mark of saved states; placeholders, as long as the content is not known.
+    model_name : str
+        Model name, with which the model identifier begins.
+    placeholder : str
+        Stands for the GUID, the end of the identifier and the mark of saved states.
     description : str
         One sentence for people.
     fmi : {2, 3}
@@ -106,13 +104,13 @@ def compiled_members(
     FmuBuildError
         If fmpy's headers are missing.
     """
-    sources = _sources(fmi)
+    sources, identifier = _sources(fmi), f"{model_name}_{placeholder}"
     if interface == "model-exchange":
         table = exchange_table(table, model.mode_count, arrays=fmi == 3)
     if fmi == 3:
         table = (*table, replace(_TIME, reference=len(table)))
     arrays = arrays_of(table) if fmi == 3 else ()
-    made = variable_sources(table, roles, guid=guid, content_tag=content_tag, arrays=arrays)
+    made = variable_sources(table, roles, guid=placeholder, content_tag=placeholder, arrays=arrays)
     sources |= {name: text.encode() for name, text in made.items()}
     listed = sorted(name for name in sources if name.endswith(".c"))
     sources["CMakeLists.txt"] = _cmake_lists(identifier, listed, fmi)
@@ -121,7 +119,7 @@ def compiled_members(
         model_description_text = model_description3(
             model_name=model_name,
             identifier=identifier,
-            guid=guid,
+            guid=placeholder,
             table=table,
             arrays=arrays,
             units=units,
@@ -132,7 +130,7 @@ def compiled_members(
         model_description_text = model_description(
             model_name=model_name,
             identifier=identifier,
-            guid=guid,
+            guid=placeholder,
             table=table,
             units=units,
             description=description,

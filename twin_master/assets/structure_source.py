@@ -158,7 +158,7 @@ class StructureFmuSource(FmuSource):
         from fe.reduction.model_cache import check_structure
         from fmu_asset.compiled.compiler import find_compiler
         from fmu_asset.door.binding import load_binding
-        from fmu_asset.structures.binding import names_of_design, structure_binding
+        from fmu_asset.structures.binding import structure_binding
 
         self.files()
         design = self._design()
@@ -171,7 +171,7 @@ class StructureFmuSource(FmuSource):
         binding = (
             load_binding(self._section.binding_path)
             if own
-            else structure_binding(names_of_design(design), frequencies_observed(self._scenario))
+            else structure_binding(design, frequencies_observed(self._scenario))
         )
         self._check_names(binding)
         if self._scenario.observation.modes is None:
@@ -188,11 +188,11 @@ class StructureFmuSource(FmuSource):
         """Reduce the structure and pack the FMU."""
         from fe.reduction.model_cache import reduced_structure
         from fmu_asset.packing.structure_fmu import build_fmu
-        from fmu_asset.structures.binding import names_of_model, structure_binding_text
+        from fmu_asset.structures.binding import structure_binding_text
 
         model = reduced_structure(self._path(FLOWN_COPY), progress=progress)
         if not self._path(BINDING_COPY).exists():
-            text = structure_binding_text(names_of_model(model), frequencies_observed(self._scenario))
+            text = structure_binding_text(self._design(), frequencies_observed(self._scenario))
             atomic_write_text(self._path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):
             build_fmu(model, self.fmu_path(), kind=self._section.packed, replace=True)

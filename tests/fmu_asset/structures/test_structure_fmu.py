@@ -10,12 +10,13 @@ import pytest
 from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.transient import ModalIntegrator
+from fe.structure.operators import Structure
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.check.file import check_file
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.structure_fmu import build_fmu, fmu_bytes
-from fmu_asset.structures.binding import names_of_model, structure_binding
+from fmu_asset.structures.binding import structure_binding
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +39,10 @@ def _inputs(model: ReducedModel, steps: int) -> list[dict[str, float]]:
     ]
 
 
-def test_every_step_is_that_of_the_model(model: ReducedModel, fmu: Path) -> None:
+def test_every_step_is_that_of_the_model(model: ReducedModel, fmu: Path, beam: Structure) -> None:
     """Quasi-static: strains, displacements and bounds to 1e-12 of the largest; accelerations are zero."""
     with FmiAsset(
-        fmu, structure_binding(names_of_model(model)), parameters={"e": 1.06, "pump": 0.03}, isolated=False
+        fmu, structure_binding(beam.design), parameters={"e": 1.06, "pump": 0.03}, isolated=False
     ) as asset:
         for chosen in _inputs(model, 20):
             seen = asset.step(
@@ -56,12 +57,12 @@ def test_every_step_is_that_of_the_model(model: ReducedModel, fmu: Path) -> None
             assert seen.extra["strain_error_bound"] == pytest.approx(found.strain_error_bound, rel=1e-12)
 
 
-def test_motion_is_that_of_the_model(model: ReducedModel, fmu: Path) -> None:
+def test_motion_is_that_of_the_model(model: ReducedModel, fmu: Path, beam: Structure) -> None:
     """Transient, health changing on the way; a state that is restored goes on to the bit."""
     steps = _inputs(model, 12)
     for number in range(1, 6):  # the load jumps while health stays
         steps[number] |= {name: steps[0][name] for name in model.regions}
-    binding = structure_binding(names_of_model(model))
+    binding = structure_binding(beam.design)
     binding = binding.model_copy(update={"binding": binding.binding.model_copy(update={"step_size": 1e-3})})
     seen, kept, after = [], b"", []
     with FmiAsset(fmu, binding, parameters={"response": 2}, isolated=False) as asset:
