@@ -27,7 +27,6 @@ from discrepancy.sources.from_run import (
 )
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import reduced_structure
-from fe.reduction.stages import Progress
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import load_structure
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
@@ -38,6 +37,7 @@ from fmu_asset.packing.structure_fmu import fmu_bytes
 from fmu_asset.structures.rig import rig_text
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes
+from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
 from reporting.toml_file import parse_toml, read_toml
 from scenarios import structure_files

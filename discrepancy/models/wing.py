@@ -26,7 +26,6 @@ from discrepancy.models.memory import Memory
 from discrepancy.models.ported import PortedSystem
 from discrepancy.models.wing_structure import MovingWing, Outputs, Stiffness, WingStructure
 from fe.reduction.model_cache import patch_arrays
-from fe.reduction.stages import Progress
 from fe.runtime.errors import FiniteElementError, InvalidPatchError, SolutionError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
 from fe.runtime.patch import (
@@ -47,6 +46,7 @@ from fe.runtime.patched_wing import LOAD_PLACE, PORTS, PatchedWing
 from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import wing_names
 from fe.wing.design import load_design
+from reporting.progress import Progress
 
 FloatArray = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays
 from fe.runtime.reduced import ReducedModel
 from fe.structure.elements import HEXAHEDRA_20
-from fe.structure.field import write_vtu
+from fe.structure.field import centre_strains, write_vtu
 
 if TYPE_CHECKING:
     from fe.full.operators import AffineOperators
@@ -51,8 +51,6 @@ class FieldBasis(KeptArrays):
         0 skin, 1 to K the damage regions, K + 1 webs, K + 2 ribs.
     static_displacement : (P, 3, N) ndarray
         Static basis vectors [m per unit coordinate].
-    static_strain : (C, 6, N) ndarray
-        Their strains at the centres of the cells: xx, yy, zz, yz, xz, xy; shear as engineering strain.
     modal_displacement : (P, 3, Nm) ndarray
         Modal basis vectors.
     """
@@ -64,7 +62,6 @@ class FieldBasis(KeptArrays):
     cells: IntArray
     region: IntArray
     static_displacement: FloatArray
-    static_strain: FloatArray
     modal_displacement: FloatArray
 
     def __post_init__(self) -> None:
@@ -82,7 +79,6 @@ class FieldBasis(KeptArrays):
             "cells": (*cells, 20),
             "region": cells,
             "static_displacement": (*points, 3, *static),
-            "static_strain": (*cells, 6, *static),
             "modal_displacement": (*points, 3, *modal),
         }
 
@@ -124,13 +120,12 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
     """
     from skfem import ElementHexS2
 
-    from fe.full.assembly import global_gradients, strain_matrix
+    from fe.full.assembly import global_gradients
 
     discretisation = operators.discretisation
     cells = discretisation.cell_nodes[:, _order(HEXAHEDRA_20.places, ElementHexS2().doflocs)]
-    gradients, determinant = global_gradients(discretisation.corners, np.full((1, 3), 0.5))
+    _, determinant = global_gradients(discretisation.corners, np.full((1, 3), 0.5))
     cells = np.where(determinant < 0.0, cells[:, _MIRRORED], cells)
-    strain = strain_matrix(gradients[:, 0])
 
     def spread(vectors: FloatArray) -> FloatArray:
         return np.asarray(operators.expansion @ vectors)
@@ -143,7 +138,6 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
         cells=cells.astype(np.int64),
         region=operators.wing_mesh.region.astype(np.int64),
         static_displacement=static.reshape(-1, 3, static.shape[1]),
-        static_strain=strain @ static[discretisation.cell_dofs],
         modal_displacement=modal.reshape(-1, 3, modal.shape[1]),
     )
 
@@ -172,7 +166,8 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
         If the file cannot be written.
     """
     coordinates, basis = wing.model.static_response(vector).coordinates, wing.basis
-    strain, loss = basis.static_strain @ coordinates, np.zeros(len(basis.region))
+    displacement, loss = basis.static_displacement @ coordinates, np.zeros(len(basis.region))
+    strain = centre_strains(HEXAHEDRA_20, basis.points, basis.cells, displacement)
     for number, name in enumerate(wing.model.regions, start=1):
         loss[basis.region == number] = vector[wing.model.chosen.index(name)]
     cells = {
@@ -181,7 +176,6 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
         "region": basis.region,
         "stiffness_loss": loss,
     }
-    displacement = basis.static_displacement @ coordinates
     write_vtu(path, basis.points, (_CELLS, basis.cells), {"displacement": displacement}, cells)
 
 

@@ -14,19 +14,19 @@ from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
+from reporting.progress import SilentProgress
 
 from .built_once import built_once, cache_folder, kept
 from .fields import FieldBasis, WingFields, field_basis
-from .stages import stage_of
 
 if TYPE_CHECKING:
     from fe.full.operators import AffineOperators
     from fe.structure.operators import Structure
     from fe.wing.design import WingDesign
+    from reporting.progress import Progress
 
     from .patch_basis import PatchSettings
     from .settings import ReductionSettings, StructureSettings
-    from .stages import Progress
 
 MODELLING_ROOMS = ("runtime", "wing", "full", "structure", "reduction")
 """The rooms that decide what a reduced model holds; a change in any of their files makes a new entry."""
@@ -109,28 +109,25 @@ def wing_fields(
     """
     wing = given_or_shipped(design)
     path = entry("wing", wing.hash, settings)
-    return kept(lambda: _loaded_fields(path, wing.hash)) or _kept_fields(wing, path, progress, settings)
-
-
-def _loaded_fields(path: Path, design_hash: str) -> WingFields:
-    model = _loaded(ReducedModel, path, design_hash)
-    return WingFields(model, _loaded(FieldBasis, _field_path(path), design_hash))
-
-
-def _field_path(path: Path) -> Path:
-    return path.with_name(f"{path.stem}-fields.npz")
+    return _kept_fields(wing, path, progress, settings)
 
 
 def _kept_fields(
     design: "WingDesign", path: Path, progress: "Progress | None", settings: "ReductionSettings | None"
 ) -> WingFields:
+    fields = path.with_name(f"{path.stem}-fields.npz")
+
+    def load() -> WingFields:
+        model = _loaded(ReducedModel, path, design.hash)
+        return WingFields(model, _loaded(FieldBasis, fields, design.hash))
+
     def keep(wing: WingFields) -> None:
-        wing.basis.save(_field_path(path))
+        wing.basis.save(fields)
         wing.model.save(path)
 
     return built_once(
         path,
-        load=lambda: _loaded_fields(path, design.hash),
+        load=load,
         build=lambda: build(design, progress, settings),
         keep=keep,
     )
@@ -155,7 +152,7 @@ def assembled(design: "WingDesign", progress: "Progress | None") -> "Iterator[Af
     from fe.full.operators import assemble
 
     with threadpool_limits(1):
-        with stage_of(progress, "Meshing and assembling the wing"):
+        with (progress or SilentProgress()).stage("Meshing and assembling the wing"):
             operators = assemble(design)
         yield operators
 
@@ -172,13 +169,9 @@ def patch_arrays(
     """
     wing = given_or_shipped(design)
     path = entry("patches", wing.hash, settings)
-
-    def load() -> PatchArrays:
-        return _loaded(PatchArrays, path, wing.hash)
-
-    return kept(load) or built_once(
+    return built_once(
         path,
-        load=load,
+        load=lambda: _loaded(PatchArrays, path, wing.hash),
         build=lambda: build_patch_arrays(wing, progress, settings),
         keep=lambda arrays: arrays.save(path),
     )
@@ -228,7 +221,7 @@ def reduced_structure(
     def build_structure() -> ReducedModel:
         from fe.structure.operators import load_and_assemble
 
-        with stage_of(progress, "Reading the mesh and assembling"):
+        with (progress or SilentProgress()).stage("Reading the mesh and assembling"):
             structure = load_and_assemble(file, memory_limit)
         return reduced(structure, settings, progress)
 

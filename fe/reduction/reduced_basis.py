@@ -17,6 +17,7 @@ from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.structure.affine import AffineStructure
+from reporting.progress import Progress, SilentProgress
 from reporting.words import counted
 
 from .certified_basis import AffineProblem, Judgement, State, StaticReduction, greedy
@@ -31,7 +32,6 @@ from .settings import (
     loss_splits,
     remaining_levels,
 )
-from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -255,14 +255,14 @@ def reduce_structure(
     SolutionError
         If the full model cannot be solved.
     """
-    settings = settings or StructureSettings()
+    settings, progress = settings or StructureSettings(), progress or SilentProgress()
     terms = ReductionTerms(structure)
     _check(terms, name)
-    with stage_of(progress, "Factorising the structure"):
+    with progress.stage("Factorising the structure"):
         norm = Norm(affine_sum(terms.reference, terms.problem.stiffness_terms))
-    with stage_of(progress, "Reducing the modes") as stage:
+    with progress.stage("Reducing the modes") as stage:
         modes = _modes(terms, norm, name, settings.modal, stage.advance, followed_load)
-    with stage_of(progress, "Reducing the statics") as stage:
+    with progress.stage("Reducing the statics") as stage:
         static = StaticReduction(
             terms.problem,
             norm,

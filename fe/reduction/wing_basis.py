@@ -6,10 +6,10 @@ from scipy import sparse
 from fe.full.affine import AffineSystem
 from fe.runtime.state import TIP_FORCE, WING, DigitalState
 from fe.structure.affine import AffineStructure, LoadTerm, StiffnessTerm
+from reporting.progress import Progress
 
 from .reduced_basis import Reduction, reduce_structure
 from .settings import ReductionSettings
-from .stages import Progress
 
 
 def wing_structure(system: AffineSystem, settings: ReductionSettings) -> AffineStructure:

@@ -4,7 +4,8 @@ NumPy and relative imports only: this file is copied into the FMU.
 """
 
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
+from sys import float_info
 from typing import ClassVar
 
 import numpy as np
@@ -124,22 +125,17 @@ class PatchArrays(RegionArrays):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in SCALARS:
+        for name, low, high in (
+            *((name, float_info.min, inf) for name in SCALARS),
+            ("gauge_length", 0.0, inf),
+            ("straight_chord_line", 0.0, 1.0),
+        ):
             value = getattr(self, name)
-            if not (isfinite(value) and value > 0.0):
+            if not (isfinite(value) and low <= value <= high):
                 raise ReducedModelFileError(
-                    f"The {name} of a wing for patches must be positive, but is {value!r}; build it anew."
+                    f"The {name} of a wing for patches must lie between {low:.2g} and {high:g}, but is "
+                    f"{value!r}; build it anew."
                 )
-        if not (isfinite(self.gauge_length) and self.gauge_length >= 0.0):
-            raise ReducedModelFileError(
-                f"The gauge_length of a wing for patches must not be negative, but is "
-                f"{self.gauge_length!r}; build it anew."
-            )
-        if not 0.0 <= self.straight_chord_line <= 1.0:
-            raise ReducedModelFileError(
-                f"The straight_chord_line of a wing for patches must be a fraction, but is "
-                f"{self.straight_chord_line!r}; build it anew."
-            )
         strips = len(self.strip_lines) - 1
         if len(self.strip_of) and not (
             self.strip_of.min() >= 0

@@ -179,11 +179,11 @@ class PatchedSteps:
 
     @cached_property
     def _modes(self) -> Modes:
-        return self._patched.moving_modes(self._held_rows, MODE_COUNT)
+        return self._patched.modes(MODE_COUNT, self._held_rows)
 
     @cached_property
     def _plain_modes(self) -> Modes:
-        return self._plain.moving_modes(self._held_rows, MODE_COUNT)
+        return self._plain.modes(MODE_COUNT, self._held_rows)
 
     @cached_property
     def _system(self) -> ModalSystem:

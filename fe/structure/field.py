@@ -10,28 +10,33 @@ from numpy.typing import NDArray
 
 from fe.full.statics import Factorisation
 
-from .elements import meshio_with_wedges
+from .elements import ElementKind, meshio_with_wedges
 from .operators import Structure
 
 FloatArray = NDArray[np.float64]
 
 
-def centre_strains(structure: Structure, displacement: FloatArray) -> FloatArray:
+def centre_strains(
+    kind: ElementKind, points: FloatArray, cells: NDArray[np.int64], displacement: FloatArray
+) -> FloatArray:
     """Strains (nc, 6) xx, yy, zz, yz, xz, xy, shear as engineering strain, at the centres of the cells.
 
     Parameters
     ----------
-    structure : Structure
-        The structure.
+    kind : ElementKind
+        Of the cells.
+    points : (nodes, 3) m
+        The nodes.
+    cells : (nc, k)
+        Nodes of the cells.
     displacement : (nodes, 3) m
         Of all nodes.
     """
-    mesh = structure.mesh
-    centre = mesh.kind.places[: len(mesh.kind.corners)].mean(axis=0)
-    _, slopes = mesh.kind.shape_functions(centre[None])
-    jacobian = np.einsum("nai,aj->nij", mesh.nodes, slopes[0])
+    centre = kind.places[: len(kind.corners)].mean(axis=0)
+    _, slopes = kind.shape_functions(centre[None])
+    jacobian = np.einsum("nai,aj->nij", points[cells], slopes[0])
     along = np.einsum("ak,nki->nai", slopes[0], np.linalg.inv(jacobian))
-    gradient = np.einsum("nai,naj->nij", displacement[mesh.cells], along)
+    gradient = np.einsum("nai,naj->nij", displacement[cells], along)
     strain = gradient + gradient.transpose(0, 2, 1)
     diagonal = 0.5 * np.einsum("nii->ni", strain)
     return np.column_stack((diagonal, strain[:, 1, 2], strain[:, 0, 2], strain[:, 0, 1]))
@@ -62,25 +67,19 @@ def write_structure_vtu(
         If the file cannot be written.
     """
     given = dict(values or {})
-    parameters, losses, masses = (
-        {name: given[name] for name in names if name in given}
-        for names in (structure.parameters, structure.regions, structure.masses)
-    )
-    load = np.zeros(structure.unknowns)
-    for name, control in structure.loads.items():
-        load = load + structure.load(name, None if control is None else given.get(control), masses)
-    free = Factorisation(structure.stiffness(parameters, losses)).solve(load)
+    stiffness, _, load = structure.at(given)
+    free = Factorisation(stiffness).solve(load)
     displacement = structure.full_displacement(free)
-    loss = np.zeros(len(structure.mesh.cells))
+    mesh, loss = structure.mesh, np.zeros(len(structure.mesh.cells))
     for number, name in enumerate(structure.regions):
-        loss[structure.region_of == number] = losses.get(name, 0.0)
+        loss[structure.region_of == number] = given.get(name, 0.0)
     write_vtu(
         path,
-        structure.mesh.points,
-        (structure.mesh.kind.file_type, structure.mesh.cells),
+        mesh.points,
+        (mesh.kind.file_type, mesh.cells),
         {"displacement": displacement},
         {
-            "strain": centre_strains(structure, displacement),
+            "strain": centre_strains(mesh.kind, mesh.points, mesh.cells, displacement),
             "material": structure.material_of + 1,
             "region": structure.region_of + 1,
             "stiffness_loss": loss,

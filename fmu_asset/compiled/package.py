@@ -48,11 +48,6 @@ _TIME = FmuVariable(
     variability="continuous",
     description="Time",
     unit="s",
-    display_unit=None,
-    minimum=None,
-    maximum=None,
-    start=None,
-    enumeration=None,
 )
 
 HOST = "It is compiled C and needs nothing but the C library; its sources are inside."

@@ -10,7 +10,7 @@ import os
 import re
 import zipfile
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Literal, TypedDict, Unpack
 
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
@@ -56,22 +56,24 @@ _OF_A_STRUCTURE = (
 _ACCELERATION = Unit("m/s2", (("m", 1), ("s", -2)))
 
 
+class FmuOptions(TypedDict, total=False):
+    """What may be said of an FMU to be packed, see `build_fmu`."""
+
+    state: DigitalState | None
+    start: Mapping[str, float] | None
+    kind: FmuKind
+    note: str
+    resources: Mapping[str, bytes] | None
+    patch: PatchFile | None
+    activate: bool
+    arrays: PatchArrays | None
+    fmi: FmiVersion
+    interface: Interface
+    platforms: Sequence[Platform]
+
+
 def build_fmu(
-    model: ReducedModel,
-    path: str | os.PathLike[str],
-    *,
-    state: DigitalState | None = None,
-    start: Mapping[str, float] | None = None,
-    kind: FmuKind = "python",
-    note: str = "",
-    resources: Mapping[str, bytes] | None = None,
-    patch: PatchFile | None = None,
-    activate: bool = False,
-    arrays: PatchArrays | None = None,
-    fmi: FmiVersion = 2,
-    interface: Interface = "co-simulation",
-    platforms: Sequence[Platform] = (PLATFORM,),
-    replace: bool = False,
+    model: ReducedModel, path: str | os.PathLike[str], *, replace: bool = False, **options: Unpack[FmuOptions]
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
 
@@ -119,20 +121,7 @@ def build_fmu(
         If the FMU cannot carry an effect of the patch.
     """
     target = checked_target(path, replace=replace)
-    content, content_hash = fmu_bytes(
-        model,
-        state,
-        kind,
-        start=start,
-        note=note,
-        resources=resources,
-        patch=patch,
-        activate=activate,
-        arrays=arrays,
-        fmi=fmi,
-        interface=interface,
-        platforms=platforms,
-    )
+    content, content_hash = fmu_bytes(model, **options)
     return write_fmu(target, content, content_hash, stem_of(model), model.design_hash)
 
 

@@ -187,12 +187,14 @@ class StructureFmuSource(FmuSource):
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
         from fe.reduction.model_cache import reduced_structure
+        from fe.structure.design import load_structure
         from fmu_asset.packing.structure_fmu import build_fmu
         from fmu_asset.structures.binding import structure_binding_text
 
         model = reduced_structure(self._path(FLOWN_COPY), progress=progress)
         if not self._path(BINDING_COPY).exists():
-            text = structure_binding_text(self._design(), frequencies_observed(self._scenario))
+            design = load_structure(self._path(FLOWN_COPY))
+            text = structure_binding_text(design, frequencies_observed(self._scenario))
             atomic_write_text(self._path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):
             build_fmu(model, self.fmu_path(), kind=self._section.packed, replace=True)

@@ -190,7 +190,6 @@ def test_model_and_fields_must_belong_together(coarse_wing: WingFields) -> None:
     cut = replace(
         coarse_wing.basis,
         static_displacement=coarse_wing.basis.static_displacement[..., :-1],
-        static_strain=coarse_wing.basis.static_strain[..., :-1],
     )
     with pytest.raises(ReducedModelFileError, match="does not belong"):
         WingFields(coarse_wing.model, cut)

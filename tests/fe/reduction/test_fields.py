@@ -153,7 +153,7 @@ def test_basis_comes_back_to_the_last_bit(wing: WingFields) -> None:
         FieldBasis.from_bytes(content[:1000], "the basis")
     with pytest.raises(ReducedModelFileError, match="lacks"):
         FieldBasis.from_bytes(wing.model.to_bytes(), "the basis")
-    for name in ("points", "cells", "region", "static_displacement", "static_strain", "modal_displacement"):
+    for name in ("points", "cells", "region", "static_displacement", "modal_displacement"):
         for value in (np.array(1.0), np.array("a"), getattr(wing.basis, name)[:-1, ...]):
             with pytest.raises(ReducedModelFileError, match="field basis"):
                 replace(wing.basis, **{name: value})
