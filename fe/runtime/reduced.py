@@ -21,6 +21,11 @@ Values = Mapping[str, float] | FloatArray
 """What is chosen: by name, or all of it (V,) in the order of `ReducedArrays.chosen`."""
 
 
+def dense_sum(coefficients: FloatArray, terms: FloatArray) -> FloatArray:
+    """Return the sum of coefficients (T,) times dense terms (T, n, m)."""
+    return np.asarray((coefficients @ terms.reshape(len(terms), -1)).reshape(terms.shape[1:]))
+
+
 @dataclass(frozen=True, slots=True)
 class StaticResponse:
     """Static response of a structure.
@@ -201,11 +206,19 @@ class ReducedModel(ReducedArrays):
                 )
 
     def _coefficients(self, vectors: FloatArray, number: int) -> FloatArray:
+        if vectors.ndim == 1:
+            return self._of_one(vectors.tolist(), number)
         first = len(self.parameters)
         unit = np.ones((*vectors.shape[:-1], 1))
         left = 1.0 - vectors[..., first : first + len(self.regions)]
         known = np.concatenate((unit, vectors, left), axis=-1)
         return np.asarray(known[..., np.array(self._pairs[number]).reshape(-1, 2)].prod(axis=-1))
+
+    def _of_one(self, values: list[float], number: int) -> FloatArray:
+        # plain floats: arrays of so few numbers cost more than all sums over them
+        first = len(self.parameters)
+        known = [1.0, *values, *[1.0 - value for value in values[first : first + len(self.regions)]]]
+        return np.array([known[one] * known[other] for one, other in self._pairs[number]])
 
     def stiffness_coefficients(self, vectors: FloatArray) -> FloatArray:
         """Return the coefficients (..., T) of the stiffness terms at values (..., V)."""
@@ -247,22 +260,19 @@ class ReducedModel(ReducedArrays):
         self.check_validity(chosen)
         first, gauges = len(self.parameters), len(self.gauges)
         loss = tuple(chosen[first : first + len(self.regions)])
-        # plain floats: arrays of so few numbers cost more than all sums over them
-        known = [1.0, *chosen, *(1.0 - value for value in loss)]
-        stiffness, loads = self._pairs
-        theta = np.array([known[one] * known[other] for one, other in stiffness])
-        if load is None:
-            load = np.array([known[one] * known[other] for one, other in loads])
-        found, rounding = self._online.solution(theta, load, loss), self.rounding_allowance
+        acting = self._of_one(chosen, 1) if load is None else load
+        found, rounding = (
+            self._online.solution(self._of_one(chosen, 0), acting, loss),
+            self.rounding_allowance,
+        )
         strain, displacement = found.output[:gauges], found.output[gauges:]
+        bound = found.bound.tolist()
         return StaticResponse(
-            strain=strain,
-            displacement=displacement,
-            strain_error_bound=float(found.bound[:gauges].max(initial=0.0))
-            + rounding * sqrt(strain @ strain),
-            displacement_error_bound=float(found.bound[gauges:].max(initial=0.0))
-            + rounding * sqrt(displacement @ displacement),
-            coordinates=found.coordinates,
+            strain,
+            displacement,
+            max(bound[:gauges], default=0.0) + rounding * sqrt(strain @ strain),
+            max(bound[gauges:], default=0.0) + rounding * sqrt(displacement @ displacement),
+            found.coordinates,
         )
 
     def static_outputs(self, vectors: FloatArray) -> FloatArray:
@@ -305,8 +315,8 @@ class ReducedModel(ReducedArrays):
         """
         vector = self.vector(values, stiffness_loss, **named)
         self.check_validity(vector.tolist())
-        stiffness = np.tensordot(self.stiffness_coefficients(vector), self.modal_stiffness, 1)
-        mass = np.tensordot(self.mass_coefficients(vector), self.modal_mass, 1)
+        stiffness = dense_sum(self.stiffness_coefficients(vector), self.modal_stiffness)
+        mass = dense_sum(self.mass_coefficients(vector), self.modal_mass)
         # M x = K x / omega^2: the stiffness is well conditioned in this basis, the mass is not, and the low
         # modes are the largest eigenvalues, which keep all their digits.
         to_standard = np.linalg.inv(np.linalg.cholesky(stiffness))

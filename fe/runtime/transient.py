@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from .damping import rayleigh_damping_ratio
 from .errors import InvalidStateError
-from .reduced import ReducedModel
+from .reduced import ReducedModel, dense_sum
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -167,7 +167,7 @@ class ModalIntegrator:
         self._cached: tuple[float, Propagator] | None = None
         self._from_modal = self.modes.shape.T @ self.modes.mass
         masses = model.mass_coefficients(vector)
-        self._from_static = self.modes.shape.T @ np.tensordot(masses, model.cross_mass, 1)
+        self._from_static = self.modes.shape.T @ dense_sum(masses, model.cross_mass)
 
     def at_rest(self, load: npt.ArrayLike) -> TransientState:
         """Return the state of equilibrium under loads (L,)."""

@@ -128,10 +128,10 @@ class Slave:
         self._tuned = {row.name: row.reference for row in self._table[self._end :]}
         self._status = next(row.reference for row in self._table if row.name == "status")
         self._later = contents.later
-        self._first_later = min((part.start for part in self._later), default=len(self._table))
         self._pending = [True] * len(self._later)
         self._stale = True
-        self._read: tuple[list[int], slice | None] = ([], None)  # what was read last, and the slice it is
+        # what was read last, the slice that it is, and the groups of later outputs in it
+        self._read: tuple[list[int], slice | None, list[int]] = ([], None, [])
         self._phase = INSTANTIATED
         self._time = self._start_time = 0.0
 
@@ -264,7 +264,7 @@ class Slave:
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
         """Return values; some outputs are computed when they are asked for."""
-        references, part = self._read
+        references, part, groups = self._read
         if vrs != references:
             references = list(vrs)
             unknown = [vr for vr in references if not 0 <= vr < len(self._values)]
@@ -273,19 +273,23 @@ class Slave:
                 return [math.nan] * len(references)
             first, last = (references[0], references[-1]) if references else (0, -1)
             part = slice(first, last + 1) if references == list(range(first, last + 1)) else None
-            self._read = references, part
+            groups = [
+                number
+                for number, rows in enumerate(self._later)
+                if any(rows.start <= vr < rows.stop for vr in references)
+            ]
+            self._read = references, part, groups
         if self._stale and self._phase == INITIALISING:
             self._initialise()
-        if True in self._pending and self._phase not in (INSTANTIATED, REFUSED):
-            self._complete(references)
+        if groups and self._phase not in (INSTANTIATED, REFUSED):
+            self._complete(groups)
         return self._values[part] if part else [self._values[vr] for vr in references]
 
-    def _complete(self, references: Sequence[int]) -> None:
-        """Compute the groups of outputs that are asked for and not known yet."""
-        if max(references, default=0) < self._first_later:
-            return
-        for number, part in enumerate(self._later):
-            if self._pending[number] and any(part.start <= vr < part.stop for vr in references):
+    def _complete(self, groups: Sequence[int]) -> None:
+        """Compute groups of outputs that are asked for and not known yet."""
+        for number in groups:
+            if self._pending[number]:
+                part = self._later[number]
                 try:
                     self._values[part] = self._behaviour.later(number)
                     self._pending[number] = False

@@ -50,9 +50,8 @@ class StructureBehaviour:
     def __init__(self, model: ReducedModel, table: Sequence[FmuVariable], roles: Roles) -> None:
         self._model, self._roles = model, roles
         inputs = [row.name for row in table if row.causality == "input"]
-        self._from_inputs = [
-            (place, inputs.index(name)) for place, name in enumerate(roles.chosen) if name in inputs
-        ]
+        self._sources = [(name, inputs.index(name) if name in inputs else None) for name in roles.chosen]
+        self._resting = [0.0] * len(model.accelerations)
         self._own = len(model.chosen) - len(model.controls)  # what modes depend on
         self._parameters: Mapping[str, float] = {}
         self._vector: FloatArray | None = None
@@ -81,7 +80,7 @@ class StructureBehaviour:
         vector = self._chosen(self._parameters, inputs)
         if motion is not None:
             integrator, state = motion
-            if vector[: self._own].tolist() != before[: self._own].tolist():
+            if vector[: self._own].tobytes() != before[: self._own].tobytes():
                 integrator = self._integrator(self._parameters, vector)
                 state = integrator.take_over(state, motion[0])
             motion = integrator, integrator.advance(state, duration, self._model.load_coefficients(vector))
@@ -131,10 +130,9 @@ class StructureBehaviour:
         self._parameters, self._vector, self._motion, self._static = kept, vector, motion, None
 
     def _chosen(self, parameters: Mapping[str, float], inputs: Sequence[float]) -> FloatArray:
-        vector = np.array([parameters.get(name, 0.0) for name in self._roles.chosen])
-        for place, number in self._from_inputs:
-            vector[place] = inputs[number]
-        return vector
+        return np.array(
+            [parameters[name] if number is None else inputs[number] for name, number in self._sources]
+        )
 
     @staticmethod
     def _damping(parameters: Mapping[str, float]) -> tuple[float, float]:
@@ -152,7 +150,6 @@ class StructureBehaviour:
             values: list[float] = motion[0].outputs(motion[1]).tolist()
         else:
             static = self._model.static_response(vector)
-            resting = [0.0] * len(self._model.accelerations)
-            values = [*static.strain.tolist(), *static.displacement.tolist(), *resting]
+            values = static.strain.tolist() + static.displacement.tolist() + self._resting
         self._vector, self._motion, self._static = vector, motion, static
         return values

@@ -19,15 +19,14 @@ def load_contents(resources: Path) -> Contents:
     """Return what the files that `fmu_asset.packing.structure_fmu` packed describe."""
     model, start = ReducedModel.load(resources / "reduced_model.npz"), _read(resources / "start.json")
     own = {name: value for name, value in start.items() if not name.startswith("effect.")}
+    table, roles = structure_table(model, own)
+    later = later_outputs(table, roles)
     if not (resources / "effects.json").is_file():
-        table, roles = structure_table(model, own)
-        return Contents(table, lambda: StructureBehaviour(model, table, roles), later_outputs(table, roles))
+        return Contents(table, lambda: StructureBehaviour(model, table, roles), later)
     # a plain structure needs nothing of these
-    from .effect_variables import TEMPERATURE, effect_rows
+    from .effect_variables import effect_rows
     from .patched_behaviour import PatchedBehaviour
 
-    temperature = own.pop(TEMPERATURE, 0.0)
-    table, roles = structure_table(model, own)
     record = _read(resources / "effects.json")
     effects, channels = record["effects"], tuple((name, quantity) for name, quantity in record["channels"])
     steps = None
@@ -39,9 +38,9 @@ def load_contents(resources: Path) -> Contents:
 
         steps = partial(PatchedSteps, model, PatchedWing(PatchArrays.load(arrays)))
     return Contents(
-        table + effect_rows(effects, len(table), {**start, TEMPERATURE: temperature}),
+        table + effect_rows(effects, len(table), start),
         lambda: PatchedBehaviour(model, table, roles, effects, channels, steps),
-        later_outputs(table, roles),
+        later,
     )
 
 
