@@ -6,7 +6,7 @@ NumPy and relative imports only: this file is copied into the FMU. The equations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isfinite, sqrt
+from math import sqrt
 
 import numpy as np
 import numpy.typing as npt
@@ -192,13 +192,8 @@ class ReducedModel(ReducedArrays):
         OutsideModelError
             If one lies outside; the sentence names it and its range.
         """
-        for value, (low, high) in zip(values, self._limits, strict=True):
-            if not low <= value <= high:
-                break
-        else:
-            return
         for name, value, (low, high) in zip(self.chosen, values, self._limits, strict=True):
-            if not (isfinite(value) and low <= value <= high):
+            if not low <= value <= high:
                 raise OutsideModelError(
                     f"{name} must lie between {low:g} and {high:g}, the range of the reduced model of "
                     f"{self.name}, but is {float(value)!r}; give a value inside, or reduce it for a wider "

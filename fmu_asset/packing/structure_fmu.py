@@ -14,14 +14,14 @@ from typing import Literal, TypedDict, Unpack
 
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import WING, DigitalState
+from fe.runtime.state import DigitalState
 from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
 from fmu_asset.compiled.compiler import PLATFORM, Platform
 from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
-from fmu_asset.slaves.table import Roles, structure_table
+from fmu_asset.slaves.table import Roles, is_wing, structure_table
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .contents import (
@@ -181,7 +181,7 @@ def _template(
 ) -> dict[str, bytes]:
     """Return the files of an FMU with the placeholder in them, but for start values and effects."""
     name = stem_of(model)
-    description = _OF_THE_WING if model.name == WING else _OF_A_STRUCTURE.format(model.name)
+    description = _OF_THE_WING if is_wing(model) else _OF_A_STRUCTURE.format(model.name)
     description = f"{description} {note}".strip()
     if kind == "python":
         return python_members(

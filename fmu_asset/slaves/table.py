@@ -56,6 +56,11 @@ class Roles:
     load_point: str | None = None
 
 
+def is_wing(model: ReducedModel) -> bool:
+    """Return whether a model is that of a wing, and no structure that only bears its name."""
+    return model.name == WING and len(model.followed_shapes) > 0
+
+
 def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tuple[FmuVariable, ...], Roles]:
     """Return the table, inputs, parameters and outputs, and which of its rows is what.
 
@@ -74,7 +79,7 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
     for name in (*model.controls, *model.parameters):
         if name in RESERVED:
             raise ValueError(f"a structure with an FMU can have no control or parameter named {name!r}")
-    table, wing = Table(start), model.name == WING
+    table, wing = Table(start), is_wing(model)
     texts = _OF_THE_WING if wing else {}
     nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
     validity = model.validity

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import WING
 from fe.runtime.transient import ModalIntegrator
 from fe.structure.operators import Structure
 from fmu_asset.archive.fmu_file import read_fmu
@@ -16,6 +18,7 @@ from fmu_asset.check.file import check_file
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.structure_fmu import build_fmu, fmu_bytes
+from fmu_asset.slaves.table import structure_table
 from fmu_asset.structures.binding import structure_binding
 
 
@@ -102,6 +105,12 @@ def test_the_check_of_the_file_finds_nothing(fmu: Path) -> None:
     findings = {finding.check: finding.verdict for finding in check_file(read_fmu(fmu))}
     assert set(findings.values()) == {"ok"}
     assert {"fmpy validate", "content", "units", "ranges"} <= set(findings)
+
+
+def test_a_structure_of_the_wings_name_is_no_wing(model: ReducedModel) -> None:
+    table, roles = structure_table(replace(model, name=WING), {})
+    assert roles.displacement_bound == "displacement_error_bound"
+    assert [row.name for row in table] == [row.name for row in structure_table(model, {})[0]]
 
 
 def test_equal_models_make_equal_bytes_and_bad_starts_are_refused(model: ReducedModel, fmu: Path) -> None:
