@@ -217,7 +217,8 @@ def stem_of(model: ReducedModel) -> str:
 
 def _units(table: tuple[FmuVariable, ...]) -> tuple[Unit, ...]:
     """Return the units of the table; of a control's unit that is not known no more than its name is told."""
-    known = (*UNITS, _ACCELERATION, *units_of(table))
+    moving = any(row.unit == _ACCELERATION.name for row in table)
+    known = (*UNITS, *((_ACCELERATION,) if moving else ()), *units_of(table))
     names = {unit.name for unit in known}
     others = sorted({row.unit for row in table if row.unit is not None} - names)
     return (*known, *(Unit(name) for name in others))
