@@ -286,14 +286,7 @@ def channel_list() -> dict[str, Channel]:
 
 
 def _trial(name: str, kind: TrialKind, time: FloatArray, **given: object) -> Trial:
-    count, names = len(time), tuple(channel_list())
-    zero = np.zeros(count)
-    base = {
-        "values": np.zeros((count, len(names))), "used": np.ones((count, len(names)), dtype=bool),
-        "force": zero, "load_factor": zero, "load_place": "tip_load", "temperature": zero, "start": 0.0,
-        "run": "A", "health": np.zeros((count, 2)), "health_deviation": np.zeros((count, 2)),
-    }  # fmt: skip
-    return Trial(name=name, kind=kind, channels=names, time=time, **{**base, **given})  # type: ignore[arg-type]
+    return Trial.plain(name, kind, tuple(channel_list()), time, **{"run": "A", **given})
 
 
 def campaign() -> Campaign:

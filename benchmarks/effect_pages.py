@@ -12,11 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.effect_pictures import draw, picture_of, picture_patch, picture_setting
-from discrepancy.catalogue import outflow
-from discrepancy.catalogue.building import KIND_NAMES
+from benchmarks.effect_pictures import FLOWS, draw, picture_of, picture_patch, picture_setting
 from discrepancy.catalogue.entry import Effect, Prior, Setting
 from discrepancy.catalogue.library import library
+from discrepancy.catalogue.needs import KIND_NAMES
 from reporting.files import atomic_write_bytes, atomic_write_text
 
 FOLDER = Path(__file__).parents[1] / "docs" / "effects"
@@ -47,7 +46,7 @@ def rounded(value: Any) -> Any:
 
 def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     """Return the page of an effect."""
-    tank = effect in outflow.EFFECTS
+    tank = effect.identifier in FLOWS
     on, what = ("on the tank", "A tank") if tank else ("on the cantilever", "A uniform cantilever")
     names = {other.identifier: other.name for other in library()}
     kinds = [name for kind, name in KIND_NAMES.items() if kind in effect.acts_on]
@@ -148,7 +147,7 @@ def pages() -> dict[str, str]:
     texts, beam = paragraphs(), picture_setting()
     made = {
         f"{effect.identifier}.md": page(
-            effect, texts[effect.identifier], picture_setting(effect) if effect in outflow.EFFECTS else beam
+            effect, texts[effect.identifier], picture_setting(effect) if effect.identifier in FLOWS else beam
         )
         for effect in library()
     }

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from benchmarks.cantilever import Cantilever, campaign
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Quantity, Trial
-from discrepancy.catalogue import outflow
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
@@ -22,6 +21,8 @@ from reporting.figures import PREDICTION, REFERENCE, new_figure, publication_sty
 
 FloatArray = NDArray[np.float64]
 RESOLUTION = 88.0
+FLOWS = ("outflow", "overflow")
+"""Effects that act on a store, not on a structure."""
 
 # Factor and unit of each quantity in a picture.
 UNITS = {
@@ -320,7 +321,7 @@ def picture_of(effect: Effect) -> Picture:
 
 def picture_setting(effect: Effect | None = None) -> Setting:
     """Return the setting of a picture: the cantilever, or for flows a tank."""
-    if effect in outflow.EFFECTS:
+    if effect is not None and effect.identifier in FLOWS:
         return tank_setting()
     given, model = campaign(), Cantilever()
     return Setting(given, model, model.scales(given))

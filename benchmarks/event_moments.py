@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from discrepancy.location.change_points import segments_of
+from discrepancy.missing_force.events import Events, events
+from discrepancy.missing_force.windows import of_series
 
 FloatArray = NDArray[np.float64]
 
@@ -63,6 +64,12 @@ def record(
     return time, values, (begin, end) if np.isfinite(end) else (begin,)
 
 
+def found_in(time: FloatArray, values: FloatArray) -> Events:
+    """Return the events of a record."""
+    one, _ = of_series("record", time, values[:, None], np.ones((len(values), 1), bool))
+    return events(one.view, 0, one.processes[0])
+
+
 def main() -> None:
     """Print the counts."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -76,18 +83,15 @@ def main() -> None:
         found: dict[str, int] = defaultdict(int)
         for _ in range(chosen.count):
             time, values, truth = record(generator, kind)
-            segments = segments_of(
-                values[:, None], np.ones((len(values), 1), bool), time, np.array([FREEDOM])
-            )
-            moments = [item.begin for item in segments if item.begin is not None]
+            moments = found_in(time, values).moments(0)
             for true in truth:
                 found["moments"] += 1
-                if not moments:
+                if not len(moments):
                     found["missed"] += 1
                     continue
-                near = min(moments, key=lambda item: abs(item.value - true))
-                found["close"] += abs(near.value - true) <= 0.01 * (time[-1] - time[0])
-                found["held"] += near.low <= true <= near.high
+                value, low, high = min(moments, key=lambda item: abs(item[0] - true))
+                found["close"] += abs(value - true) <= 0.01 * (time[-1] - time[0])
+                found["held"] += low <= true <= high
             found["others"] += max(0, len(moments) - len(truth))
         total = found["moments"]
         print(
@@ -97,8 +101,7 @@ def main() -> None:
     false = 0
     for _ in range(2 * chosen.count):
         time, values, _ = record(generator, None)
-        found_here = segments_of(values[:, None], np.ones((len(values), 1), bool), time, np.array([FREEDOM]))
-        false += len(found_here) > 1 or bool(found_here[0].holds.any())
+        false += bool(found_in(time, values).paths[0].any())
     print(f"quiet records with an event: {false} of {2 * chosen.count}")
     print(f"{clock.perf_counter() - began:.0f} s")
 

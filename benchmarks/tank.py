@@ -51,15 +51,10 @@ def tank_setting() -> Setting:
     """Return a driven trial of a tank as it is, without noise."""
     model = LumpedModel(parse_lumped(tomllib.loads(MODEL)))
     time = np.arange(0.0, 300.0, 2.0)
-    zero, pair = np.zeros(len(time)), np.zeros((len(time), 2))
     pump = RecordedInput("pump", Quantity.FLOW, 0.15 * (np.sin(0.04 * time) > 0.0), Hold.ZERO_ORDER)
-    trial = Trial(
-        name="filled and drained", kind=TrialKind.DRIVEN, channels=("level",),
-        values=np.zeros((len(time), 1)),
-        used=np.ones((len(time), 1), dtype=bool), time=time, force=zero, load_factor=zero,
-        load_place="tip_load", temperature=zero, start=0.0, run="", health=pair, health_deviation=pair,
-        begins=Start.STILL, inputs=(pump,),
-    )  # fmt: skip
+    trial = Trial.plain(
+        "filled and drained", TrialKind.DRIVEN, ("level",), time, begins=Start.STILL, inputs=(pump,)
+    )
     channel = Channel("level", Quantity.LEVEL, "level", NoiseRecord(0.01, np.inf))
     campaign = Campaign("Tank", {"level": channel}, (trial,), None, {}, "")
     trial.values[:] = observe(model, campaign, trial, ModelPatch(), Conditions(np.ones(1))).values

@@ -16,9 +16,9 @@ from discrepancy.files.patch import (
     PATCHED,
     StoredPatch,
     fmu_outputs,
-    primitive_intervals,
+    patch_effects,
     read_patch,
-    store_patch,
+    write_patch,
 )
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.files.verdict import VERDICT_NAME, StoredVerdict, read_verdict
@@ -146,7 +146,7 @@ def apply_verdict(
         pack_patched(choice, patch, path, activate=True, replace=replace, progress=progress)
         return Applied(path, sentence, "")
     else:
-        store_patch(path, patch)
+        write_patch(path, patch)
     return Applied(path, sentence, _again(stored.origin.command, path))
 
 
@@ -170,12 +170,10 @@ def _found(stored: StoredVerdict, file: Path, member: str | None) -> StoredPatch
         raise DiscrepancyError(
             f"{file} gives nothing to apply: {NOTHING.get(verdict.kind, 'it lacks what it names')}."
         )
-    intervals = tuple(primitive_intervals(effect.patch) for effect in best.effects)
     residuals = file.parent / RESIDUALS_NAME
     channels = fmu_outputs(read_residuals(residuals).channels) if residuals.is_file() else {}
-    return StoredPatch(
-        best.effects, intervals, stored.origin, channels, verdict.kind, parameters=best.parameters
-    )
+    effects = patch_effects(best.effects)
+    return StoredPatch(verdict.kind, "", effects, channels, best.parameters, stored.origin)
 
 
 def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:

@@ -134,6 +134,20 @@ class SearchSettings:
     related_starts: int = 2
     """Of these, how many begin a fit."""
 
+    # ---------------------------------------------------------------- named by the missing force
+    followed: float = 25.0
+    """Sets of effects within this log evidence of the best one, along the missing force, are fitted."""
+    least_end: float = 0.25
+    """Lower end of the share of the missing force that a name in part needs."""
+    contenders: float = 12.0
+    """Those within this are compared by the share of the missing force that they are."""
+    slim: float = 0.01
+    """Share of the missing force below which a further effect or a shape of its own is no part of a name;
+    three times it where they were fitted, as any freedom gains there."""
+    force_rival: float = 10.0
+    """Log evidence within which another effect is no worse along the missing force, whose motion is taken as
+    known: unless trials that were not fitted tell them apart."""
+
     # ---------------------------------------------------------------- weighed with a remainder
     weighed_sets: tuple[int, ...] = (8, 4, 2)
     """Sets of one, two and three effects whose remainders are looked at."""

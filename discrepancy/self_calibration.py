@@ -265,9 +265,7 @@ def _investigated(
     generator = np.random.default_rng(seed)
     try:
         campaign = simulator.simulate(hidden, generator)
-    except (
-        ModelError
-    ):  # at the edge of what the structure carries: the effect at its mean conditions is known to go
+    except ModelError:  # at the edge of what the structure carries: it goes at its mean conditions
         generator = np.random.default_rng(seed.spawn(1)[0])
         campaign = simulator.simulate(hidden, generator)
     found = investigate(campaign, simulator.model, effects, thorough=False).verdict
@@ -344,14 +342,7 @@ def outcomes(found: SelfCalibration, *, null: bool) -> list[str]:
     """Return the outcomes that occurred, "right" and "wrong" always, in a fixed order."""
     counts = Counter(case.outcome for case in found.cases if (case.hidden == NOTHING) is null)
     order = (
-        "right",
-        "wrong",
-        "group",
-        "in part",
-        "family",
-        "missed",
-        "unexplained",
-        "below detectability",
+        "right", "wrong", "group", "in part", "family", "missed", "unexplained", "below detectability",
         "data error",
-    )
+    )  # fmt: skip
     return [name for name in order if counts[name] or name in ("right", "wrong")]

@@ -6,7 +6,6 @@ from enum import StrEnum
 from math import nan
 
 from .document_types import Number, Patch
-from .location.change_points import GapWindow
 
 
 class VerdictKind(StrEnum):
@@ -20,6 +19,45 @@ class VerdictKind(StrEnum):
     UNEXPLAINED = "unexplained"  # a gap that no hypothesis fits
     DATA_ERROR = "data error"  # the data are at fault
     BELOW_LIMIT = "below detectability"  # something may be there, too small for these data
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When something changed [s since the trial's start]: posterior median and 90 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class GapWindow:
+    """A stretch of a record in which something acts that the model lacks.
+
+    Attributes
+    ----------
+    trial : str
+        Whose record.
+    channels : tuple of str
+        Those that show it.
+    begin, end : Moment or None
+        Since when, until when; None where it is there from the first sample on, or to the last.
+    first, last : float
+        Times of the first and the last sample of the record [s].
+    size : float
+        Root mean square of what it does to the readings over their noise, of the channel with the largest.
+    with_effect : bool
+        Whether it is left by the best hypothesis; else by the model as it was.
+    """
+
+    trial: str
+    channels: tuple[str, ...]
+    begin: Moment | None
+    end: Moment | None
+    first: float
+    last: float
+    size: float
+    with_effect: bool = False
 
 
 @dataclass(frozen=True)

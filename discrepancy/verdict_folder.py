@@ -6,20 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from discrepancy.files.document import Origin
-from discrepancy.files.patch import PATCH_NAME, PATCHED, fmu_outputs, primitive_intervals, write_patch
+from discrepancy.files.patch import PATCH_NAME, PATCHED, StoredPatch, fmu_outputs, patch_effects, write_patch
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
 from discrepancy.files.verdict import VERDICT_NAME, write_verdict
 from discrepancy.judgement.conclusion import named_effects
-from discrepancy.judgement.separability import Separability
 from discrepancy.report.content import ReportInput
 from discrepancy.report.figures import draw, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label
-from discrepancy.self_calibration import SELF_CALIBRATION_NAME, SelfCalibration, write_self_calibration
+from discrepancy.self_calibration import SELF_CALIBRATION_NAME, write_self_calibration
 from discrepancy.verdict import VerdictKind
-from discrepancy.workflow import Investigation, patch_draws
-from fe.wing.design import WingDesign
+from discrepancy.workflow import patch_draws
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_png
 from reporting.files import atomic_write_bytes, atomic_write_text, write_error
@@ -33,30 +30,15 @@ Pack = Callable[[Path, Path], str]
 
 
 @dataclass(frozen=True)
-class VerdictContent:
-    """What is written.
+class VerdictContent(ReportInput):
+    """What is written: what the report shows, and more.
 
     Attributes
     ----------
-    investigation : Investigation
-        What came out.
-    origin : Origin
-        What it came from.
-    separability : Separability, optional
-        What the campaign can decide.
-    self_calibration : SelfCalibration, optional
-        Where it was asked for.
-    design : WingDesign, optional
-        Of a wing, for the map.
     pack : callable, optional
         Makes the patched FMU; called where an effect is named.
     """
 
-    investigation: Investigation
-    origin: Origin
-    separability: Separability | None = None
-    self_calibration: SelfCalibration | None = None
-    design: WingDesign | None = None
     pack: Pack | None = None
 
 
@@ -136,24 +118,19 @@ def _move(fresh: Path, folder: Path) -> None:
 
 
 def _write(folder: Path, content: VerdictContent, *, report: bool) -> None:
-    found = content.investigation
-    verdict, origin = found.verdict, content.origin
+    found, origin = content.investigation, content.origin
+    verdict = found.verdict
     write_verdict(folder / VERDICT_NAME, verdict, found.proof, origin)
-    page = ReportInput(found, origin, content.separability, (), content.design, content.self_calibration)
     if found.problem is not None and found.fit is not None and found.fit.candidate.terms:
-        effects = named_effects(found.problem, found.fit)
-        draws = patch_draws(found.problem, found.fit, origin.provenance.seed or 0)
         if verdict.kind in PATCHED:
-            page = replace(
-                page,
-                intervals=[primitive_intervals(e.patch, d) for e, d in zip(effects, draws, strict=True)],
-            )
-            write_patch(
-                folder / PATCH_NAME, effects, origin, draws, fmu_outputs(found.campaign.channels),
-                verdict=verdict.kind, sentence=verdict.sentence, parameters=verdict.parameters,
-            )  # fmt: skip
+            draws = patch_draws(found.problem, found.fit, origin.provenance.seed or 0)
+            effects = patch_effects(named_effects(found.problem, found.fit), draws)
+            content = replace(content, intervals=[effect.intervals for effect in effects])
+            outputs = fmu_outputs(found.campaign.channels)
+            patch = StoredPatch(verdict.kind, verdict.sentence, effects, outputs, verdict.parameters, origin)
+            write_patch(folder / PATCH_NAME, patch)
         if verdict.kind is VerdictKind.NAMED and content.pack is not None:
-            page = replace(page, fmu=content.pack(folder / PATCH_NAME, folder / FMU_NAME))
+            content = replace(content, fmu=content.pack(folder / PATCH_NAME, folder / FMU_NAME))
     if found.after is not None:
         label = added_label(found) or "nothing added"
         write_residuals(
@@ -165,9 +142,9 @@ def _write(folder: Path, content: VerdictContent, *, report: bool) -> None:
         write_self_calibration(folder / SELF_CALIBRATION_NAME, content.self_calibration, origin)
     if not report:
         return
-    figures = report_figures(page)
+    figures = report_figures(content)
     drawings = draw(figures)
     for name, item in figures.items():
         atomic_write_bytes(folder / FIGURES / f"{name}.svg", drawings[name])
         atomic_write_bytes(folder / FIGURES / f"{name}.png", to_png(item.figure))
-    atomic_write_text(folder / REPORT_NAME, render_report(page, drawings, figures))
+    atomic_write_text(folder / REPORT_NAME, render_report(content, drawings, figures))

@@ -13,9 +13,9 @@ import numpy as np
 from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
-from discrepancy.catalogue.building import NO_PORT
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import load_catalogue
+from discrepancy.catalogue.needs import NO_PORT
 from discrepancy.checks.fault import DataFault
 from discrepancy.checks.outliers import wrong_ends
 from discrepancy.checks.quality import check_against_model, check_data, mark_outliers
@@ -31,10 +31,11 @@ from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
 from discrepancy.judgement.when import acting_sentence, begins_inside, when_sentence
-from discrepancy.location.change_points import GapWindow, gap_windows
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.force import MissingForce, missing_force
+from discrepancy.missing_force.naming import ForceSearch, key_of, sees_forces
+from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wrapped import innermost
@@ -43,10 +44,10 @@ from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from fe.runtime.patch import ModelPatch
 from reporting.words import be
 
-from .errors import CampaignDataError
+from .errors import CampaignDataError, DiscrepancyError
 from .model_choice import load_model
 from .search_settings import SEARCH
-from .verdict import Experiment, NotFitted, Proof, Verdict, VerdictKind
+from .verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
 
 DRAWS = 400
 IMPLAUSIBLE = 4.0
@@ -201,17 +202,15 @@ def investigate(
     if thorough:
         with stage("Locating the gap", "locate"):
             location = locate(before, seed=seed)
-            windows = location.windows
+            windows = gap_windows(problem, fit, before, seed=seed)
             if after is not before:
-                windows += gap_windows(after, seed=seed, with_effect=True)
+                windows += residual_windows(after, seed=seed, with_effect=True)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     missing = None
     if thorough and verdict.kind not in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT):
         with stage("Seeing the missing force", "force"):
-            missing = missing_force(
-                problem, fit, [item for item in catalogue if item.unavailable(setting) is None]
-            )
+            missing = _missing(problem, search, fit)
     proof = None
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
@@ -240,6 +239,27 @@ def investigate(
         seconds,
         missing,
     )
+
+
+def _missing(problem: Problem, search: Search, fit: CandidateFit) -> MissingForce | None:
+    """Return the missing force, with the law of a verdict drawn through it; None where none can be seen."""
+    try:
+        force = search.force
+        terms = fit.candidate.terms
+        if terms and not any(term.place in problem.model.ports() for term in terms):
+            return None
+        if force is None:
+            if not sees_forces(problem):
+                return None
+            force = ForceSearch(problem)
+            force.locate()
+        key = key_of(fit.candidate)
+        found = next((item for item in search.forces if key_of(item.candidate) == key), None)
+        if found is None and terms:
+            found = force.followed(force.whole, fit.candidate, fit.point.effect)
+        return missing_force(force, force.whole if found is None else found)
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # it is shown, and no verdict rests on it
+        return None
 
 
 def _dated(verdict: Verdict, windows: tuple[GapWindow, ...]) -> str:

@@ -38,6 +38,16 @@ class Column:
     numeric: bool = False
 
 
+def columns(*heads: Column | str) -> tuple[Column, ...]:
+    """Return columns; a plain heading is one of text."""
+    return tuple(Column(head) if isinstance(head, str) else head for head in heads)
+
+
+def numbers(name: str, unit: str = "") -> Column:
+    """Return a column of numbers."""
+    return Column(name, unit, numeric=True)
+
+
 @dataclass(frozen=True)
 class Table:
     """A table of ready text; numbers are formatted by whoever knows what their digits mean.

@@ -84,12 +84,13 @@ def shown(value: object) -> str:
 def _sentence(error: ValidationError, what: str, first_index: int) -> str:
     found = error.errors(include_url=False)
     # A misspelt key shows up twice, as unknown and as missing: the unknown one tells more.
-    for kind, one, several in (
-        ("extra_forbidden", f"is not a key of {what}; remove it or correct its spelling",
+    for kinds, one, several in (
+        (("extra_forbidden", "unexpected_keyword_argument"),
+         f"is not a key of {what}; remove it or correct its spelling",
          f"are not keys of {what}; remove them or correct their spelling"),
-        ("missing", "is missing", "are missing"),
+        (("missing", "missing_argument"), "is missing", "are missing"),
     ):  # fmt: skip
-        if places := [shown(_written(item["loc"], first_index)) for item in found if item["type"] == kind]:
+        if places := [shown(_written(item["loc"], first_index)) for item in found if item["type"] in kinds]:
             return f"{listing(places)} {several if places[1:] else one}"
     first = found[0]
     place = _written(first["loc"], first_index)

@@ -104,7 +104,7 @@ def run(
     )  # fmt: skip
     pack = None if choice.design is None else _packing(choice, progress)
     origin = _origin(data, choice, command, seed, effects or [])
-    content = VerdictContent(found, origin, able, tried, choice.design, pack)
+    content = VerdictContent(found, origin, able, tried, choice.design, pack=pack)
     with progress.stage("Writing the verdict"):
         place = write_verdict_folder(folder, content, replace_it=replace, report=not no_report)
     if json:
@@ -288,7 +288,7 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
     console.print(headline(verdict), soft_wrap=True)
     if (patch_file := folder / PATCH_NAME).is_file():
         stored = read_patch(patch_file)
-        if sizes := size_sentence(found, stored.effects, stored.intervals):
+        if sizes := size_sentence(found, stored.effects, [effect.intervals for effect in stored.effects]):
             console.print(sizes, soft_wrap=True)
     for sentence in (shares_sentence(verdict), remainders_sentence(verdict)):
         if sentence:

@@ -123,18 +123,4 @@ def _split(trial: Trial, names: set[str]) -> tuple[Trial, Trial] | None:
     name = f"{trial.name}, levels held out"
     while name in names:
         name += "'"
-    return _rows(trial, ~spared), replace(_rows(trial, spared), name=name, held_out=True)
-
-
-def _rows(trial: Trial, rows: np.ndarray) -> Trial:
-    return replace(
-        trial,
-        values=trial.values[rows],
-        used=trial.used[rows],
-        time=trial.time[rows],
-        force=trial.force[rows],
-        load_factor=trial.load_factor[rows],
-        temperature=trial.temperature[rows],
-        health=trial.health[rows],
-        health_deviation=trial.health_deviation[rows],
-    )
+    return trial.rows(~spared), trial.rows(spared, name=name, held_out=True)

@@ -85,10 +85,7 @@ class NoiseModel:
         The best predictors of lower order, by the Levinson-Durbin recursion backwards.
         """
         weights: list[FloatArray] = []
-        coefficients, share = (
-            self.autoregression,
-            1.0,
-        )  # variance of the innovation over that of the prediction
+        coefficients, share = self.autoregression, 1.0  # of the innovation in the prediction's variance
         while coefficients.size:
             last = coefficients[-1]
             share *= 1.0 - last**2

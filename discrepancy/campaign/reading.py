@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from math import inf
 from pathlib import Path, PurePosixPath
@@ -78,7 +78,12 @@ def read_campaign(folder: str | Path) -> Campaign:
     if section.noise is not None:
         names.add(section.noise.file)
     for name in sorted(names):
-        _check_inside(name)
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
+            raise CampaignFileError(
+                f"The file {name!r} must lie in the campaign's folder: give its place in there, with forward "
+                "slashes."
+            )
     tables = {name: read_table(folder, name) for name in sorted(names - {CAMPAIGN_FILE})}
     data_hash = hash_record({name: hash_file(folder / name) for name in sorted(names)})
     return assemble(section, printed, tables, data_hash)
@@ -105,7 +110,13 @@ def assemble(
         _trial(trial, raw, tables[trial.file], section, remarks)
         for trial, raw in zip(section.trial, printed["trial"], strict=True)
     )
-    _check_every_channel_is_measured(section, trials, tables)
+    for channel in section.channel:
+        if not any(channel.name in trial.channels for trial in trials):
+            name = section.trial[0].file
+            raise CampaignFileError(
+                f"The channel {channel.name!r} is in no trial: no table has a column "
+                f"{channel.table_column!r}; the columns of {name} are {', '.join(tables[name].columns)}."
+            )
     channels = _channels(section, printed, tables, trials, remarks)
     remarks += remarks_on(channels, trials)
     return Campaign(
@@ -116,27 +127,25 @@ def assemble(
         parameters={name: (item.mean, item.deviation) for name, item in section.parameters.items()},
         data_hash=data_hash,
         loggers=section.loggers,
-        events=_events(section, trials),
+        events=tuple(_events(section, trials)),
         remarks=(*section.remarks, *(remark for remark in remarks if remark not in section.remarks)),
     )
 
 
-def _events(section: CampaignSection, trials: tuple[Trial, ...]) -> tuple[Event, ...]:
-    """Return the events; each must lie within the records of its trials."""
-    records = {trial.name: trial for trial in trials}
+def _events(section: CampaignSection, trials: tuple[Trial, ...]) -> Iterator[Event]:
+    """Yield the events; each must lie within the records of its trials."""
+    records = {trial.name: trial.time for trial in trials}
     for event in section.event:
-        for name in event.among(section.trial):
-            time = records[name].time
+        found = Event(event.name, event.among(section.trial), event.time, event.until)
+        for name in found.trials:
+            first, last = records[name][0], records[name][-1]
             for key, moment in (("time", event.time), ("until", event.until)):
-                if moment is not None and not time[0] <= moment <= time[-1]:
+                if moment is not None and not first <= moment <= last:
                     raise CampaignDataError(
                         f"The event {event.name!r} has {key} = {moment:g} s, but the record of the trial "
-                        f"{name!r} goes from {time[0]:g} to {time[-1]:g} s: times count from the trial's "
-                        "start."
+                        f"{name!r} goes from {first:g} to {last:g} s: times count from the trial's start."
                     )
-    return tuple(
-        Event(event.name, event.among(section.trial), event.time, event.until) for event in section.event
-    )
+        yield found
 
 
 def _read_section(folder: Path) -> tuple[CampaignSection, Mapping[str, Any]]:
@@ -148,27 +157,6 @@ def _read_section(folder: Path) -> tuple[CampaignSection, Mapping[str, Any]]:
     table = read_toml(path, CampaignFileError, what="campaign")
     printed = read_toml(path, CampaignFileError, what="campaign", parse_float=str)
     return parse_campaign(table, str(path)), printed
-
-
-def _check_inside(name: str) -> None:
-    path = PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
-        raise CampaignFileError(
-            f"The file {name!r} must lie in the campaign's folder: give its place in there, with forward "
-            "slashes."
-        )
-
-
-def _check_every_channel_is_measured(
-    section: CampaignSection, trials: tuple[Trial, ...], tables: Mapping[str, TextTable]
-) -> None:
-    for channel in section.channel:
-        if not any(channel.name in trial.channels for trial in trials):
-            name = section.trial[0].file
-            raise CampaignFileError(
-                f"The channel {channel.name!r} is in no trial: no table has a column "
-                f"{channel.table_column!r}; the columns of {name} are {', '.join(tables[name].columns)}."
-            )
 
 
 # ---------------------------------------------------------------- trials
@@ -234,14 +222,14 @@ def _inputs(
     """Return the recorded inputs of a driven or static trial: those whose columns are there."""
     if section.kind not in (TrialKind.DRIVEN, TrialKind.STATIC):
         return ()
-    found = []
-    for item in campaign.input:
-        if item.table_column not in table.columns:
-            continue
-        values = _numbers(table, item, user)
-        offset = si_value(repr(item.offset_deviation), item.quantity, item.unit)
-        found.append(RecordedInput(item.name, item.quantity, values, item.holds, offset, item.unit))
-    return tuple(found)
+    return tuple(
+        RecordedInput(
+            item.name, item.quantity, _numbers(table, item, user), item.holds,
+            si_value(repr(item.offset_deviation), item.quantity, item.unit), item.unit,
+        )
+        for item in campaign.input
+        if item.table_column in table.columns
+    )  # fmt: skip
 
 
 def _numbers(table: TextTable, item: ColumnSection, user: str, *, empty_allowed: bool = False) -> FloatArray:
@@ -339,43 +327,37 @@ def _health(section: TrialSection, table: TextTable, user: str) -> tuple[FloatAr
     health, deviation = np.zeros((len(table), 2)), np.zeros((len(table), 2))
     for index, name in enumerate(("z1", "z2")):
         stated = None if section.health is None else getattr(section.health, name)
-        if name in table.columns:
-            if stated is not None:
-                raise CampaignFileError(
-                    f"{user.capitalize()} gives {name} twice: remove it from `health` or from {table.name}."
-                )
-            health[:, index] = table.numbers(name, user)
-            outside = np.flatnonzero((health[:, index] < 0.0) | (health[:, index] > 1.0))
-            if outside.size:
-                raise CampaignFileError(
-                    f"{table.name}, line {table.lines[int(outside[0])]}: {name} is a fraction from 0 to "
-                    "1, and "
-                    f"{health[outside[0], index]:g} came."
-                )
-        elif stated is not None:
-            health[:, index] = stated
-        if f"{name}_deviation" in table.columns:
-            deviation[:, index] = table.numbers(f"{name}_deviation", user)
-            negative = np.flatnonzero(deviation[:, index] < 0.0)
-            if negative.size:
-                raise CampaignFileError(
-                    f"{table.name}, line {table.lines[int(negative[0])]}: {name}_deviation is a standard "
-                    f"deviation, and {deviation[negative[0], index]:g} came."
-                )
-        elif section.health is not None:
-            deviation[:, index] = section.health.deviation
+        if name in table.columns and stated is not None:
+            raise CampaignFileError(
+                f"{user.capitalize()} gives {name} twice: remove it from `health` or from {table.name}."
+            )
+        health[:, index] = _within(table, name, user, 1.0, "a fraction from 0 to 1", stated)
+        usual = None if section.health is None else section.health.deviation
+        column = f"{name}_deviation"
+        deviation[:, index] = _within(table, column, user, inf, "a standard deviation", usual)
     return health, deviation
+
+
+def _within(
+    table: TextTable, name: str, user: str, most: float, what: str, stated: float | None
+) -> FloatArray | float:
+    """Return a column of numbers from zero to `most`, or what is stated where there is none."""
+    if name not in table.columns:
+        return stated or 0.0
+    values = table.numbers(name, user)
+    outside = np.flatnonzero((values < 0.0) | (values > most))
+    if outside.size:
+        row = int(outside[0])
+        raise CampaignFileError(
+            f"{table.name}, line {table.lines[row]}: {name} is {what}, and {values[row]:g} came."
+        )
+    return values
 
 
 def _release(section: ReleaseSection, displacement: str) -> Release:
     quantity = Quantity.DISPLACEMENT if section.unit in ("m", "mm", "um") else Quantity.SIGNAL
-    return Release(
-        displacement=si_value(displacement, quantity, section.unit),
-        deviation=section.deviation,
-        at_rest=section.at_rest,
-        mode_count=section.mode_count,
-        time_zero_deviation=section.time_zero_deviation,
-    )
+    given = section.model_dump(exclude={"displacement", "unit"})
+    return Release(si_value(displacement, quantity, section.unit), **given)
 
 
 # ---------------------------------------------------------------- channels
@@ -413,8 +395,7 @@ def _channels(
                 source=item.noise.source,
             )
         noise, remark = with_noise(channel, recorded, stated, trials)
-        if remark:
-            remarks.append(remark)
+        remarks += [remark] if remark else []
         channels[item.name] = replace(channel, noise=noise)
     return channels
 

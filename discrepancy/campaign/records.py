@@ -4,10 +4,10 @@
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,6 +189,10 @@ class Channel:
     column: str = field(default="", compare=False)
     unit: str = field(default="", compare=False)
 
+    def noise_in(self, trial: "Trial") -> float:
+        """Return the deviation of its noise in a trial [its unit], 0 where it is not known."""
+        return 0.0 if self.noise is None else self.noise.standard_deviation * trial.noise_factor
+
 
 @dataclass(frozen=True)
 class Release:
@@ -308,6 +312,33 @@ class Trial:
     inputs: tuple[RecordedInput, ...] = ()
     hold: Hold | None = None
     file: str = field(default="", compare=False)
+
+    @classmethod
+    def plain(
+        cls, name: str, kind: TrialKind, channels: tuple[str, ...], time: FloatArray, **given: Any
+    ) -> "Trial":
+        """Return a trial of which only this and `given` are said: readings of zero, no force, healthy."""
+        zeros, shape, pair = np.zeros(len(time)), (len(time), len(channels)), np.zeros((len(time), 2))
+        usual = {
+            "values": np.zeros(shape), "used": np.ones(shape, dtype=bool), "force": zeros,
+            "load_factor": zeros, "load_place": "tip_load", "temperature": zeros, "start": 0.0, "run": "",
+            "health": pair, "health_deviation": pair,
+        }  # fmt: skip
+        return cls(name, kind, channels, time=time, **{**usual, **given})
+
+    def rows(self, rows: BoolArray, **changes: Any) -> "Trial":
+        """Return the trial with some of its rows (N,) only, and other fields changed."""
+        parts = (
+            "values",
+            "used",
+            "time",
+            "force",
+            "load_factor",
+            "temperature",
+            "health",
+            "health_deviation",
+        )
+        return replace(self, **{part: getattr(self, part)[rows] for part in parts}, **changes)
 
     @property
     def input_names(self) -> tuple[str, ...]:

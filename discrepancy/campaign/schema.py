@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from keyword import iskeyword
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
 from discrepancy.campaign.units import conversion_of
@@ -29,6 +29,8 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Deviation = Annotated[float, Field(allow_inf_nan=False, ge=0.0)] | Literal["free"]
 MOST_MODES = 100
+_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
+"""What a list of the file becomes before it is checked."""
 
 
 class ParameterSection(Section):
@@ -167,8 +169,10 @@ class TrialSection(Section):
     load_place: Name | tuple[Number, Number] = Field(default="tip_load", union_mode="left_to_right")
     health: HealthSection | None = None
     release: ReleaseSection | None = None
-    channels: tuple[Name, ...] | None = None
-    left_out: dict[str, tuple[Annotated[int, Field(ge=1)], ...]] = Field(default_factory=dict)
+    channels: Annotated[tuple[Name, ...], _LIST] | None = None
+    left_out: dict[str, Annotated[tuple[Annotated[int, Field(ge=1)], ...], _LIST]] = Field(
+        default_factory=dict
+    )
     begins: Start | None = Field(default=None, strict=False)
     hold: Hold | None = Field(default=None, strict=False)
 
@@ -193,18 +197,6 @@ class TrialSection(Section):
             return tuple(value)
         return value
 
-    @field_validator("channels", mode="before")
-    @classmethod
-    def _tuple(cls, value: object) -> object:
-        return tuple(value) if isinstance(value, list) else value
-
-    @field_validator("left_out", mode="before")
-    @classmethod
-    def _tuples(cls, value: object) -> object:
-        if not isinstance(value, Mapping):
-            return value
-        return {key: tuple(rows) if isinstance(rows, list) else rows for key, rows in value.items()}
-
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.kind is not TrialKind.RINGDOWN and self.release is not None:
@@ -228,13 +220,8 @@ class EventSection(Section):
     name: Name
     time: NotNegative
     trial: Name | None = None
-    trials: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
+    trials: Annotated[tuple[Name, ...], Field(min_length=1), _LIST] | None = None
     until: Number | None = None
-
-    @field_validator("trials", mode="before")
-    @classmethod
-    def _tuple(cls, value: object) -> object:
-        return tuple(value) if isinstance(value, list) else value
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -274,24 +261,12 @@ class CampaignSection(Section):
     reference_temperature: Annotated[float, Field(allow_inf_nan=False, ge=-273.15)] | None = None
     parameters: dict[Name, ParameterSection] = Field(default_factory=dict)
     noise: NoiseFileSection | None = None
-    channel: tuple[ChannelSection, ...] = Field(min_length=1)
-    input: tuple[InputSection, ...] = ()
-    trial: tuple[TrialSection, ...] = Field(min_length=1)
-    event: tuple[EventSection, ...] = ()
-    remarks: tuple[str, ...] = ()
-    loggers: dict[Name, tuple[Name, ...]] = Field(default_factory=dict)
-
-    @field_validator("loggers", mode="before")
-    @classmethod
-    def _member_tuples(cls, value: object) -> object:
-        if not isinstance(value, Mapping):
-            return value
-        return {key: tuple(names) if isinstance(names, list) else names for key, names in value.items()}
-
-    @field_validator("channel", "input", "trial", "event", "remarks", mode="before")
-    @classmethod
-    def _tuple(cls, value: object) -> object:
-        return tuple(value) if isinstance(value, list) else value
+    channel: Annotated[tuple[ChannelSection, ...], Field(min_length=1), _LIST]
+    input: Annotated[tuple[InputSection, ...], _LIST] = ()
+    trial: Annotated[tuple[TrialSection, ...], Field(min_length=1), _LIST]
+    event: Annotated[tuple[EventSection, ...], _LIST] = ()
+    remarks: Annotated[tuple[str, ...], _LIST] = ()
+    loggers: dict[Name, Annotated[tuple[Name, ...], _LIST]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check(self) -> Self:

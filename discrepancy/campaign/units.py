@@ -31,20 +31,9 @@ _LONGEST = 40
 _PART = re.compile(r"([^\W\d_]+|[%‰°]|1)(?:\^?([+-]?\d))?")
 """One factor of a unit: a name and its power."""
 _WORDS = {
-    "chain",
-    "chains",
-    "dB",
-    "decade",
-    "hand",
-    "hands",
-    "link",
-    "links",
-    "octave",
-    "point",
-    "points",
-    "rod",
+    "chain", "chains", "dB", "decade", "hand", "hands", "link", "links", "octave", "point", "points", "rod",
     "rods",
-}
+}  # fmt: skip
 """What pint takes for lengths and ratios, and measuring programmes do not."""
 _NEVER_CONVERTED = {"degC", "°C", "K"}
 """Temperatures: a campaign has one of the two for all."""
@@ -196,11 +185,6 @@ def quantities_of(unit: str) -> tuple[Quantity, ...]:
             conversion_of(quantity, unit)
             found.append(quantity)
     return tuple(found)
-
-
-def units_of(quantity: Quantity) -> tuple[str, ...]:
-    """Return the usual units of a quantity."""
-    return UNITS[quantity].usual
 
 
 def si_value(text: str, quantity: Quantity, unit: str) -> float:

@@ -12,15 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.reading import CAMPAIGN_FILE
-from discrepancy.campaign.records import (
-    Campaign,
-    Channel,
-    Hold,
-    RecordedInput,
-    Start,
-    Trial,
-    TrialKind,
-)
+from discrepancy.campaign.records import Campaign, Channel, Hold, RecordedInput, Start, Trial, TrialKind
 from discrepancy.campaign.schema import FORMAT, input_columns
 from discrepancy.campaign.units import UNITS, in_unit, sum_text
 from discrepancy.errors import CampaignFileError
@@ -67,7 +59,8 @@ def write_campaign(campaign: Campaign, folder: str | Path, *, si: bool = False) 
             raise CampaignFileError(
                 f"A channel cannot be called {name!r} in a file, which is an input: rename it."
             )
-    files = [f"{number:02d}_{_slug(trial.name)}.csv" for number, trial in enumerate(campaign.trials, start=1)]
+    slugs = (re.sub(r"[^a-z0-9]+", "_", trial.name.lower()).strip("_")[:40] for trial in campaign.trials)
+    files = [f"{number:02d}_{slug or 'trial'}.csv" for number, slug in enumerate(slugs, start=1)]
     texts = {
         file: _trial_table(campaign, trial, si) for file, trial in zip(files, campaign.trials, strict=True)
     }
@@ -78,10 +71,6 @@ def write_campaign(campaign: Campaign, folder: str | Path, *, si: bool = False) 
     for name, text in texts.items():
         atomic_write_text(folder / name, text)
     return folder
-
-
-def _slug(name: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:40] or "trial"
 
 
 # ---------------------------------------------------------------- tables

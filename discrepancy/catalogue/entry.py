@@ -3,8 +3,9 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import exp, log
-from typing import Literal
+from typing import Annotated, Literal
 
+from pydantic import ConfigDict, Strict
 from scipy.special import ndtr, ndtri
 
 from discrepancy.campaign.records import Campaign, TrialKind
@@ -13,8 +14,9 @@ from fe.runtime.patch import ModelPatch
 
 NINETY = 1.6448536269514722
 """Standard normal quantile of 0.95."""
-
-
+Number = Annotated[float, Strict()]
+_ROW = ConfigDict(extra="forbid", allow_inf_nan=False, str_min_length=1)
+"""How a table of an entry is read as one of these records."""
 LEAST_SHRINKAGE = 0.3
 """A step takes no positive value below this share of itself."""
 
@@ -32,9 +34,11 @@ class Prior:
         See there.
     """
 
+    __pydantic_config__ = _ROW
+
     shape: Literal["log_normal", "normal", "uniform"]
-    low: float
-    high: float
+    low: Number
+    high: Number
 
     def value(self, u: float) -> float:
         """Return the value at the standard normal variable `u`."""
@@ -81,13 +85,15 @@ class EffectParameter:
         Number of values, evenly over the prior, at which fits may begin; 0 leaves the choice to the search.
     """
 
+    __pydantic_config__ = _ROW
+
     name: str
     symbol: str
     unit: str
     description: str
     prior: Prior
-    magnitude: bool = False
-    levels: int = 0
+    magnitude: Annotated[bool, Strict()] = False
+    levels: Annotated[int, Strict()] = 0
 
 
 @dataclass(frozen=True)
@@ -104,10 +110,12 @@ class ShapeParameter:
         Within the family.
     """
 
+    __pydantic_config__ = _ROW
+
     name: str
     symbol: str
     description: str
-    canonical: float
+    canonical: Number
     prior: Prior
 
 

@@ -2,38 +2,50 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from importlib.metadata import entry_points
 from pathlib import Path
 
-from discrepancy.catalogue import (
-    clock_and_lines,
-    damping,
-    hysteresis,
-    loads,
-    outflow,
-    sensors,
-    stiffness,
-    structure,
-)
-from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, ShapeParameter
-from discrepancy.catalogue.user_entries import effects_of_entry_points, effects_of_file
+from discrepancy.catalogue.effect_file import effects_of_file
+from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
+from discrepancy.catalogue.places import DYNAMIC
 from discrepancy.errors import CatalogueError
+from discrepancy.models.wrapped import follows_windows
+from fe.runtime.patch import SENSORS, ModelPatch, Window
 
+THEMES = (
+    "structure", "damping", "stiffness", "hysteresis", "outflow", "sensors", "loads", "clock_and_lines",
+)  # fmt: skip
+"""Files of the effects that come with the package, in their order."""
+GROUP = "uav_twin.effects"
+"""Group of the entry points: each a function without arguments that returns an Effect or several."""
 _IDENTIFIER = re.compile(r"[a-z][a-z0-9_]*")
 
 
+@cache
 def library() -> tuple[Effect, ...]:
     """Return the effects that come with the package, by theme."""
-    return (
-        *structure.EFFECTS,
-        *damping.EFFECTS,
-        *stiffness.EFFECTS,
-        *hysteresis.EFFECTS,
-        *outflow.EFFECTS,
-        *sensors.EFFECTS,
-        *loads.EFFECTS,
-        *clock_and_lines.EFFECTS,
-    )
+    folder = Path(__file__).parent
+    return tuple(effect for theme in THEMES for effect in effects_of_file(folder / f"{theme}.toml"))
+
+
+def effects_of_entry_points() -> tuple[Effect, ...]:
+    """Return the effects of installed packages; raises `CatalogueError` naming the entry point at fault."""
+    found: list[Effect] = []
+    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+        where = f"The entry point {point.name!r} of the group {GROUP!r}"
+        try:
+            given = point.load()()
+        except Exception as cause:
+            raise CatalogueError(f"{where} failed: {type(cause).__name__}: {cause}.") from cause
+        effects = tuple(given) if isinstance(given, Iterable) else (given,)
+        for effect in effects:
+            if not isinstance(effect, Effect):
+                raise CatalogueError(f"{where} must return effects, but returned a {type(effect).__name__}.")
+        found += effects
+    return tuple(found)
 
 
 def load_catalogue(extra: Iterable[Effect | Path] = (), *, installed: bool = True) -> tuple[Effect, ...]:
@@ -42,7 +54,7 @@ def load_catalogue(extra: Iterable[Effect | Path] = (), *, installed: bool = Tru
     Parameters
     ----------
     extra : iterable of Effect or Path
-        Further effects, or TOML files of them (`discrepancy.catalogue.user_entries`).
+        Further effects, or TOML files of them (`discrepancy.catalogue.effect_file`).
     installed : bool
         Whether the entry points of the group "uav_twin.effects" are asked as well.
 
@@ -68,12 +80,64 @@ def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
     return known[identifier]
 
 
+def in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
+    """Return the effects as they act while each event lasts, in the trials that have it; none without events.
+
+    They are hypotheses beside the others. The moments are those of the campaign, in held-out trials too;
+    nothing of them is fitted. Effects that cannot be switched, or whose law the model cannot switch, are left
+    out.
+    """
+    fitted = {trial.name for trial in setting.campaign.fitted}
+    events = [event for event in setting.campaign.events if fitted.intersection(event.trials)]
+    names = dict.fromkeys(event.name for event in events)
+    return tuple(
+        _during(effect, name, setting) for name in names for effect in effects if _switches(effect, setting)
+    )
+
+
+def _switches(effect: Effect, setting: Setting) -> bool:
+    """Whether an effect can act in windows of this model's trials."""
+    places = effect.places(setting)
+    if not places or not effect.acts_on & DYNAMIC:
+        return False
+    sizes = {item.name: item.prior.value(0.5) for item in effect.parameters}
+    patch = effect.patch(setting, sizes, places[0])
+    if not len(patch) or patch.has_windows or not all(item.in_windows for item in patch):
+        return False
+    return follows_windows(setting.model) or all(isinstance(item, SENSORS) for item in patch)
+
+
+def _during(effect: Effect, event: str, setting: Setting) -> Effect:
+    """Return an effect as it acts while an event lasts."""
+    windows = tuple(
+        Window(trial, item.time, item.until)
+        for item in setting.campaign.events
+        if item.name == event
+        for trial in item.trials
+    )
+    return replace(
+        effect,
+        identifier=f"{effect.identifier}_during_{event}",
+        name=f"{effect.name} during {event}",
+        acts_on=effect.acts_on & DYNAMIC,
+        build=partial(_build_during, effect, windows),
+    )
+
+
+def _build_during(
+    effect: Effect, windows: tuple[Window, ...], setting: Setting, values: Mapping[str, float], place: str
+) -> ModelPatch:
+    patch = effect.build(setting, values, place)
+    return ModelPatch(tuple(replace(item, windows=windows) for item in patch))
+
+
 def check(effects: Iterable[Effect]) -> None:
     """Raise `CatalogueError` at the first entry that is not sound, by itself or among the others."""
     effects = tuple(effects)
-    for effect in effects:
-        _check_one(effect)
     known = Counter(effect.identifier for effect in effects)
+    for effect in effects:
+        for fault in _faults(effect):
+            raise CatalogueError(f"The effect {effect.identifier!r}{fault}")
     for identifier, count in known.items():
         if count > 1:
             raise CatalogueError(f"The catalogue has {count} effects with the identifier {identifier!r}.")
@@ -86,38 +150,30 @@ def check(effects: Iterable[Effect]) -> None:
                 )
 
 
-def _check_one(effect: Effect) -> None:
-    where = f"The effect {effect.identifier!r}"
+def _faults(effect: Effect) -> Iterator[str]:
+    """Yield what is not sound in an entry, as a sentence goes on after its identifier."""
     if not _IDENTIFIER.fullmatch(effect.identifier):
-        raise CatalogueError(
-            f"{where} must have an identifier of lower-case letters, digits and underscores."
-        )
+        yield " must have an identifier of lower-case letters, digits and underscores."
     for field in ("name", "family", "equation", "signature", "reference"):
         if not getattr(effect, field).strip():
-            raise CatalogueError(f"{where} has no {field}.")
+            yield f" has no {field}."
     if not effect.acts_on:
-        raise CatalogueError(f"{where} does not say which trials it acts on.")
-    names = Counter([item.name for item in effect.parameters] + [item.name for item in effect.shape])
-    for name, count in names.items():
-        if count > 1:
-            raise CatalogueError(f"{where} has {count} parameters with the name {name!r}.")
+        yield " does not say which trials it acts on."
     if not effect.parameters:
-        raise CatalogueError(f"{where} has no parameters.")
+        yield " has no parameters."
     free: tuple[EffectParameter | ShapeParameter, ...] = (*effect.parameters, *effect.shape)
-    for parameter in free:
-        _check_prior(parameter.prior, f"{where}, parameter {parameter.name!r}")
+    for name, count in Counter(item.name for item in free).items():
+        if count > 1:
+            yield f" has {count} parameters with the name {name!r}."
+    for item in free:
+        where, prior = f", parameter {item.name!r}: ", item.prior
+        if not prior.low < prior.high:
+            yield f"{where}the prior must have low < high, but has {prior.low:g}, {prior.high:g}."
+        if prior.shape == "log_normal" and prior.low <= 0.0:
+            yield f"{where}a log-normal prior must have low > 0, but has {prior.low:g}."
     for shape in effect.shape:
         if not shape.prior.low < shape.canonical < shape.prior.high:
-            raise CatalogueError(
-                f"{where}: the canonical value {shape.canonical:g} of {shape.name!r} must lie between "
+            yield (
+                f": the canonical value {shape.canonical:g} of {shape.name!r} must lie between "
                 f"{shape.prior.low:g} and {shape.prior.high:g}."
             )
-
-
-def _check_prior(prior: Prior, where: str) -> None:
-    if not prior.low < prior.high:
-        raise CatalogueError(
-            f"{where}: the prior must have low < high, but has {prior.low:g}, {prior.high:g}."
-        )
-    if prior.shape == "log_normal" and prior.low <= 0.0:
-        raise CatalogueError(f"{where}: a log-normal prior must have low > 0, but has {prior.low:g}.")

@@ -50,7 +50,7 @@ def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
     series = np.column_stack([trial.values, *(item.values for item in trial.inputs)])
     for column, name in enumerate(trial.channels):
         channel = campaign.channels[name]
-        noise = 0.0 if channel.noise is None else channel.noise.standard_deviation * trial.noise_factor
+        noise = channel.noise_in(trial)
         others = np.delete(series, column, axis=1)
         for start, stop in held_spans(trial.values[:, column], trial.used[:, column], others, noise):
             yield DataFault(

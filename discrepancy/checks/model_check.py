@@ -156,7 +156,7 @@ def _scales(campaign: Campaign, predictions: dict[str, FloatArray]) -> dict[tupl
             used = trial.used[:, column]
             data, model = trial.values[used, column], predictions[trial.name][used, column]
             expected = _amplitude(model, trial)
-            noise = 0.0 if channel.noise is None else channel.noise.standard_deviation * trial.noise_factor
+            noise = channel.noise_in(trial)
             if expected <= _VISIBLE * largest[trial.name, channel.quantity] or expected == 0.0:
                 continue
             scale = _slope(data, model) if not trial.is_dynamic else _dynamic_scale(data, model, trial, used)
@@ -254,14 +254,11 @@ def _swaps_of(
         for row, own in enumerate(columns):
             channel = campaign.channels[names[row]]
             used = trial.used[:, own]
-            noise = 0.0 if channel.noise is None else channel.noise.standard_deviation * trial.noise_factor
+            noise = channel.noise_in(trial)
             for place, other in enumerate(columns):
+                predicted, offset = predictions[trial.name][used, other], channel.offset_deviation
                 misfit[row, place] += _misfit(
-                    trial.values[used, own],
-                    predictions[trial.name][used, other],
-                    noise,
-                    trial.is_dynamic,
-                    channel.offset_deviation,
+                    trial.values[used, own], predicted, noise, trial.is_dynamic, offset
                 )
     _, assigned = linear_sum_assignment(misfit)
     for row, place in enumerate(assigned):

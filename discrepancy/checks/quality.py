@@ -20,12 +20,11 @@ from discrepancy.checks.held_and_copied import copy_faults, held_faults, roughne
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers, mark_outliers
 from discrepancy.checks.rest import rest_faults
-from discrepancy.errors import CampaignDataError
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-__all__ = ["DataFault", "FaultKind", "check_against_model", "check_data", "mark_outliers", "require_sound"]
+__all__ = ["DataFault", "FaultKind", "check_against_model", "check_data", "mark_outliers"]
 
 CLIPPED_RUN = 3
 """Consecutive samples at the very extreme value that make a record clipped, if it gets there in a jump."""
@@ -76,13 +75,6 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     return tuple(faults)
 
 
-def require_sound(faults: tuple[DataFault, ...]) -> None:
-    """Raise `CampaignDataError` with the sentences of all fatal faults, if there are any."""
-    sentences = [fault.sentence for fault in faults if fault.fatal]
-    if sentences:
-        raise CampaignDataError(" ".join(sentences))
-
-
 # ---------------------------------------------------------------- noise
 
 
@@ -95,10 +87,7 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
     if found is not None:
         ratio = (found.standard_deviation / stated) ** 2
         freedom = min(record.degrees_of_freedom, 1e9)
-        tail = min(
-            fisher.sf(ratio, found.degrees_of_freedom, freedom),
-            fisher.cdf(ratio, found.degrees_of_freedom, freedom),
-        )
+        tail = min(side(ratio, found.degrees_of_freedom, freedom) for side in (fisher.sf, fisher.cdf))
         if 2.0 * tail < _ALPHA and not 1.0 / _NOISE_FACTOR**2 < ratio < _NOISE_FACTOR**2:
             yield _noise_fault(channel, stated, found.standard_deviation, "repeated trials scatter")
             return

@@ -9,7 +9,7 @@ from statistics import median
 from typing import NamedTuple
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
-from discrepancy.campaign.units import STANDARD_GRAVITY, si_value, units_of
+from discrepancy.campaign.units import STANDARD_GRAVITY, UNITS, si_value
 from discrepancy.checks.fault import DataFault, FaultKind
 
 FOREIGN: Mapping[Quantity, Mapping[str, float]] = {
@@ -79,7 +79,7 @@ def slip_between(scale: float, quantity: Quantity, stated: str = "", *, drive: b
     """
     if abs(log(abs(scale))) < log(LEAST / 1.1):
         return None
-    units = {*units_of(quantity), *([stated] if stated else [])}
+    units = {*UNITS[quantity].usual, *([stated] if stated else [])}
     sizes = {unit: si_value("1.0", quantity, unit) for unit in sorted(units)}
     sizes |= FOREIGN.get(quantity, {})
     slips = [

@@ -2,10 +2,10 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from math import nan
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema
@@ -87,16 +87,10 @@ class PatchDocument:
 
 
 @dataclass(frozen=True)
-class StoredPatch:
-    """Content of patch.json, as `PatchDocument`: effects, intervals of their primitives, origin, the rest."""
+class StoredPatch(PatchDocument):
+    """Content of patch.json."""
 
-    effects: tuple[NamedEffect, ...]
-    intervals: tuple[tuple[PrimitiveInterval, ...], ...]
     origin: Origin
-    channels: Mapping[str, str] = field(default_factory=dict)
-    verdict: VerdictKind = VerdictKind.NAMED
-    sentence: str = ""
-    parameters: tuple[CalibratedParameter, ...] = ()
 
     @property
     def patch(self) -> ModelPatch:
@@ -107,13 +101,13 @@ class StoredPatch:
         """Return this patch and the one that was built into its model, for the model that had neither."""
         if earlier is None:
             return self
+        beneath = replace(
+            self.origin, model_file=earlier.origin.model_file, model_hash=earlier.origin.model_hash
+        )
         return replace(
             self,
             effects=earlier.effects + self.effects,
-            intervals=earlier.intervals + self.intervals,
-            origin=replace(
-                self.origin, model_file=earlier.origin.model_file, model_hash=earlier.origin.model_hash
-            ),
+            origin=beneath,
             channels={**earlier.channels, **self.channels},
         )
 
@@ -150,70 +144,46 @@ def primitive_intervals(patch: ModelPatch, draws: Sequence[ModelPatch] = ()) -> 
     return tuple(found)
 
 
-def write_patch(
-    path: Path,
-    effects: Sequence[NamedEffect],
-    origin: Origin,
-    draws: Sequence[Sequence[ModelPatch]] = (),
-    channels: Mapping[str, str] | None = None,
-    *,
-    verdict: VerdictKind = VerdictKind.NAMED,
-    sentence: str = "",
-    parameters: tuple[CalibratedParameter, ...] = (),
-) -> Path:
-    """Write patch.json, whole or not at all.
+def patch_effects(
+    effects: Sequence[NamedEffect], draws: Sequence[Sequence[ModelPatch]] = ()
+) -> tuple[PatchEffect, ...]:
+    """Return effects with the intervals of their primitives.
 
     Parameters
     ----------
-    path : Path
-        Destination.
     effects : sequence of NamedEffect
-        What the patch stands for.
-    origin : Origin
-        What it was found from.
+        In order.
     draws : sequence of sequence of ModelPatch, optional
         For each effect, in order: its patch at draws of the posterior. Without, intervals are null.
-    channels : mapping of str to str, optional
-        Outputs of the wing FMU by the names of channels, as `fmu_outputs` returns them: by it the FMU knows
-        what the patch's sensors are.
-    verdict : VerdictKind
-        On what the patch rests: a name, a family, or a group of which it is the most probable member.
-    sentence : str
-        The verdict in words.
-    parameters : tuple of CalibratedParameter
-        Of the model, beside these effects.
 
     Raises
     ------
-    VerdictFileError, reporting.errors.FileNotWrittenError
-        As `write_verdict` and `primitive_intervals`.
+    VerdictFileError
+        As `primitive_intervals`, or if there are not draws of each effect.
     """
     if draws and len(draws) != len(effects):
         raise VerdictFileError(
             f"Draws are needed for each of {len(effects)} effects, or none, but came for {len(draws)}."
         )
-    intervals = tuple(
-        primitive_intervals(effect.patch, draws[place] if draws else ())
+    return tuple(
+        PatchEffect(
+            **{item.name: getattr(effect, item.name) for item in fields(NamedEffect)},
+            intervals=primitive_intervals(effect.patch, draws[place] if draws else ()),
+        )
         for place, effect in enumerate(effects)
     )
-    stored = StoredPatch(
-        tuple(effects), intervals, origin, dict(channels or {}), verdict, sentence, parameters
-    )
-    return store_patch(path, stored)
 
 
-def store_patch(path: Path, stored: StoredPatch) -> Path:
-    """Write the file of a patch, whole or not at all; raises as `write_patch`."""
-    rows = tuple(
-        PatchEffect(**_fields(effect), intervals=own)
-        for effect, own in zip(stored.effects, stored.intervals, strict=True)
-    )
-    content = PatchDocument(stored.verdict, stored.sentence, rows, stored.channels, stored.parameters)
-    return write_document(path, PATCH_SCHEMA, stored.origin, content)
+def write_patch(path: Path, stored: StoredPatch) -> Path:
+    """Write patch.json, whole or not at all.
 
-
-def _fields(effect: NamedEffect) -> dict[str, Any]:
-    return {item.name: getattr(effect, item.name) for item in fields(NamedEffect)}
+    Raises
+    ------
+    VerdictFileError, reporting.errors.FileNotWrittenError
+        As `write_verdict`.
+    """
+    content = {item.name: getattr(stored, item.name) for item in fields(PatchDocument)}
+    return write_document(path, PATCH_SCHEMA, stored.origin, PatchDocument(**content))
 
 
 def fmu_outputs(channels: Mapping[str, Channel]) -> dict[str, str]:
@@ -252,12 +222,4 @@ def read_patch(path: Path) -> StoredPatch:
     """
     older = {FIRST_SCHEMA: lambda content: {**content, "model_file": None, "parameters": []}}
     found, origin = read_document(path, PATCH_SCHEMA, PatchDocument, older)
-    return StoredPatch(
-        tuple(NamedEffect(**_fields(effect)) for effect in found.effects),
-        tuple(effect.intervals for effect in found.effects),
-        origin,
-        found.channels,
-        found.verdict,
-        found.sentence,
-        found.parameters,
-    )
+    return StoredPatch(**vars(found), origin=origin)

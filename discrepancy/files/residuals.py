@@ -6,6 +6,7 @@ recorded of the noise.
 
 import json
 from collections.abc import Mapping
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ RESIDUALS_NAME = "residuals.nc"
 SCHEMA = "uav-twin residuals 1"
 """Value of the attribute `schema` of the root."""
 
+_PLAIN = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
+"""What the file has of a channel as it is."""
 _BY_CHANNEL = {
     "measured": "measured value",
     "prediction": "mean of the posterior prediction, gains and offsets included",
@@ -68,7 +71,7 @@ def write_residuals(path: Path, residuals: ResidualSet, attributes: Mapping[str,
         if channel.noise is not None and channel.noise.samples is not None:
             groups[f"noise/channel_{number:03d}"] = xr.Dataset(
                 {"noise": ("sample", channel.noise.samples, {"units": UNITS[channel.quantity].si})},
-                attrs={"channel": name, "interval": _or_nan(channel.noise.interval)},
+                attrs={"channel": name, "interval": channel.noise.interval or float("nan")},
             )
     return atomic_write_bytes(path, bytes(xr.DataTree.from_dict(groups).to_netcdf(engine="h5netcdf")))
 
@@ -111,25 +114,11 @@ def _residuals(tree: xr.DataTree) -> ResidualSet:
     return ResidualSet(channels, tuple(_trial(groups[name]) for name in sorted(groups)))
 
 
-def _or_nan(value: float | None) -> float:
-    return float("nan") if value is None else value
-
-
 def _channel_row(channel: Channel) -> dict[str, Any]:
     noise = channel.noise
-    return {
-        "name": channel.name,
-        "quantity": channel.quantity.value,
-        "output": channel.output,
-        # JSON as Python writes it knows Infinity; this text is read by Python only.
-        "gain_deviation": channel.gain_deviation,
-        "offset_deviation": channel.offset_deviation,
-        "station": channel.station,
-        "chord": channel.chord,
-        "noise": None
-        if noise is None
-        else [noise.standard_deviation, noise.degrees_of_freedom, noise.interval, noise.source],
-    }
+    recorded = noise and [noise.standard_deviation, noise.degrees_of_freedom, noise.interval, noise.source]
+    # JSON as Python writes it knows Infinity; this text is read by Python only.
+    return {"quantity": channel.quantity, **{key: getattr(channel, key) for key in _PLAIN}, "noise": recorded}
 
 
 def _channel(row: Mapping[str, Any], samples: Mapping[str, xr.Dataset]) -> Channel:
@@ -138,17 +127,14 @@ def _channel(row: Mapping[str, Any], samples: Mapping[str, xr.Dataset]) -> Chann
         deviation, freedom, interval, source = row["noise"]
         recorded = samples[row["name"]]["noise"].values if row["name"] in samples else None
         noise = NoiseRecord(deviation, freedom, recorded, interval, source)
-    others = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
-    return Channel(quantity=Quantity(row["quantity"]), noise=noise, **{key: row[key] for key in others})
+    return Channel(quantity=Quantity(row["quantity"]), noise=noise, **{key: row[key] for key in _PLAIN})
 
 
 def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
     trial, plane = item.trial, ("row", "channel")
     note = "unit of each channel: see the coordinate `unit`"
-    values = {"measured": trial.values, "prediction": item.prediction, "residual": item.residual,
-              "predictive_deviation": item.predictive_deviation}  # fmt: skip
     variables: dict[str, Any] = {
-        name: (plane, values[name], {"long_name": text, "comment": note})
+        name: (plane, getattr(item, name, trial.values), {"long_name": text, "comment": note})
         for name, text in _BY_CHANNEL.items()
     }
     variables["standardised"] = (plane, item.standardised, {"long_name": "residual over noise", "units": "1"})
@@ -163,19 +149,11 @@ def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
     for name in ("health", "health_deviation"):
         variables[name] = (("row", "region"), getattr(trial, name), {"units": "1"})
     attributes: dict[str, Any] = {
-        "name": trial.name,
-        "kind": trial.kind.value,
-        "run": trial.run,
-        "start": trial.start,
-        "held_out": int(trial.held_out),
-        "load_place": json.dumps(trial.load_place),
-    }
+        "name": trial.name, "kind": trial.kind.value, "run": trial.run, "start": trial.start,
+        "held_out": int(trial.held_out), "load_place": json.dumps(trial.load_place),
+    }  # fmt: skip
     if trial.release is not None:
-        release = trial.release
-        attributes["release"] = json.dumps(
-            [release.displacement, release.deviation, release.at_rest, release.mode_count,
-             release.time_zero_deviation]
-        )  # fmt: skip
+        attributes["release"] = json.dumps(astuple(trial.release))
     coordinates = {
         "time": ("row", trial.time, {"units": "s"}),
         "channel": ("channel", list(trial.channels)),
@@ -186,8 +164,11 @@ def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
 
 def _trial(group: xr.Dataset) -> FittedTrial:
     attributes = group.attrs
-    for name in (*_BY_ROW, "time", "health", "health_deviation"):
-        if not np.all(np.isfinite(group[name].values)):
+    rows: dict[str, Any] = {
+        name: group[name].values for name in (*_BY_ROW, "time", "health", "health_deviation")
+    }
+    for name, values in rows.items():
+        if not np.all(np.isfinite(values)):
             raise ValueError(f"{name} is not finite")
     place = json.loads(attributes["load_place"])
     release = json.loads(attributes["release"]) if "release" in attributes else None
@@ -197,24 +178,13 @@ def _trial(group: xr.Dataset) -> FittedTrial:
         channels=tuple(str(name) for name in group["channel"].values),
         values=group["measured"].values,
         used=group["used"].values.astype(bool),
-        time=group["time"].values,
-        force=group["force"].values,
-        load_factor=group["load_factor"].values,
         load_place=place if isinstance(place, str) else (float(place[0]), float(place[1])),
-        temperature=group["temperature"].values,
         start=float(attributes["start"]),
         run=str(attributes["run"]),
-        health=group["health"].values,
-        health_deviation=group["health_deviation"].values,
         release=None if release is None else Release(*release),
         held_out=bool(attributes["held_out"]),
+        **rows,
     )
-    return FittedTrial(
-        trial=trial,
-        prediction=group["prediction"].values,
-        residual=group["residual"].values,
-        noise_deviation=group["noise_deviation"].values,
-        predictive_deviation=group["predictive_deviation"].values,
-        leverage=group["leverage"].values,
-        rates=group["rates"].values if "rates" in group else None,
-    )
+    found = ("prediction", "residual", "noise_deviation", "predictive_deviation", "leverage")
+    rates = group["rates"].values if "rates" in group else None
+    return FittedTrial(trial, **{name: group[name].values for name in found}, rates=rates)

@@ -38,13 +38,11 @@ class StoredVerdict(VerdictDocument):
 
 
 @dataclass(frozen=True)
-class VerdictFolder:
-    """What `uav-twin discrepancy run` left.
+class VerdictFolder(StoredVerdict):
+    """What `uav-twin discrepancy run` left: the content of `verdict.json`, and more.
 
     Attributes
     ----------
-    verdict, proof, origin : Verdict, Proof or None, Origin
-        Of `verdict.json`.
     patch : ModelPatch or None
         The effects that were found, identical to what was found; None without `patch.json`.
     residuals : ResidualSet or None
@@ -52,9 +50,6 @@ class VerdictFolder:
         stopped the work.
     """
 
-    verdict: Verdict
-    proof: Proof | None
-    origin: Origin
     patch: ModelPatch | None
     residuals: ResidualSet | None
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from discrepancy.catalogue.entry import NINETY
 from discrepancy.fits.candidate import FREE_SHAPE, Candidate
@@ -20,6 +21,8 @@ from discrepancy.verdict import (
     Verdict,
     VerdictKind,
 )
+
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -108,15 +111,22 @@ def named_effects(problem: Problem, found: CandidateFit) -> tuple[NamedEffect, .
 
     Intervals are those of the fit's draws, else of its covariance.
     """
-    named = []
     deviation = np.sqrt(np.diag(found.effect_covariance))
     low, high = found.point.effect - NINETY * deviation, found.point.effect + NINETY * deviation
     if found.draws is not None:
         low, high = np.quantile(found.draws, (0.05, 0.95), axis=0)
         # the most probable value may be one of many optima along a ridge
         low, high = np.minimum(low, found.point.effect), np.maximum(high, found.point.effect)
+    return effects_at(problem, found.candidate, found.point.effect, low, high)
+
+
+def effects_at(
+    problem: Problem, candidate: Candidate, effect: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[NamedEffect, ...]:
+    """Return the effects of a candidate at scaled values (E,) with the ends of their intervals (E,)."""
+    named = []
     at = 0
-    for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
+    for term, part in zip(candidate.terms, candidate.parts(effect), strict=True):
         estimates = []
         rows = slice(at, at + len(part))
         for item, u, *interval in zip(term.parameters, part, low[rows], high[rows], strict=True):
@@ -149,9 +159,16 @@ def named_effects(problem: Problem, found: CandidateFit) -> tuple[NamedEffect, .
 
 def calibrated_parameters(problem: Problem, found: CandidateFit) -> tuple[CalibratedParameter, ...]:
     """Return the calibrated parameters of the model as a fit has them, within the model's range."""
+    return parameters_at(problem, found.point.shared, found.covariance)
+
+
+def parameters_at(
+    problem: Problem, shared: FloatArray, covariance: FloatArray
+) -> tuple[CalibratedParameter, ...]:
+    """Return the calibrated parameters at scaled shared unknowns (Q,), whose covariance comes first."""
     layout = problem.shared
-    values = layout.parameters(found.point.shared)
-    spread = layout.parameter_scale * np.sqrt(np.maximum(np.diag(found.covariance)[: len(values)], 0.0))
+    values = layout.parameters(shared)
+    spread = layout.parameter_scale * np.sqrt(np.maximum(np.diag(covariance)[: len(values)], 0.0))
     return tuple(
         CalibratedParameter(item.name, float(value), float(deviation), item.unit)
         for item, value, deviation in zip(problem.model.parameters, values, spread, strict=True)

@@ -19,6 +19,7 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain
 
+from .by_force import judged_by_force
 from .conclusion import Conclusion, best_of, named_effects, plain_names
 from .consistency_gate import consistency_gate
 from .in_part import judged_with_remainder, without_sliver
@@ -51,6 +52,28 @@ def name(
         group or of what is too small to tell; else the one without effect.
     """
     found = search(problem, effects, tell)
+    first = _named(problem, found)
+    if found.force is None or first[0].kind is not VerdictKind.UNEXPLAINED:
+        return first
+    tell("nothing follows the missing force: comparing whole simulations")
+    second = search(problem, effects, tell, by_force=False)
+    other = _named(problem, second)
+    if other[0].kind is not VerdictKind.NAMED_IN_PART or not _closes_fitted(problem, other):
+        return first
+    second.force, second.forces = found.force, found.forces
+    return other
+
+
+def _closes_fitted(problem: Problem, outcome: tuple[Verdict, Search, CandidateFit]) -> bool:
+    """Whether a fit closes most of the gap where it was fitted: held-out trials alone give no name."""
+    _, found, fit = outcome
+    count = float(problem.counts.sum())
+    gap = found.none.chi_square - count
+    return gap > 0.0 and fit.chi_square - count < (1.0 - SEARCH.least_share) * gap
+
+
+def _named(problem: Problem, found: Search) -> tuple[Verdict, Search, CandidateFit]:
+    """Return the verdict on a search, by its simulations or else by the missing force."""
     verdict, _, fit = _as_recorded(problem, found)
     stands = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
     if stands or verdict.kind is VerdictKind.GROUP:
@@ -70,8 +93,12 @@ def name(
         gate.name in ("absolute fit", "held-out trials") and gate.passed is False for gate in verdict.gates
     )
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
+    if verdict.kind is VerdictKind.GROUP and found.force is not None:
+        return judged_by_force(problem, found, verdict)
     if stands or not (misfits or verdict.kind in open_kinds):
         return verdict, found, fit
+    if found.force is not None:
+        return judged_by_force(problem, found, verdict)
     return judged_with_remainder(problem, found, verdict)
 
 

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from math import floor, log10
 
-from discrepancy.location.change_points import GapWindow, Moment
-from discrepancy.verdict import NamedEffect
+from discrepancy.verdict import GapWindow, Moment, NamedEffect
 
 TOLD = 3
 """Windows told in a sentence; the others are in the file."""

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_tests import holm, variance_p_value
 from discrepancy.errors import FitError
-from discrepancy.location.change_points import GapWindow, gap_windows
 from discrepancy.location.dependence import (
     Explanation,
     explanations,
@@ -96,8 +95,6 @@ class Location:
     remarks : tuple of str
         Limits: a missing noise record, noise that is not white, residuals smaller than the noise, a map by
         the residuals' own scale.
-    windows : tuple of GapWindow
-        Since when and until when there is a gap in the records in time, those held out too.
     """
 
     disagrees: bool
@@ -107,7 +104,6 @@ class Location:
     explanations: tuple[Explanation, ...]
     disagreements: tuple[Disagreement, ...]
     remarks: tuple[str, ...]
-    windows: tuple[GapWindow, ...] = ()
 
 
 def locate(
@@ -166,7 +162,6 @@ def locate(
         explanations=explained,
         disagreements=_disagreements(fitted, white, explained, patterns, frequencies) if disagrees else (),
         remarks=(*coloured.values(), *_noise_remarks(fitted), *own),
-        windows=gap_windows(residuals, seed=seed),
     )
 
 

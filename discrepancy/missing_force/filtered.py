@@ -1,9 +1,10 @@
-"""The Kalman filter with a missing force at one port: evidence of columns, and the force and motion seen.
+"""The Kalman filter with missing forces at ports: evidence of columns, and the forces and the motion seen.
 
-The force is a Gaussian process in time of deviation `size` and correlation time `time`: Matern 3/2, two
+A force is a Gaussian process in time of deviation `size` and correlation time `time`: Matern 3/2, two
 states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for Signal Processing), or 1/2.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,8 +19,11 @@ from .trial import SeenTrial
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+LATER = 200
+"""Samples after which more of them tell nothing of a moment."""
+
 callable_when_compiled(kernels.is_steady)
-_discretised = compiled(kernels.discretised)
+discretised = compiled(kernels.discretised)
 _covariances = compiled(kernels.covariances)
 _whitened = compiled(kernels.whitened)
 _smoothed = compiled(kernels.smoothed)
@@ -61,21 +65,18 @@ class Process:
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """A trial with a missing force at a port.
+    """A trial with missing forces at ports.
 
     Attributes
     ----------
     trial : SeenTrial
         Which.
-    port : int
-        Number of the port.
-    process : Process
-        The force.
+    processes : mapping of int to Process
+        The force at each port, by its number.
     """
 
     trial: SeenTrial
-    port: int
-    process: Process
+    processes: Mapping[int, Process]
 
     @cached_property
     def _scale(self) -> FloatArray:
@@ -83,14 +84,22 @@ class Filtered:
         system = self.trial.system
         n = len(system.generator)
         pace = max(float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9)
-        push = max(float(np.max(np.abs(system.actions[self.port]), initial=0.0)), 1e-300) * self.process.size
+        pushes = [np.abs(system.actions[p]).max(initial=0.0) * one.size for p, one in self.processes.items()]
+        push = max(*pushes, 1e-300)
         units = np.full(n, push / pace)
         half = n // 2 if 2 * (n // 2) == n else 0
         units[:half] /= pace
         return units
 
     @cached_property
-    def _white(self) -> FloatArray:
+    def _places(self) -> list[int]:
+        """Where each force stands in the whole state."""
+        counts = [len(one.generator) for one in self.processes.values()]
+        begin = len(self.trial.system.generator)
+        return [begin + sum(counts[:number]) for number in range(len(counts))]
+
+    @cached_property
+    def white(self) -> FloatArray:
         """Deviation (C,) of each channel's noise over that of what is white of it."""
         found = np.ones(len(self.trial.deviation))
         for channel, share, _ in self.trial.coloured:
@@ -98,33 +107,36 @@ class Filtered:
         return found
 
     @cached_property
-    def _system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def system(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Generator, noise intensity, rows of the readings, covariance at the first sample."""
-        trial, own = self.trial, self.process.generator
+        trial = self.trial
         n, units, noises = len(trial.system.generator), self._scale, len(trial.coloured)
-        force = slice(n, n + len(own))
-        whole = n + len(own) + noises
+        begin = n + sum(len(one.generator) for one in self.processes.values())
+        whole = begin + noises
         generator, intensity, start = np.zeros((3, whole, whole))
         generator[:n, :n] = trial.system.generator * units / units[:, None]
-        generator[:n, n] = -trial.system.actions[self.port] * self.process.size / units
-        generator[force, force] = own
-        intensity[force.stop - 1, force.stop - 1] = self.process.intensity
         rows = np.zeros((len(trial.deviation), whole))
         rows[:, :n] = trial.system.outputs * units / trial.deviation[:, None]
-        rows[:, n] = -trial.system.through[self.port] * self.process.size / trial.deviation
-        start[force, force] = np.eye(len(own))
-        if trial.settled:  # at rest under the missing force too
-            begun = np.linalg.lstsq(generator[:n, :n], -generator[:n, n], rcond=1e-12)[0]
-            start[:n, :n], start[:n, n], start[n, :n] = np.outer(begun, begun), begun, begun
-        for at, (channel, share, rate) in enumerate(trial.coloured, force.stop):
+        for (port, one), at in zip(self.processes.items(), self._places, strict=True):
+            force = slice(at, at + len(one.generator))
+            generator[:n, at] = -trial.system.actions[port] * one.size / units
+            generator[force, force] = one.generator
+            intensity[force.stop - 1, force.stop - 1] = one.intensity
+            rows[:, at] = -trial.system.through[port] * one.size / trial.deviation
+            start[force, force] = np.eye(len(one.generator))
+            if trial.settled:  # at rest under the missing force too
+                begun = np.linalg.lstsq(generator[:n, :n], -generator[:n, at], rcond=1e-12)[0]
+                start[:n, :n] += np.outer(begun, begun)
+                start[:n, at] = start[at, :n] = begun
+        for at, (channel, share, rate) in enumerate(trial.coloured, begin):
             generator[at, at], intensity[at, at], start[at, at] = -rate, 2.0 * rate, 1.0
             rows[channel, at] = np.sqrt(share)
-        rows *= self._white[:, None]
+        rows *= self.white[:, None]
         return generator, intensity, rows, start
 
     def _steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return transitions and noises (J, n, n) of steps (J,) [s]."""
-        return _discretised(*self._system[:2], lengths)
+        return discretised(*self.system[:2], lengths)
 
     @cached_property
     def _passed(
@@ -132,30 +144,36 @@ class Filtered:
     ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         lengths, which = self.trial.steps
         moves, noises = self._steps(lengths)
-        _, _, rows, start = self._system
+        _, _, rows, start = self.system
         return moves, *_covariances(moves, noises, which, rows, self.trial.used, start)
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether no variance has been lost to rounding, as under forces far larger than what is read."""
+        return bool(np.all(self._passed[3] > 0.5))
 
     @property
     def log_determinant(self) -> float:
         """Half the sum of the logarithms of the readings' variances given those before [nat]."""
         _, slot, _, sizes, _, _ = self._passed
-        white = np.sum(self.trial.used * np.log(self._white))
+        white = np.sum(self.trial.used * np.log(self.white))
         return 0.5 * float(np.sum(np.log(sizes[slot]) * self.trial.used)) - float(white)
 
     def whitened(self, columns: FloatArray) -> FloatArray:
         """Return columns (K, N, C) as independent numbers of variance one (N C, K)."""
         moves, slot, gains, sizes, _, _ = self._passed
-        given = np.ascontiguousarray(np.moveaxis(columns * self._white, 0, -1))
+        given = np.moveaxis(columns, 0, -1)
+        given = np.ascontiguousarray(given * self.white[:, None] if self.trial.coloured else given)
         found = _whitened(
-            moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, given
+            moves, self.trial.steps[1], self.system[2], self.trial.used, slot, gains, sizes, given
         )
         return np.asarray(found.reshape(-1, found.shape[-1]))
 
     def smoothed(self, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the added state (F, n) and the missing force (F,) at the fine stamps, given readings."""
+        """Return the added state (F, n) and the missing forces (P, F) at the fine stamps, given readings."""
         moves, slot, gains, sizes, _, filtered = self._passed
         lengths, which = self.trial.steps
-        rows = self._system[2]
+        rows = self.system[2]
         means, later = _smoothed(
             moves,
             which,
@@ -164,20 +182,31 @@ class Filtered:
             slot,
             gains,
             sizes,
-            np.ascontiguousarray(readings * self._white),
+            np.ascontiguousarray(readings * self.white),
         )
         parts = self.trial.parts
         fine = self._steps(lengths / parts)
         found = _between(parts, *fine, which, slot, filtered, means, later)
-        n = len(self._scale)
-        return np.asarray(found[:, :n] * self._scale), np.asarray(found[:, n] * self.process.size)
+        sizes = np.array([one.size for one in self.processes.values()])
+        forces = found[:, self._places].T * sizes[:, None]
+        return np.asarray(found[:, : len(self._scale)] * self._scale), np.asarray(forces)
 
-    def deviation(self) -> FloatArray:
-        """Return the deviation (N,) of the missing force at the samples, all columns being known."""
+    def deviation(self, port: int) -> FloatArray:
+        """Return the deviation (N,) of the missing force of a port at the samples, columns being known."""
+        shown = np.zeros(len(self.system[0]))
+        shown[self._places[list(self.processes).index(port)]] = self.processes[port].size
+        return self._deviations(shown, slice(None))
+
+    def speed_deviation(self, port: int) -> float:
+        """Return that of a port's speed, at a sample with many that follow."""
+        shown = np.zeros(len(self.system[0]))
+        shown[: len(self._scale)] = self.trial.system.speeds[port] * self._scale
+        return float(self._deviations(shown, slice(-LATER, None))[0])
+
+    def _deviations(self, shown: FloatArray, at: slice) -> FloatArray:
+        """Return the smoothed deviation of a row (n,) of the state at last samples."""
         moves, slot, gains, sizes, predicted, _ = self._passed
-        shown = np.zeros((1, len(self._system[0])))
-        shown[0, len(self._scale)] = self.process.size
-        found = _variances(
-            moves, self.trial.steps[1], self._system[2], self.trial.used, slot, gains, sizes, predicted, shown
-        )
+        which, used = self.trial.steps[1][at], self.trial.used[at]
+        rows = self.system[2]
+        found = _variances(moves, which, rows, used, slot[at], gains, sizes, predicted, shown[None])
         return np.asarray(np.sqrt(found[:, 0]))

@@ -1,27 +1,15 @@
 """The force that a verdict is about: where it is, how large, what a named law is of it, what is left."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.catalogue.entry import Effect
-from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.problem import Problem
-from discrepancy.models.ported import shows_ports
-from fe.runtime.laws.interface import PortForce
-from fe.runtime.patch import ModelPatch
-
-from .columns import Columns
-from .naming import ROUNDS, ForceSearch, Seen, seen
-from .view import Column
+from .naming import Explained, ForceSearch, scaled
 
 FloatArray = NDArray[np.float64]
 
-FAR = 2.0
-"""Prior deviations from which on a parameter has taken up what it should not: no law is drawn beside it."""
 GROUND = 3.0
 """Evidence over no missing force at all [nat] from which there is one."""
 
@@ -112,112 +100,42 @@ class MissingForce:
         return float(np.sqrt(np.mean(np.concatenate([item.force for item in self.courses]) ** 2)))
 
 
-def missing_force(problem: Problem, fit: CandidateFit, effects: Sequence[Effect] = ()) -> MissingForce | None:
-    """Return the missing force beside a verdict's fit.
+def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
+    """Return the missing force that a hypothesis is about, None where no force is missing at all.
 
-    It is that beside parameters within their priors, at the port of the verdict's effect or else at the one
-    with the most evidence. Where the verdict has no law at a port, that of `effects` is drawn which follows
-    the force best, if one follows it at all.
-
-    None where a model does not tell how its ports move, where the verdict is no law at one port, where its
-    law is not ahead of a force without one (friction that holds is anything up to its largest), and where
-    nothing is missing.
+    It is that at the port of its law, or else at the one with the most evidence; the law is drawn through it
+    if it acts at one port.
     """
-    model = problem.model.inner
-    dynamic = [data for data in problem.trials if data.trial.is_dynamic]
-    if not dynamic or not shows_ports(model):
+    nothing = max(of_nothing(one) for one in search.at.values())
+    evidence = {name: one.evidence - nothing for name, one in search.at.items()}
+    if max(evidence.values()) < GROUND:
         return None
-    try:
-        return _missing(problem, fit, effects)
-    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # it is shown, and no verdict rests on it
-        return None
-
-
-def _missing(problem: Problem, fit: CandidateFit, effects: Sequence[Effect]) -> MissingForce | None:
-    search = ForceSearch(problem)
-    patch = fit.candidate.patch(problem.setting, fit.point.effect) if fit.candidate.terms else ModelPatch()
-    if not all(isinstance(item, PortForce) for item in patch):
-        return None
-    strained = np.abs(fit.point.shared[problem.shared.precision > 0.0]).max(initial=0.0) > FAR
-    believed = len(patch) > 0 and not strained
-    at = search.locate(fit.point if believed else None)
-    nothing = max(_of_nothing(one) for one in at.values())
-    evidence = {name: one.evidence - nothing for name, one in at.items()}
-    port = max(at, key=lambda name: at[name].evidence)
-    if evidence[port] < GROUND:
-        return None
-    drawn = _Drawn(at[port])
-    if believed:
-        laws = _of_verdict(search, fit, patch)
-        ahead = [law for law in laws if law.seen.evidence > at[law.port(at)].evidence + GROUND]
-        if (
-            len(laws) != 1 or not ahead
-        ):  # several hide each other's motion; one that sticks has no known force
-            return None
-        drawn = ahead[0]
-    elif effects:
-        first = next(iter(search.name(effects)), None)
-        acts = first is not None and any(part.forces for part in first.seen.view.effects[-1].parts)
-        if first is not None and acts and first.evidence > at[port].evidence + GROUND:
-            column = first.seen.view.effects[-1]
-            drawn = _Drawn(first.seen, column, first.size, first.term.effect.name)
-    return _told(search, drawn.port(at), drawn, evidence)
-
-
-def _of_nothing(found: Seen) -> float:
-    """Return the evidence [nat] without any missing force."""
-    return found.view.solve(replace(found.process, size=1e-9 * found.process.size)).evidence
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """What is left of the missing force beside a law, which is a factor times a column."""
-
-    seen: Seen
-    law: Column | None = None
-    factor: float = 1.0
-    name: str = ""
-
-    def port(self, ports: Iterable[str]) -> str:
-        return list(ports)[self.seen.view.port]
-
-
-def _of_verdict(search: ForceSearch, fit: CandidateFit, patch: ModelPatch) -> list[_Drawn]:
-    """Return what is left at each port at which a verdict has laws, beside these."""
-    columns = Columns(search.problem, search.numbers, search.point)
-    named, found = " and ".join(term.effect.name for term in fit.candidate.terms), []
-    for port, one in search.at.items():
-        forces = (item for item in patch if isinstance(item, PortForce))
-        own = ModelPatch(tuple(item for item in forces if item.port == port))
-        drawn, motions = None, one.motions
-        for _ in range(ROUNDS if len(own) else 0):  # along the motion that the law itself gives
-            column = columns.of_patch(one.view, motions, own, fit.candidate.acts_on)
-            if column is None:
-                break
-            view = replace(one.view, motions=motions, certain=(*one.view.certain, column))
-            drawn = _Drawn(seen(view, one.process), column, 1.0, named)
-            motions = drawn.seen.motions
-        if drawn is not None:
-            found.append(drawn)
-    return found
-
-
-def _told(search: ForceSearch, port: str, drawn: _Drawn, evidence: Mapping[str, float]) -> MissingForce:
-    found, view = drawn.seen, drawn.seen.view
+    laws = {term.place for term in found.candidate.terms if term.place in search.ports}
+    port = laws.pop() if len(laws) == 1 else max(evidence, key=lambda name: evidence[name])
+    at = search.ports.index(port)
+    if at not in found.processes:
+        found = search.at[port]
+    named = " and ".join(term.effect.name for term in found.candidate.terms if term.place == port)
     courses = []
-    for number, (trial, motion) in enumerate(zip(view.trials, found.motions, strict=True)):
-        at = slice(None, None, trial.parts)
-        position, speed = trial.port_motion(view.port, motion.added)
-        force, law = found.left[number][at], None
-        if drawn.law is not None:
-            law = drawn.factor * drawn.law.parts[number].forces.get(view.port, np.zeros(len(speed)))[at]
-            force = force + law
-        deviation = view.filtered(found.process)[number].deviation()
-        courses.append(ForceCourse(trial.name, trial.time, position[at], speed[at], force, deviation, law))
-    share = None
-    if drawn.law is not None:
-        left, whole = (np.concatenate([getattr(c, name) for c in courses]) for name in ("left", "force"))
-        share = 1.0 - float(np.mean(left**2) / np.mean(whole**2))
+    filters = found.view.filtered(found.processes)
+    for trial, motion, one in zip(found.view.trials, found.motions, filters, strict=True):
+        samples = slice(None, None, trial.parts)
+        position, speed = motion.positions[:, at], motion.speeds[:, at]
+        force, left = motion.forces[at][samples], motion.left[at][samples]
+        law = force - left if named else None
+        motion_at = (position[samples], speed[samples])
+        courses.append(ForceCourse(trial.name, trial.time, *motion_at, force, one.deviation(at), law))
     scale = search.problem.setting.scales.ports.get(port)
     of_state = bool(scale and scale.of_state)
-    return MissingForce(port, of_state, dict(evidence), found.process.time, courses, drawn.name, share)
+    time = found.processes[at].time
+    return MissingForce(port, of_state, evidence, time, courses, named, _share(courses) if named else None)
+
+
+def of_nothing(found: Explained) -> float:
+    """Return the evidence [nat] without any missing force."""
+    return found.view.solve(scaled(found.processes, 1e-9, 1.0)).evidence
+
+
+def _share(courses: Sequence[ForceCourse]) -> float:
+    left, whole = (np.concatenate([getattr(c, name) for c in courses]) for name in ("left", "force"))
+    return 1.0 - float(np.mean(left**2) / np.mean(whole**2))

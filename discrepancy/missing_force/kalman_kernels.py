@@ -16,7 +16,7 @@ BoolArray = NDArray[np.bool_]
 
 SMALL_PART, ORDERS = 0.25, 12
 """Norm of what is summed as a series, and its orders: 1e-16 is left out."""
-STEADY = 1e-10
+STEADY = 1e-9
 """A covariance that moves less than this, over the deviations that it holds, is steady."""
 
 
@@ -64,7 +64,7 @@ def covariances(
     slot = np.zeros(count, dtype=np.int64)
     gains, sizes = np.empty((count, channels, n)), np.empty((count, channels))
     predicted, filtered = np.empty((count, n, n)), np.empty((count, n, n))
-    cover, last, unit = start.copy(), -1, np.eye(n)
+    cover, last = start.copy(), -1
     for k in range(count):
         if k > 0:
             same = k > 1 and which[k] == which[k - 1] and slot[k - 1] == slot[k - 2]
@@ -89,8 +89,13 @@ def covariances(
             weight = cover @ rows[c]
             size = rows[c] @ weight + 1.0
             gain = weight / size
-            keep = unit - np.outer(gain, rows[c])
-            cover = keep @ cover @ keep.T + np.outer(gain, gain)
+            for i in range(n):  # from both sides in turn: what the first leaves by rounding the second takes
+                for j in range(n):
+                    cover[i, j] -= gain[i] * weight[j]
+            weight = cover @ rows[c]
+            for i in range(n):
+                for j in range(n):
+                    cover[i, j] += (gain[i] - weight[i]) * gain[j]
             gains[last, c] = gain
             sizes[last, c] = size
         cover = 0.5 * (cover + cover.T)
@@ -134,16 +139,20 @@ def whitened(
         for c in range(channels):
             if not used[k, c]:
                 continue
+            left = found[k, c]
+            left[:] = columns[k, c]
+            for j in range(n):
+                factor = rows[c, j]
+                if factor != 0.0:
+                    for w in range(width):
+                        left[w] -= factor * mean[j, w]
+            for j in range(n):
+                gain = gains[at, c, j]
+                for w in range(width):
+                    mean[j, w] += gain * left[w]
             root = np.sqrt(sizes[at, c])
             for w in range(width):
-                left = columns[k, c, w]
-                for j in range(n):
-                    left -= rows[c, j] * mean[j, w]
-                found[k, c, w] = left / root
-            for j in range(n):
-                gain = gains[at, c, j] * root
-                for w in range(width):
-                    mean[j, w] += gain * found[k, c, w]
+                left[w] /= root
     return found
 
 

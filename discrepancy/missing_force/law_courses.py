@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from discrepancy.models.compiled_motion import law_functions
 from fe.compilation import compiled
@@ -13,6 +14,9 @@ from fe.runtime.laws.interface import HEAD, PARAMETERS, PortForce
 from fe.runtime.motion_arrays import FIRST_PARTS
 
 FloatArray = NDArray[np.float64]
+
+WIDER = 10.0
+"""By which a deviation of the speed is too small: that of the process does not know of steps."""
 
 
 def along(
@@ -34,8 +38,19 @@ def _compiled_along() -> Callable[..., None]:
     return compiled(along, law_functions(), "numpy")
 
 
-def law_course(law: PortForce, time: FloatArray, position: FloatArray, speed: FloatArray) -> FloatArray:
-    """Return the force (F,) of a law along a motion (F,) of its port; zero outside of its windows."""
+def law_course(
+    law: PortForce,
+    time: FloatArray,
+    position: FloatArray,
+    speed: FloatArray,
+    doubt: float = 0.0,
+    holding: FloatArray | float = 0.0,
+) -> FloatArray:
+    """Return the force (F,) of a law along a motion (F,) of its port; zero outside of its windows.
+
+    Where a speed may be zero by its deviation `doubt`, a law of the speed that is a force at rest, too, is
+    what holds the port, `holding` (F,), up to its own largest.
+    """
     elements = np.asarray(law.elements(), dtype=np.float64)
     elements = elements if len(elements) else np.zeros(1)
     values = np.pad(np.array(law.row, dtype=np.float64), (0, PARAMETERS - len(law.row)))
@@ -43,6 +58,9 @@ def law_course(law: PortForce, time: FloatArray, position: FloatArray, speed: Fl
     memory = np.zeros(HEAD + len(elements))
     motion = (np.ascontiguousarray(position), np.ascontiguousarray(speed))
     _compiled_along()(LAWS.index(type(law)), type(law).of_speed, values, elements, *motion, memory, found)
+    if type(law).of_speed and doubt > 0.0:
+        moves = erf(np.abs(speed) / (np.sqrt(2.0) * WIDER * doubt))
+        found = moves * found + (1.0 - moves) * np.clip(holding, -np.abs(found), np.abs(found))
     if law.windows:
         inside = np.zeros(len(found), dtype=bool)
         for window in law.windows:

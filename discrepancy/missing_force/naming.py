@@ -1,99 +1,122 @@
-"""The search for what the missing force is: effects as columns beside a process, by their evidence."""
+"""The search for what the missing force is: effects beside what is left of it, by their evidence.
 
-from collections.abc import Sequence
+A hypothesis is a set of effects with missing forces at ports beside it. Its effects act along the motion
+that was, so that they and their derivatives by their unknowns are columns; a step of all unknowns, a new
+motion, new columns: an iterated smoother whose fixed point is the most probable value, and whose evidence is
+Laplace's.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from math import comb, log
 
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.catalogue.entry import Effect
+from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from fe.runtime.patch import ModelPatch
+from discrepancy.models.ported import apart, shows_ports
+from discrepancy.search_settings import SEARCH
 
-from .columns import Columns, variants, with_prior
+from .columns import Columns
 from .filtered import Process
 from .regression import Solution
 from .trial import seen_trial
-from .view import SHARES, Column, Motion, View
+from .view import SHARES, Column, Motion, Processes, View, combined
 
 FloatArray = NDArray[np.float64]
+Key = tuple[tuple[str, str], ...]
 
+NOTHING, NO_VALUES = Candidate(), np.zeros(0)
+LEVELS = (-1.3, -0.4, 0.4, 1.3)
+"""Standard normal values at which the numbers of an effect that are no magnitudes are tried."""
+MOST_VARIANTS = 16
+AWAY = 0.5
+"""Standard normal value of a magnitude with which an effect is tried, its size being free."""
 WIDE = 3.0
-"""Prior deviation of an effect: so many times what would explain all of the gap."""
+"""Prior deviation of that size: so many times what would explain all of the gap."""
+LARGEST = 4.0
+"""Standard normal value from which on an unknown is not followed."""
 SIZES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
 TIMES = (0.5, 1.5)
-"""Processes, over the most probable one without effect, beside which all effects are weighed."""
-KEPT = 8
-"""Effects that are followed along the motion that they give themselves."""
-ROUNDS = 2
+"""Processes, over the most probable one without effect, beside which all effects are tried."""
+MOST_PORTS = 4
+"""Ports at which forces may be missing at once."""
+BESIDE = 0.1
+"""Size of a force beside the largest one, over its size alone, to begin with."""
+WIDTHS = (10, 4, 4)
+"""Effects that are followed after the screen: alone, beside one other, beside two."""
+BEAM = 3
+"""Sets to which one more effect is added."""
+BEGIN_TIMES = (1.0, 10.0)
+"""Correlation times over that of the port's motion, from which the most probable one is looked for."""
+ROUNDS = 8
+LONGEST_STEP = 1.5
+SETTLED = 0.05
+"""Steps of the unknowns of an effect: how many, the longest, and that after which no other follows."""
+WORSE, LEAST_PART = 1.0, 0.2
+"""Loss of evidence [nat] from which a step is taken back and halved, and the least part of it."""
+SLOPE = 0.05
+"""Standard normal step of the derivatives of an effect."""
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """The missing force at a port.
+class Explained:
+    """A hypothesis.
 
     Attributes
     ----------
-    view : View
-        Port, trials, effects in it.
-    process : Process
-        Most probable.
+    candidate : Candidate
+        Its effects; none: missing forces alone.
+    effect : (E,) ndarray
+        Their unknowns, standard normal before.
+    processes : mapping of int to Process
+        Missing forces beside them, by the numbers of their ports.
     evidence : float
-        [nat], with the prior of the process.
+        [nat], with the prior of the processes.
+    view : View
+        Trials and columns.
     solution : Solution
-        Unknowns beside it.
+        Shared unknowns first, those of the effects last.
     local : sequence of (L,) ndarray
         Unknowns of the trials.
     motions : sequence of Motion
-        Motion and missing force, the effects' own included.
+        By trial.
     """
 
-    view: View
-    process: Process
+    candidate: Candidate
+    effect: FloatArray
+    processes: Processes
     evidence: float
+    view: View
     solution: Solution
     local: Sequence[FloatArray]
     motions: Sequence[Motion]
 
     @property
-    def left(self) -> list[FloatArray]:
-        """Missing force (F,) of each trial beside the effects."""
-        count = len(self.view.shared_precision)
-        found = []
-        for number, motion in enumerate(self.motions):
-            force = motion.force
-            for mean, item in zip(self.solution.mean[count:], self.view.effects, strict=True):
-                force = force - mean * item.parts[number].forces.get(self.view.port, 0.0)
-            found.append(np.asarray(force))
-        return found
+    def covariance(self) -> FloatArray:
+        """Of the effects' unknowns (E, E)."""
+        at = len(self.view.shared_precision)
+        return self.solution.covariance[at:, at:]
 
-
-def seen(view: View, about: Process, shares: Sequence[float] = SHARES) -> Seen:
-    """Return the missing force at a view's port."""
-    process, evidence = view.most_probable(about, shares)
-    return Seen(view, process, evidence, *view.smoothed(process))
-
-
-@dataclass(frozen=True, eq=False)
-class Explained:
-    """An effect beside what is left of the missing force."""
-
-    term: Term
-    values: FloatArray
-    size: float
-    deviation: float
-    seen: Seen
-
-    @property
-    def evidence(self) -> float:
-        """[nat]."""
-        return self.seen.evidence
+    @cached_property
+    def shared(self) -> FloatArray:
+        """Shared unknowns (K,) at the values of the effects, which may not have settled."""
+        at = len(self.view.shared_precision)
+        mean, covariance = self.solution.mean, self.solution.covariance
+        if not len(self.effect):
+            return mean[:at]
+        step = np.linalg.solve(covariance[at:, at:], self.effect - mean[at:])
+        return np.asarray(mean[:at] + covariance[:at, at:] @ step)
 
 
 class ForceSearch:
-    """The missing force of a problem, at every port, and effects that may be it.
+    """The missing forces of a problem, and effects that may be they.
 
     Parameters
     ----------
@@ -102,16 +125,19 @@ class ForceSearch:
     """
 
     def __init__(self, problem: Problem) -> None:
-        model = problem.model.inner
-        self.laws: ModelPatch
-        linear, self.laws = model.apart() if hasattr(model, "apart") else (model, ModelPatch())
+        linear, self.laws = apart(problem.model.inner)
         trials = tuple(data.trial for data in problem.trials)
         self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
-        self.at: dict[str, Seen] = {}
+        self.ports = tuple(linear.ports())
+        self.at: dict[str, Explained] = {}
+        self.whole: Explained
         self.point = self.problem.start(Candidate())
+        self.columns = Columns(self.problem, self.numbers, self.point)
 
-    def locate(self, about: Point | None = None) -> dict[str, Seen]:
+    # ---------------------------------------------------------------- where
+
+    def locate(self, about: Point | None = None) -> dict[str, Explained]:
         """Return the missing force at each port.
 
         First along the model's own motion, for the initial states; then along the motion that was, with the
@@ -123,109 +149,330 @@ class ForceSearch:
             self.point = Point(about.shared, about.local, np.zeros(0))
         for turn in range(2):
             trials = [seen_trial(problem, number, self.point) for number in self.numbers]
-            columns = Columns(problem, self.numbers, self.point)
-            for port, name in enumerate(problem.model.ports()):
-                view = View(trials, port, problem.shared.precision)
-                if not turn:
-                    self.at[name] = seen(view, self._about(name), SHARES[:1])
-                    continue
-                before = self.at[name]
-                found = view.smoothed(before.process)
-                own = columns.of_patch(view, found[2], self.laws) if len(self.laws) else None
-                view = replace(view, motions=found[2], certain=() if own is None else (own,))
-                self.at[name] = seen(view, before.process)
+            self.columns = Columns(problem, self.numbers, self.point)
+            for port, name in enumerate(self.ports):
+                view = View(trials, problem.shared.precision)
+                if turn:
+                    motions = view.smoothed(self.at[name].processes)[2]
+                    view = replace(view, motions=motions, own=self._own(view, motions))
+                begins = [scaled(self.about((port,)), 1.0, time) for time in BEGIN_TIMES]
+                begins += [self.at[name].processes] if turn else []
+                found = [self._seen(view, Candidate(), np.zeros(0), one, SHARES[:1]) for one in begins]
+                self.at[name] = max(found, key=lambda item: item.evidence)
             if not turn and about is None:
                 self.point = self._point(self.best())
+        self.whole = self._together()
         return self.at
 
-    def best(self) -> Seen:
-        """Return the view of the largest evidence."""
+    def _together(self) -> Explained:
+        """Return missing forces at all ports at once, or at those that matter most if they are many."""
+        best = self.best()
+        ranked = sorted(self.at.values(), key=lambda item: -item.evidence)[:MOST_PORTS]
+        if len(ranked) == 1:
+            return best
+        begin = dict(best.processes)
+        for item in ranked[1:]:
+            begin |= scaled(item.processes, BESIDE, 1.0)
+        view = best.view
+        for _ in range(2):
+            found = self._seen(view, Candidate(), np.zeros(0), begin, SHARES[:1])
+            view = replace(view, motions=found.motions, own=self._own(view, found.motions))
+            begin = dict(found.processes)
+        return found
+
+    def best(self) -> Explained:
+        """Return the missing force of the largest evidence."""
         return max(self.at.values(), key=lambda item: item.evidence)
 
-    def _about(self, port: str) -> Process:
-        scale = self.problem.setting.scales.ports[port]
-        pace = scale.angular_frequency or 1.0 / self.problem.setting.scales.duration
-        return Process(0.05 * scale.stiffness * scale.displacement, 1.0 / pace)
+    def about(self, ports: Iterable[int]) -> dict[int, Process]:
+        """Return missing forces at ports as they may be before any reading."""
+        found = {}
+        for port in ports:
+            scale = self.problem.setting.scales.ports[self.ports[port]]
+            pace = scale.angular_frequency or 1.0 / self.problem.setting.scales.duration
+            found[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / pace)
+        return found
 
-    def _point(self, found: Seen) -> Point:
+    def _own(self, view: View, motions: Sequence[Motion]) -> Column | None:
+        return self.columns.of_patch(view, motions, self.laws) if len(self.laws) else None
+
+    def _seen(
+        self,
+        view: View,
+        candidate: Candidate,
+        effect: FloatArray,
+        begin: Processes,
+        shares: Sequence[float] = SHARES,
+    ) -> Explained:
+        return seen(view, self.about(begin), begin, shares, candidate, effect)
+
+    def rough(self, port: str) -> Explained:
+        """Return the missing force at a port as one that may jump, linear about the motion that it gives."""
+        found = self.at[port]
+        for _ in range(2):
+            self.point = self._point(found)
+            trials = [seen_trial(self.problem, number, self.point) for number in self.numbers]
+            self.columns = Columns(self.problem, self.numbers, self.point)
+            view = View(trials, self.problem.shared.precision)
+            for _ in range(2):
+                motions = view.smoothed(found.processes)[2]
+                view = replace(view, motions=motions, own=self._own(view, motions))
+            begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
+            found = self._seen(view, Candidate(), np.zeros(0), begin)
+        return found
+
+    def _at(self, view: View, candidate: Candidate, effect: FloatArray, processes: Processes) -> Explained:
+        evidence = view.evidence(self.about(processes), processes)
+        return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))
+
+    def whole_point(self, found: Explained) -> Point:
+        """Return the point of a hypothesis, from which a fit may begin."""
+        point = self._point(found)
+        return Point(found.shared.copy(), point.local, found.effect.copy())
+
+    def _point(self, found: Explained) -> Point:
         local = [np.zeros(data.unknowns.size) for data in self.problem.trials]
         for number, values in zip(self.numbers, found.local, strict=True):
             local[number] = values
-        shared = found.solution.mean[: self.problem.shared.size]
-        return Point(np.clip(shared, -2.0, 2.0), tuple(local), np.zeros(0))
+        return Point(np.clip(found.shared, -2.0, 2.0), tuple(local), np.zeros(0))
+
+    # ---------------------------------------------------------------- what
 
     def name(self, effects: Sequence[Effect]) -> list[Explained]:
-        """Return effects with what they leave, best first."""
-        columns = Columns(self.problem, self.numbers, self.point)
-        found: list[tuple[float, Seen, Term, FloatArray, Column]] = []
-        base = self.best()
-        ports = list(self.problem.model.ports())
-        for port, at in self.at.items():
-            candidates = []
-            for effect in effects:
-                for place in effect.places(self.problem.setting):
-                    if (place in ports and place != port) or (place not in ports and at is not base):
+        """Return hypotheses, the most probable first: sets of effects that were found one after another.
+
+        Each effect alone, with its own shape and with a free one; the best of these with one more effect,
+        while that makes a more probable set; then the best set less one effect.
+        """
+        found: dict[Key, Explained] = {(): self.whole}
+        beam = [self.whole]
+        for width in WIDTHS:
+            best = self._ranked(found, len(effects))[0]
+            longer: dict[Key, Explained] = {}
+            for base in beam:
+                for _, term, start in self.screened(base, effects)[:width]:
+                    candidate = base.candidate.plus(term)
+                    if key_of(candidate) in longer:
                         continue
-                    term = Term(effect, place)
-                    for values in variants(term):
-                        column = columns.of(at.view, at.motions, term, values)
-                        if column is not None:
-                            candidates.append((term, values, self._scaled(column, at)))
-            for value, number in self._weighed(at, [item[2] for item in candidates]):
-                term, values, column = candidates[number]
-                found.append((value, at, term, values, column))
-        best: dict[tuple[str, str], tuple[float, Seen, Term, FloatArray, Column]] = {}
-        for item in sorted(found, key=lambda item: item[0]):
-            best[item[2].label, item[2].place] = item
-        ranked = sorted(best.values(), key=lambda item: -item[0])[:KEPT]
-        return sorted(
-            (self._followed(columns, *item[1:]) for item in ranked), key=lambda item: -item.evidence
-        )
-
-    @staticmethod
-    def _scaled(column: Column, at: Seen) -> Column:
-        """Return a column with its prior: what would be all of the gap, three times."""
-        forces = [part.forces.get(at.view.port) for part in column.parts]
-        if any(force is not None for force in forces):
-            own = np.sqrt(np.mean(np.concatenate([f for f in forces if f is not None]) ** 2))
-            gap = np.sqrt(np.mean(np.concatenate([m.force for m in at.motions]) ** 2))
-        else:
-            own = np.sqrt(np.mean(np.concatenate([p.readings.ravel() for p in column.parts]) ** 2))
-            gap = np.sqrt(np.mean(np.concatenate([t.residual.ravel() for t in at.view.trials]) ** 2))
-        return with_prior(column, WIDE * float(gap) / max(float(own), 1e-300))
-
-    @staticmethod
-    def _weighed(at: Seen, columns: Sequence[Column]) -> list[tuple[float, int]]:
-        """Return evidence and number of each column, beside processes around the most probable one."""
-        if not columns:
-            return []
-        view = replace(at.view, motions=at.motions)
-        whole = replace(view, effects=(*view.effects, *columns))
-        count = len(view.precision)
-        best = np.full(len(columns), -np.inf)
-        for size in SIZES:
-            for time in TIMES:
-                process = replace(at.process, size=at.process.size * size, time=at.process.time * time)
-                products = whole.products(process)
-                for number in range(len(columns)):
-                    chosen = [*range(count), count + number]
-                    solution = products.solve(chosen, whole.precision[chosen])
-                    if solution.mean[-1] > 0.0 or columns[number].both_signs:
-                        best[number] = max(best[number], solution.evidence)
-        return [(float(value), number) for number, value in enumerate(best) if np.isfinite(value)]
-
-    def _followed(
-        self, columns: Columns, at: Seen, term: Term, values: FloatArray, column: Column
-    ) -> Explained:
-        motions = at.motions
-        about = at.process
-        for _ in range(ROUNDS):
-            view = replace(at.view, motions=motions, effects=(*at.view.effects, column))
-            found = seen(view, about)
-            motions = found.motions
-            again = columns.of(view, motions, term, values)
-            if again is None:
+                    one = self.followed(base, candidate, np.concatenate((base.effect, start)))
+                    if one is not None:
+                        longer[key_of(candidate)] = one
+            found |= longer
+            ranked = self._ranked(longer, len(effects))
+            if not ranked or self.score(ranked[0], len(effects)) <= self.score(best, len(effects)):
                 break
-            column = replace(again, precision=column.precision)
-        mean = float(found.solution.mean[-1])
-        return Explained(term, values, mean, float(np.sqrt(found.solution.covariance[-1, -1])), found)
+            beam = ranked[:BEAM]
+        best = self._ranked(found, len(effects))[0]
+        parts = best.candidate.parts(best.effect)
+        for index in range(len(parts) if len(parts) > 1 else 0):
+            less = best.candidate.without(index)
+            if key_of(less) not in found:
+                values = np.concatenate(parts[:index] + parts[index + 1 :])
+                one = self.followed(self.whole, less, values)
+                if one is not None:
+                    found[key_of(less)] = one
+        return self._ranked(found, len(effects))
+
+    def score(self, found: Explained, count: int) -> float:
+        """Return ln (evidence times prior) of a hypothesis [nat], `count` effects being looked for."""
+        return found.evidence + log_prior(found.candidate, count, self.problem.setting)
+
+    def _ranked(self, found: Mapping[Key, Explained], count: int) -> list[Explained]:
+        return sorted(found.values(), key=lambda item: -self.score(item, count))
+
+    def screened(self, base: Explained, effects: Iterable[Effect]) -> list[tuple[float, Term, FloatArray]]:
+        """Return effects with the evidence that they may have beside a hypothesis, and values to begin with.
+
+        Best first, each at each of its places.
+        """
+        tried: list[tuple[Term, FloatArray]] = []
+        columns: list[Column] = []
+        there = {(term.effect.identifier, term.place) for term in base.candidate.terms}
+        for effect in effects:
+            for place in effect.places(self.problem.setting):
+                if (effect.identifier, place) in there:
+                    continue
+                for term in {Term(effect, place), Term(effect, place, bool(effect.shape))}:
+                    for values in variants(term):
+                        column = self.columns.of(base.view, base.motions, Candidate((term,)), values)
+                        if column is not None and any(np.any(part.readings) for part in column):
+                            tried.append((term, values))
+                            columns.append(column)
+        best: dict[tuple[str, str], tuple[float, Term, FloatArray]] = {}
+        for number, (value, size) in self._weighed(base, columns, [term for term, _ in tried]).items():
+            term, values = tried[number]
+            key = (term.label, term.place)
+            if key not in best or best[key][0] < value:
+                best[key] = (value, term, sized(term, values, size))
+        return sorted(best.values(), key=lambda item: -item[0])
+
+    def _weighed(
+        self, base: Explained, columns: Sequence[Column], terms: Sequence[Term]
+    ) -> dict[int, tuple[float, float]]:
+        """Return for columns (by number) evidence and factor, beside processes around the base's."""
+        if not columns:
+            return {}
+        gap = [self._gap(base, None), self._gap(base, base.motions)]
+        precision = []
+        for column in columns:
+            forces = [np.ravel(force) for part in column for force in part.forces.values()]
+            sizes = forces or [part.readings.ravel() for part in column]
+            own = float(np.sqrt(np.mean(np.concatenate(sizes) ** 2)))
+            precision.append((max(own, 1e-300) / (WIDE * gap[bool(forces)])) ** 2)
+        whole = replace(
+            base.view, motions=base.motions, effects=(*base.view.effects, *columns),
+            precision=(*base.view.precision, *precision),
+        )  # fmt: skip
+        count = len(base.view.precisions)
+        found: dict[int, tuple[float, float]] = {}
+        for size, time in product(SIZES, TIMES):
+            products = whole.products(scaled(base.processes, size, time))
+            for number, term in enumerate(terms):
+                chosen = [*range(count), count + number]
+                solution = products.solve(chosen, whole.precisions[chosen])
+                factor = float(solution.mean[-1])
+                better = number not in found or found[number][0] < solution.evidence
+                if better and np.isfinite(solution.evidence) and (factor > 0.0 or both_signs(term)):
+                    found[number] = (solution.evidence, factor)
+        return found
+
+    @staticmethod
+    def _gap(base: Explained, motions: Sequence[Motion] | None) -> float:
+        """Return the root mean square of the missing force, or of the residuals."""
+        if motions is None:
+            values = [trial.residual.ravel() for trial in base.view.trials]
+        else:
+            values = [np.ravel(force) for motion in motions for force in motion.forces.values()]
+        return max(float(np.sqrt(np.mean(np.concatenate(values) ** 2))), 1e-300)
+
+    def followed(self, base: Explained, candidate: Candidate, effect: FloatArray) -> Explained | None:
+        """Return a hypothesis at its most probable values, begun beside another; None: it cannot be."""
+        processes, motions, best, share = dict(base.processes), base.motions, None, 1.0
+        last: tuple[float, FloatArray, FloatArray, Sequence[Motion]] | None = None
+        for turn in range(ROUNDS):
+            view = self.linear(self.columns, base.view, motions, candidate, effect)
+            if view is None:
+                break
+            if turn in (0, ROUNDS - 1):
+                found = self._seen(view, candidate, effect, processes, SHARES[: 1 if turn else None])
+                processes = dict(found.processes)
+            else:
+                found = self._at(view, candidate, effect, processes)
+            if best is None or found.evidence > best.evidence:
+                best = found
+            if last is not None and found.evidence < last[0] - WORSE and share > LEAST_PART:
+                share *= 0.5
+                _, at, step, motions = last
+            else:
+                share = min(1.0, 2.0 * share)
+                step = found.solution.mean[len(view.shared_precision) :] - effect
+                at, motions = effect, found.motions
+                last = (found.evidence, at, step, motions)
+            effect = stepped(candidate, at, share * np.clip(step, -LONGEST_STEP, LONGEST_STEP))
+            if np.abs(step).max(initial=0.0) < SETTLED and turn:
+                break
+        return best
+
+    def linear(
+        self,
+        columns: Columns,
+        view: View,
+        motions: Sequence[Motion],
+        candidate: Candidate,
+        effect: FloatArray,
+    ) -> View | None:
+        """Return the view of a hypothesis, linear about values of its unknowns and along motions."""
+        at = columns.of(view, motions, candidate, effect) if candidate.terms else ()
+        if at is None:
+            return None
+        slopes = []
+        for k in range(len(effect)):
+            step = np.zeros(len(effect))
+            step[k] = SLOPE
+            ends = [columns.of(view, motions, candidate, effect + sign * step) for sign in (1.0, -1.0)]
+            if ends[0] is None or ends[1] is None:
+                return None
+            slopes.append(combined((ends[0], ends[1]), (0.5 / SLOPE, -0.5 / SLOPE)))
+        return replace(
+            view, motions=motions, effects=tuple(slopes), precision=(1.0,) * len(effect),
+            known=combined((at, *slopes), (1.0, *-effect)) if at else None,
+            own=columns.of_patch(view, motions, self.laws) if len(self.laws) else None,
+        )  # fmt: skip
+
+
+def sees_forces(problem: Problem) -> bool:
+    """Whether missing forces can be seen: in trials in motion, of a model that tells how its ports move."""
+    model = problem.model.inner
+    moving = any(data.trial.is_dynamic for data in problem.trials)
+    return moving and shows_ports(model) and bool(model.ports())
+
+
+def key_of(candidate: Candidate) -> Key:
+    """Return what tells candidates apart: sorted (identifier, place)."""
+    return tuple(sorted((term.label, term.place) for term in candidate.terms))
+
+
+def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:
+    """Return ln of the prior probability of a candidate at its places, `count` effects being looked for.
+
+    A free shape has to gain what the shape gate asks for.
+    """
+    terms = candidate.terms
+    if not terms:
+        return log(SEARCH.prior_none)
+    places = sum(log(len(term.effect.places(setting))) for term in terms)
+    free = sum(SHAPE_GAIN for term in terms if term.free_shape)
+    share = (1.0 - SEARCH.prior_none) * SEARCH.set_shares[len(terms) - 1]
+    return log(share / comb(count, len(terms))) - places - free
+
+
+def seen(
+    view: View,
+    about: Processes,
+    begin: Processes,
+    shares: Sequence[float] = SHARES,
+    candidate: Candidate = NOTHING,
+    effect: FloatArray = NO_VALUES,
+) -> Explained:
+    """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
+    processes, evidence = view.most_probable(about, begin, shares)
+    return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))
+
+
+def variants(term: Term) -> list[FloatArray]:
+    """Return standard normal values (E,) of a term's parameters at which it is tried."""
+    free = [number for number, item in enumerate(term.parameters) if not getattr(item, "magnitude", False)]
+    levels = [LEVELS if len(free) < 2 else LEVELS[::3]] * len(free)
+    found = []
+    for chosen in list(product(*levels))[:MOST_VARIANTS]:
+        values = np.full(len(term.parameters), AWAY)  # the middle of a prior of both signs is no effect
+        values[free] = chosen
+        found.append(values)
+    return found
+
+
+def both_signs(term: Term) -> bool:
+    """Whether an effect's size may be negative."""
+    return any(item.prior.low < 0.0 for item in term.effect.parameters if item.magnitude)
+
+
+def sized(term: Term, values: FloatArray, factor: float) -> FloatArray:
+    """Return values of a term's unknowns (E,) with its magnitudes taken `factor` times."""
+    found = values.copy()
+    for number, item in enumerate(term.effect.parameters):
+        if item.magnitude and (factor > 0.0 or item.prior.low < 0.0):
+            value = factor * item.prior.value(float(values[number]))
+            found[number] = np.clip(item.prior.normal(value), -LARGEST, LARGEST)
+    return found
+
+
+def stepped(candidate: Candidate, effect: FloatArray, step: FloatArray) -> FloatArray:
+    """Return the unknowns of a candidate (E,) after a step, taken along the values' tangents."""
+    priors = [item.prior for term in candidate.terms for item in term.parameters]
+    moved = [prior.stepped(float(u), float(s)) for prior, u, s in zip(priors, effect, step, strict=True)]
+    return np.clip(moved, -LARGEST, LARGEST)
+
+
+def scaled(processes: Processes, size: float, time: float) -> Mapping[int, Process]:
+    """Return processes of other sizes and times."""
+    return {port: replace(one, size=one.size * size, time=one.time * time) for port, one in processes.items()}

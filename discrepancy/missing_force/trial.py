@@ -1,13 +1,16 @@
 """A trial in which a missing force is looked for: what is left of its readings, and what unknowns do to them.
 
-Readings and columns are over the deviations of their noise. The unknowns are those of `fits.unknowns`, taken
-at their prior means; a calibrated parameter acts on the motion that the model has (a column) and on what the
-missing force adds to it (`slopes`), so that both together are exact along the motion that was.
+Readings and columns are over the deviations of their noise. The unknowns are those of
+`fits.unknowns`, taken at their prior means; a calibrated parameter acts on the motion that the model has (a
+column) and on what the missing force adds to it (`slopes`), so that both together are exact along the motion
+that was.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +18,9 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import NoiseModel
+from discrepancy.campaign.records import Quantity, Trial
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.linearisation import Point
+from discrepancy.fits.linearisation import PARAMETER_STEP, Point, moved
 from discrepancy.fits.problem import Problem
 from discrepancy.models.ported import PortedSystem, refined
 from fe.compilation import compiled
@@ -26,6 +30,7 @@ from . import kalman_kernels as kernels
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+Outputs = tuple[tuple[str, Quantity], ...]
 
 FINEST, COARSEST = 16, 4
 """Steps of an interval on which laws are evaluated, at most and at least."""
@@ -36,7 +41,20 @@ LONGEST_MEMORY, LEAST_WHITE = 2000, 1e-3
 SMALL = 1e-3
 """Step of the derivative of a system by a parameter, in prior deviations."""
 
+NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
+
 _driven = compiled(kernels.driven)
+
+
+class PortMotion(NamedTuple):
+    """What a unit of an unknown does to positions and speeds (2, F, P) of ports, linear about a value of it.
+
+    Unknowns are numbered: the shared ones, then the trial's own.
+    """
+
+    number: int
+    about: float
+    motion: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +80,7 @@ class SeenTrial:
     local_precision : (L,) ndarray
         Prior precision of the latter.
     system : PortedSystem
-        At the point.
+        At the point, with its gains.
     slopes : sequence of (n, n) ndarray or None
         Derivative of its generator by each shared unknown.
     parts : int
@@ -71,6 +89,12 @@ class SeenTrial:
         Motion of the ports by the model at the fine stamps.
     settled : bool
         Whether it begins at rest under what acts.
+    about : (K,) ndarray
+        Shared unknowns at the point.
+    gains : sequence of (int, int, float)
+        Shared unknowns that are gains: number, channel, and what a unit is over one and the gain.
+    by_unknowns : sequence of PortMotion
+        How the ports move otherwise, without a missing force, as unknowns do.
     """
 
     name: str
@@ -88,6 +112,9 @@ class SeenTrial:
     positions: FloatArray
     speeds: FloatArray
     settled: bool
+    about: FloatArray = field(default_factory=lambda: np.zeros(0))
+    gains: Sequence[tuple[int, int, float]] = ()
+    by_unknowns: Sequence[PortMotion] = ()
 
     @cached_property
     def steps(self) -> tuple[FloatArray, IntArray]:
@@ -119,12 +146,16 @@ class SeenTrial:
         count = len(self.time)
         return np.interp(np.arange((count - 1) * self.parts + 1) / self.parts, np.arange(count), self.time)
 
-    def port_motion(self, port: int, added: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return position and speed (F,) of a port: the model's, and of an added state (F, n)."""
-        return (
-            self.positions[:, port] + added @ self.system.positions[port],
-            self.speeds[:, port] + added @ self.system.speeds[port],
-        )
+    def port_motion(self, unknowns: FloatArray, added: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return positions and speeds (F, P) of the ports.
+
+        They are the model's at values (K + L,) of shared unknowns and the trial's own, and of an added state
+        (F, n).
+        """
+        motion = np.stack((self.positions, self.speeds))
+        for item in self.by_unknowns:
+            motion += (unknowns[item.number] - item.about) * item.motion
+        return motion[0] + added @ self.system.positions.T, motion[1] + added @ self.system.speeds.T
 
     def pushed(self, port: int, force: FloatArray) -> FloatArray:
         """Return the state (F, n) that a force (F,) at a port adds."""
@@ -139,18 +170,33 @@ class SeenTrial:
         rows = np.flatnonzero(np.any(slope, axis=1))
         return self._moved(np.zeros(len(slope)), np.eye(len(slope))[:, rows], added @ slope[rows].T)
 
-    def _moved(self, start: FloatArray, directions: FloatArray, pushes: FloatArray) -> FloatArray:
+    def _moved(
+        self, start: FloatArray, directions: FloatArray, pushes: FloatArray, which: IntArray | None = None
+    ) -> FloatArray:
         moves, begins, ends = self.fine
         begins, ends = np.ascontiguousarray(begins @ directions), np.ascontiguousarray(ends @ directions)
         pushes = np.ascontiguousarray(pushes)
-        return np.asarray(_driven(self.parts, moves, begins, ends, self.steps[1], start, pushes))
+        which = self.steps[1] if which is None else which
+        return np.asarray(_driven(self.parts, moves, begins, ends, which, start, pushes))
 
-    def readings(self, states: FloatArray, port: int = 0, force: FloatArray | None = None) -> FloatArray:
-        """Return what readings (N, C) show of an added state (F, n), and at once of a port's force (F,)."""
+    def readings(self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES) -> FloatArray:
+        """Return what readings (N, C) show of an added state (F, n), and at once of forces (F,) at ports."""
         shown = states[:: self.parts] @ self.system.outputs.T
-        if force is not None:
+        for port, force in forces.items():
             shown -= np.outer(force[:: self.parts], self.system.through[port])
         return self.over_noise(shown)
+
+    def ahead(self, forces: Mapping[int, FloatArray], begin: int, end: int) -> FloatArray:
+        """Return what forces at ports (F,) do to the readings from one sample until another, from nothing."""
+        fine = slice(begin * self.parts, (end - 1) * self.parts + 1)
+        pushes = np.array([force[fine] for force in forces.values()]).T
+        directions = -np.array([self.system.actions[port] for port in forces]).T
+        which = np.ascontiguousarray(self.steps[1][begin:end])
+        states = self._moved(np.zeros(len(directions)), directions, pushes, which)
+        shown = states[:: self.parts] @ self.system.outputs.T
+        for port, force in forces.items():
+            shown -= np.outer(force[fine][:: self.parts], self.system.through[port])
+        return np.asarray(shown / self.deviation * self.used[begin:end])
 
     def over_noise(self, columns: FloatArray) -> FloatArray:
         """Return columns (..., N, C) over the noise's deviations, zero where a reading does not count."""
@@ -178,6 +224,24 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     trial, shared, unknowns = data.trial, problem.shared, data.unknowns
     parts = problem.linearise(number, point, Candidate())
     gains = 1.0 + shared.gains(point.shared, trial.channels)
+    of_gains = np.zeros((len(shared.gain_channels), *parts.response.shape))
+    gain_unknowns = []
+    for row, name in enumerate(shared.gain_channels):
+        if name in trial.channels:
+            column, scale = trial.channels.index(name), float(shared.gain_scale[row])
+            of_gains[row, :, column] = scale * parts.response[:, column]
+            gain_unknowns.append((len(shared.parameter_mean) + row, column, scale / float(gains[column])))
+    zeros = np.zeros((unknowns.zeros, *parts.response.shape))
+    zeros[np.arange(unknowns.zeros), :, unknowns.zero_columns] = unknowns.zero_scale[:, None]
+    by_shared = np.concatenate((parts.parameters * gains, of_gains))
+    by_local = np.concatenate((zeros, parts.local * gains))
+    residual = trial.values - problem.prediction(number, point, parts.response)
+    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
+    outputs = tuple(
+        (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
+    )
+    base, slopes = _ported(problem, trial, outputs, point.shared)
+    base = replace(base, outputs=base.outputs * gains[:, None], through=base.through * gains)
     used = trial.used
     deviation = trial.noise_factor * np.array([item.static_deviation for item in data.noise])
     coloured = [
@@ -185,47 +249,48 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         for number, item in enumerate(data.noise)
         if trial.whitened_at is not None and (part := decaying_part(item, trial.whitened_at)) is not None
     ]
-
-    def over(columns: FloatArray) -> FloatArray:
-        return np.asarray(columns / deviation * used)
-
-    of_gains = np.zeros((len(shared.gain_channels), *parts.response.shape))
-    for row, name in enumerate(shared.gain_channels):
-        if name in trial.channels:
-            column = trial.channels.index(name)
-            of_gains[row, :, column] = shared.gain_scale[row] * parts.response[:, column]
-    zeros = np.zeros((unknowns.zeros, *parts.response.shape))
-    zeros[np.arange(unknowns.zeros), :, unknowns.zero_columns] = unknowns.zero_scale[:, None]
-    outputs = tuple(
-        (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
-    )
-
-    def system(u: FloatArray) -> PortedSystem:
-        return model.ported(trial, outputs, shared.parameters(u))  # type: ignore[attr-defined, no-any-return]
-
-    base = system(point.shared)
-    slopes: list[FloatArray | None] = []
-    for k in range(shared.size):
-        if k >= len(shared.parameter_mean):
-            slopes.append(None)
-            continue
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = point.shared.copy()
-            moved[k] = sign * SMALL
-            ends.append(system(moved).generator)
-        slopes.append((ends[0] - ends[1]) / (2.0 * SMALL))
     interval = float(np.median(np.diff(trial.time)))
     fastest = float(np.max(np.abs(np.linalg.eigvals(base.generator)), initial=0.0))
     count = int(np.clip(np.ceil(fastest * interval / FINE_PHASE), COARSEST, FINEST))
-    conditions = unknowns.conditions(trial, shared.parameters(point.shared), point.local[number])
-    positions, speeds = model.port_motion(refined(trial, count), conditions)  # type: ignore[attr-defined]
-    by_shared = over(np.concatenate((parts.parameters * gains, of_gains)))
-    by_local = over(np.concatenate((zeros, parts.local * gains)))
-    residual = over(trial.values - problem.prediction(number, point, parts.response))
-    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
+    fine = refined(trial, count)
+
+    def moving(of_all: FloatArray, local: FloatArray) -> FloatArray:
+        conditions = unknowns.conditions(trial, shared.parameters(of_all), local)
+        return np.stack(model.port_motion(fine, conditions))  # type: ignore[attr-defined]
+
+    here, local = moving(point.shared, point.local[number]), point.local[number]
+    by_unknowns = [
+        PortMotion(k, float(point.shared[k]), (moving(moved(point.shared, k), local) - here) / PARAMETER_STEP)
+        for k in range(len(shared.parameter_mean))
+    ] + [
+        PortMotion(
+            shared.size + k, float(local[k]), (moving(point.shared, moved(local, k)) - here) / PARAMETER_STEP
+        )
+        for k in range(unknowns.zeros, unknowns.size)
+    ]
+    residual, by_shared, by_local = (item / deviation * used for item in (residual, by_shared, by_local))
     return SeenTrial(
         trial.name, trial.time, residual, used,
         deviation, coloured, by_shared, by_local, unknowns.precision, base, slopes, count,
-        positions, speeds, trial.begins.value == "settled" and trial.kind.value != "ringdown",
+        here[0], here[1], trial.begins.value == "settled" and trial.kind.value != "ringdown", point.shared,
+        gain_unknowns, by_unknowns,
     )  # fmt: skip
+
+
+def _ported(
+    problem: Problem, trial: Trial, outputs: Outputs, shared: FloatArray
+) -> tuple[PortedSystem, list[FloatArray | None]]:
+    """Return how the ports of a trial move, and the derivatives of the generator by the shared unknowns."""
+    model, unknowns = problem.model.inner, problem.shared
+
+    def system(u: FloatArray) -> PortedSystem:
+        return model.ported(trial, outputs, unknowns.parameters(u))  # type: ignore[attr-defined, no-any-return]
+
+    base = system(shared)
+    slopes: list[FloatArray | None] = [None] * unknowns.size
+    for k in range(len(unknowns.parameter_mean)):
+        ends = []
+        for sign in (1.0, -1.0):
+            ends.append(system(moved(shared, k, sign * SMALL)).generator)
+        slopes[k] = (ends[0] - ends[1]) / (2.0 * SMALL)
+    return base, slopes

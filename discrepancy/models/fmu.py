@@ -11,7 +11,8 @@ from discrepancy.errors import ModelError
 from discrepancy.models.fmu_excitation import State
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_motion import FmuMotion
-from discrepancy.models.fmu_patch import NO_PATCH, SortedPatch, carries, sorted_patch
+from discrepancy.models.fmu_patch import NOTHING, SortedPatch, carries, sorted_patch
+from discrepancy.models.fmu_ports import SAFE_TURN
 from discrepancy.models.fmu_rest import port_flexibility, rest_with_laws
 from discrepancy.models.fmu_runs import FmuRuns
 from discrepancy.models.fmu_samples import sampled
@@ -24,11 +25,16 @@ from discrepancy.models.interface import (
     Scales,
     check_plain,
 )
+from discrepancy.models.port_system import PortSystem
+from discrepancy.models.ported import NO_PATCH, PortedSystem
 from fe.runtime.patch import ModelPatch, Primitive
 from fmu_asset.errors import FmuError
 from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
+
+FINER = (1, 2, 4, 8, 16)
+"""Refinements of the step at which the system of the ports is looked for."""
 
 
 class FmuModel:
@@ -148,9 +154,9 @@ class FmuModel:
         for trial in campaign.trials:
             state = self._trials.state(trial, Conditions(values), (), 0)
             if trial.is_dynamic:
-                moved = self._free(trial, Conditions(values), state, NO_PATCH, 1)[0]
+                moved = self._free(trial, Conditions(values), state, NOTHING, 1)[0]
             else:
-                moved = self._at_rest_values(trial, Conditions(values, health=trial.health), NO_PATCH)
+                moved = self._at_rest_values(trial, Conditions(values, health=trial.health), NOTHING)
             for port, column in zip(self._ports, port_columns, strict=True):
                 largest[port] = max(largest[port], float(np.max(np.abs(moved[:, column]))))
         frequency = given.angular_frequency
@@ -270,6 +276,61 @@ class FmuModel:
     ) -> tuple[FloatArray, float]:
         step, steps, loads = self._trials.excitations(trial, conditions, patch, self.motion, refinement)
         return self.motion.free(state, step, steps, loads), step
+
+    # ------------------------------------------------------------ ports
+
+    def ported(
+        self,
+        trial: Trial,
+        outputs: tuple[tuple[str, Quantity], ...],
+        parameters: FloatArray,
+        patch: ModelPatch = NO_PATCH,
+    ) -> PortedSystem:
+        """Return the system by which outputs see missing forces, in the state of that of the prior means.
+
+        Raises
+        ------
+        ModelError
+            If the FMU is not linear, or its answers to forces at the ports do not tell its system.
+        """
+        means = np.array([item.mean for item in self._parameters])
+        settings = sorted_patch(patch, self.description).settings
+        base, found = (self._port_system(trial, values, settings) for values in (means, parameters))
+        if base is None or found is None or len(base.transition) != len(found.transition):
+            raise ModelError(
+                f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
+                "move; it is not linear, or they are too few or too rough."
+            )
+        quantities = self.runs.quantities
+        orders = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
+        shown = list(zip(self._columns(outputs), orders, strict=True))
+        return found.in_state_of(base).ported(self._ports, self.motion.ports.x, self.motion.ports.v, shown)
+
+    def _port_system(
+        self, trial: Trial, parameters: FloatArray, settings: tuple[tuple[str, float], ...]
+    ) -> PortSystem | None:
+        """Return the system of the ports by steps so small that no mode turns by half a circle."""
+        conditions = Conditions(parameters, health=trial.health[:1])
+        state = self._trials.state(trial, conditions, settings, 0)
+        for refinement in FINER:
+            step = self.motion.step(trial, refinement)
+            found = self.motion.ports.system(state, step, len(trial.time)) if self._ports else None
+            if found is None or found.largest_turn <= SAFE_TURN:
+                return found
+        return None
+
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
+        parts = sorted_patch(patch, self.description)
+        state = self._trials.state(trial, conditions, parts.settings, 0)
+        values, step = self._free(trial, conditions, state, parts, 1)
+        rate, zero = conditions.clock
+        moved = values[:, self.motion.ports.x]
+        found = sampled(moved, step, (1.0 + rate) * trial.time + zero, [0] * len(self._ports))
+        assert found.rates is not None  # of a motion there are
+        return found.values, found.rates
 
     # ------------------------------------------------------------ rest
 

@@ -36,7 +36,7 @@ class SortedPatch:
     load: LoadChange
 
 
-NO_PATCH = SortedPatch(NO_LAWS, (), LoadChange())
+NOTHING = SortedPatch(NO_LAWS, (), LoadChange())
 """The empty patch, sorted."""
 
 

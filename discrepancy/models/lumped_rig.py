@@ -21,6 +21,8 @@ from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import PortLoad, course_of
 
 FloatArray = NDArray[np.float64]
+ActingLoad = tuple[float, float, FloatArray | None, Sequence[PortLoad]]
+"""Gain, tare and moved row of a trial's force, and loads at ports."""
 
 
 class LumpedRig:
@@ -249,10 +251,10 @@ class LumpedRig:
         outputs: Sequence[tuple[str, Quantity]],
         laws: Laws,
         conditions: Conditions,
-        load: tuple[float, float, FloatArray | None, Sequence[PortLoad]],
+        load: ActingLoad,
         refinement: int,
     ) -> Response:
-        """Return the response of a trial; `load`: gain, tare and moved row of its force, and loads at ports.
+        """Return the response of a trial.
 
         Raises
         ------
@@ -281,15 +283,21 @@ class LumpedRig:
             place = place if place is None else self._padded(place)
             force = acting_force(trial, gain, tare)
             return self._static(trial, force, row if place is None else place, self.shown(outputs), laws)
+        try:
+            motion, drives = self.moved(trial, conditions, laws, load, refinement)
+            return motion.response(self.shown(outputs, drives, motion.acting.references))
+        except ModelError as cause:
+            raise ModelError(f"The trial {trial.name!r} of {name!r}: {cause}") from cause
+
+    def moved(
+        self, trial: Trial, conditions: Conditions, laws: Laws, load: ActingLoad, refinement: int = 1
+    ) -> tuple[RigMotion, tuple[str, ...]]:
+        """Return the motion of a dynamic trial, and the inputs whose motion is prescribed."""
+        gain, tare, place, at_ports = load
         rig, acting, drives = self.acting(trial, conditions, gain, tare, place)
         if at_ports:
             acting = replace(acting, loads=(*acting.loads, *(self._at_port(item, rig) for item in at_ports)))
-        try:
-            return rig.motion(acting, laws, refinement).response(
-                self.shown(outputs, drives, acting.references)
-            )
-        except ModelError as cause:
-            raise ModelError(f"The trial {trial.name!r} of {name!r}: {cause}") from cause
+        return rig.motion(acting, laws, refinement), drives
 
     def _at_port(self, load: PortLoad, rig: Rig) -> tuple[FloatArray, FormulaCourse]:
         """Return the row and the course of a load at a port."""
@@ -324,11 +332,12 @@ class LumpedRig:
         rig, acting, _ = self.acting(trial, conditions, 0.0, 0.0, None)
         return rig.motion(replace(acting, begins=Start.STILL) if still else acting, self._laws)
 
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, load: ActingLoad
+    ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        rig, acting, _ = self.acting(trial, conditions, 0.0, 0.0, None)
-        motion = rig.motion(acting, NO_LAWS)
-        shapes = np.array(list(rig.ports.values())).reshape(-1, self.width) @ rig.shapes
+        motion, _ = self.moved(trial, conditions, NO_LAWS, load)
+        shapes = np.array(list(motion.rig.ports.values())).reshape(-1, self.width) @ motion.rig.shapes
         return motion.q @ shapes.T, motion.velocity @ shapes.T
 
     def shown(

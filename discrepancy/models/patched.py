@@ -3,12 +3,20 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Quantity, Trial
-from fe.runtime.patch import SENSORS, ModelPatch
+from discrepancy.errors import ModelError
+from fe.runtime.patch import SENSORS, ModelPatch, PortForce
 
 from .interface import Conditions, Model, ModelParameter, Response
+from .ported import NO_PATCH, PortedSystem, apart
 from .wrapped import WrappedModel
+
+FloatArray = NDArray[np.float64]
 
 
 class PatchedModel(WrappedModel):
@@ -65,3 +73,47 @@ class PatchedModel(WrappedModel):
         return self.inner.respond(
             trial, outputs, self.patch + patch, conditions, components=components, refinement=refinement
         )
+
+    # ------------------------------------------------------------ ports, where the inner model tells of them
+
+    def ported(
+        self,
+        trial: Trial,
+        outputs: tuple[tuple[str, Quantity], ...],
+        parameters: FloatArray,
+        patch: ModelPatch = NO_PATCH,
+    ) -> PortedSystem:
+        """Return the system by which outputs see missing forces, see `discrepancy.models.ported`.
+
+        Raises
+        ------
+        ModelError
+            If sensors are built in: what they make of a missing force is not known here.
+        """
+        if len(self.sensors):
+            raise ModelError(
+                f"{self.name} has sensors built in, through which no missing force is seen; leave them out."
+            )
+        inner: Any = self.inner
+        found: PortedSystem = inner.ported(trial, outputs, parameters, self.patch + patch)
+        return found
+
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
+        inner: Any = self.inner
+        found: tuple[FloatArray, FloatArray] = inner.port_motion(trial, conditions, self.patch + patch)
+        return found
+
+    def at_ports(self, forces: ModelPatch) -> ModelPatch:
+        """Return forces as they act at the ports of `ported`."""
+        return self.inner.at_ports(forces) if hasattr(self.inner, "at_ports") else forces
+
+    def apart(self) -> tuple[Model, ModelPatch]:
+        """Return the model without laws at ports, and these."""
+        inner, laws = apart(self.inner)
+        forces = ModelPatch(tuple(item for item in self.patch if isinstance(item, PortForce)))
+        rest = ModelPatch(tuple(item for item in self.patch if not isinstance(item, PortForce)))
+        calibrated = {item.name: (item.mean, item.deviation) for item in self.parameters}
+        return PatchedModel(inner, rest, calibrated), laws + forces

@@ -1,11 +1,14 @@
 """The ports of a linear FMU as a linear system, made from its answers to single forces."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm, logm
+
+from discrepancy.models.ported import PortedSystem
 
 FloatArray = NDArray[np.float64]
 
@@ -62,18 +65,80 @@ class PortSystem:
         """Largest turn of a mode in a step [rad]; beyond pi it would look like a smaller one."""
         return float(np.max(np.abs(np.angle(np.linalg.eigvals(self.transition)))))
 
-    def refined(self, parts: int) -> "PortSystem":
-        """Return the same system with steps that are so many times smaller."""
+    @cached_property
+    def push(self) -> FloatArray:
+        """Matrix (n, P) by which forces act in time, s' = G s + push f."""
+        return np.asarray(np.linalg.solve(self._over(self.step)[1], self.drive))
+
+    def _over(self, step: float) -> tuple[FloatArray, FloatArray]:
+        """Return the transition (n, n) of a step [s], and its integral over the step."""
         order = len(self.transition)
         block = np.zeros((2 * order, 2 * order))
         block[:order, :order], block[:order, order:] = self.generator, np.eye(order)
-        whole, part = expm(block * self.step), expm(block * self.step / parts)
-        start = np.linalg.solve(whole[:order, order:], self.drive)
-        finer = PortSystem(
-            part[:order, :order], part[:order, order:] @ start, self.outputs, self.direct, self.step / parts
-        )
+        whole = expm(block * step)
+        return whole[:order, :order], whole[:order, order:]
+
+    def refined(self, parts: int) -> "PortSystem":
+        """Return the same system with steps that are so many times smaller."""
+        transition, integral = self._over(self.step / parts)
+        finer = PortSystem(transition, integral @ self.push, self.outputs, self.direct, self.step / parts)
         vars(finer)["generator"] = self.generator  # the motion in time is the same
         return finer
+
+    def in_state_of(self, base: "PortSystem") -> "PortSystem":
+        """Return the same system in the state of another of its order.
+
+        Outputs and their rates say what that state is: those of a structure do not change with its
+        parameters, wherever its modes go.
+        """
+        mine, others = (np.vstack((item.outputs, item.outputs @ item.generator)) for item in (self, base))
+        size = np.linalg.norm(others, axis=1, keepdims=True)
+        size[size == 0.0] = 1.0
+        way = np.linalg.lstsq(mine / size, others / size, rcond=None)[0]
+        back = np.linalg.inv(way)
+        found = PortSystem(
+            back @ self.transition @ way, back @ self.drive, self.outputs @ way, self.direct, self.step
+        )
+        vars(found)["generator"], vars(found)["push"] = back @ self.generator @ way, back @ self.push
+        return found
+
+    def ported(
+        self,
+        ports: tuple[str, ...],
+        at: Sequence[int],
+        speeds: Sequence[int],
+        shown: Sequence[tuple[int, int]],
+    ) -> PortedSystem:
+        """Return it as the system by which outputs see missing forces.
+
+        Parameters
+        ----------
+        ports : tuple of str
+            Names.
+        at, speeds : sequence of int
+            Columns of the ports' displacements and velocities; -1: there is no velocity.
+        shown : sequence of (int, int)
+            Columns of the outputs, and how often each is derived.
+        """
+        order = len(self.transition)
+        powers = [np.eye(order)]
+        for _ in range(max([1, *(times for _, times in shown)])):
+            powers.append(powers[-1] @ self.generator)
+        rows = np.array([self.outputs[column] @ powers[times] for column, times in shown])
+        at_once = np.array(
+            [
+                self.outputs[column] @ powers[times - 1] @ self.push if times else self.direct[column]
+                for column, times in shown
+            ]
+        )
+        moving = [
+            self.outputs[v] if v >= 0 else self.outputs[x] @ self.generator
+            for x, v in zip(at, speeds, strict=True)
+        ]
+        return PortedSystem(
+            self.generator, ports, self.push.T, self.outputs[list(at)], np.array(moving),
+            rows.reshape(-1, order), at_once.reshape(-1, len(ports)).T,
+        )  # fmt: skip
 
     def motion(self, forces: FloatArray) -> FloatArray:
         """Return the outputs (N + 1, C) under forces (N, P), from rest."""

@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Hold, Trial
 from discrepancy.models.input_course import Course
+from discrepancy.models.interface import Model
+from discrepancy.models.wrapped import innermost
+from fe.runtime.patch import ModelPatch
 
 FloatArray = NDArray[np.float64]
+
+NO_PATCH = ModelPatch()
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +127,12 @@ def refined(trial: Trial, parts: int) -> Trial:
     )  # fmt: skip
 
 
-def shows_ports(model: object) -> bool:
+def shows_ports(model: Model) -> bool:
     """Whether a model tells how its ports move (`ported` and `port_motion`)."""
-    return hasattr(model, "ported") and hasattr(model, "port_motion")
+    return hasattr(innermost(model), "ported")
+
+
+def apart(model: Model) -> tuple[Model, ModelPatch]:
+    """Return a model without laws at its ports, and these at the prior means."""
+    found: tuple[Model, ModelPatch] = model.apart() if hasattr(model, "apart") else (model, NO_PATCH)
+    return found

@@ -2,15 +2,17 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
-from discrepancy.models.interface import Conditions, ModelParameter
+from discrepancy.models.interface import Conditions, Model, ModelParameter
 from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.models.lumped_rig import LumpedRig
-from discrepancy.models.ported import OutputRows, PortedSystem, modal_system
+from discrepancy.models.patch_parts import sorted_lumped
+from discrepancy.models.ported import NO_PATCH, OutputRows, PortedSystem, modal_system
 from discrepancy.models.rig import Rig
 from discrepancy.models.rig_records import Shown
 from discrepancy.models.second_order import SecondOrderSystem
@@ -50,34 +52,50 @@ class PortedLumped(ABC):
     def _mean(self) -> FloatArray:
         return np.array([item.mean for item in self.parameters])
 
+    @abstractmethod
+    def _moved_place(
+        self, lumped: LumpedRig, trial: Trial, along_span: float, along_chord: float
+    ) -> FloatArray | None: ...
+
     def ported(
-        self, trial: Trial, outputs: tuple[tuple[str, Quantity], ...], parameters: FloatArray
+        self,
+        trial: Trial,
+        outputs: tuple[tuple[str, Quantity], ...],
+        parameters: FloatArray,
+        patch: ModelPatch = NO_PATCH,
     ) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the modes of the prior means."""
-        warm = float(trial.temperature[0])
+        warm, structure = float(trial.temperature[0]), sorted_lumped(patch, cast(Model, self)).structure
         if trial.kind is TrialKind.RINGDOWN:
             vectors = {item.name: np.array(item.vector or ()) for item in self.description.output}
             rows = np.array([vectors[output] for output, _ in outputs]).reshape(len(outputs), -1)
-            base = self._system(self._mean, (), warm)
+            base = self._system(self._mean, structure, warm)
             quantities = [quantity for _, quantity in outputs]
-            return self._system(parameters, (), warm).ported(rows, quantities, base.shapes)
-        lumped = self._rig(parameters, (), warm)
+            return self._system(parameters, structure, warm).ported(rows, quantities, base.shapes)
+        lumped = self._rig(parameters, structure, warm)
         drives = lumped.acting(trial, Conditions(parameters), 0.0, 0.0, None)[2]
-        base_rig = self._rig(self._mean, (), warm).rig(drives)
+        base_rig = self._rig(self._mean, structure, warm).rig(drives)
         return rig_system(lumped.rig(drives), lumped.shown(outputs, drives), base_rig.free_shapes)
 
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
+    ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         warm = float(trial.temperature[0])
+        structure, _, (gain, tare, *moved), loads = sorted_lumped(
+            patch.in_trial(trial.name), cast(Model, self)
+        )
         if trial.kind is TrialKind.RINGDOWN and trial.release is not None:
-            system = self._system(conditions.parameters, (), warm)
+            system = self._system(conditions.parameters, structure, warm)
             motion = system.ringdown(
                 self._input_row(trial.load_place), trial.release, conditions.initial, trial.time, NO_LAWS,
                 clock=conditions.clock,
             )  # fmt: skip
             shapes = np.array(list(system.ports.values())).reshape(-1, len(system.mass)) @ system.shapes
             return motion.q @ shapes.T, motion.velocity @ shapes.T
-        return self._rig(conditions.parameters, (), warm).port_motion(trial, conditions)
+        lumped = self._rig(conditions.parameters, structure, warm)
+        place = self._moved_place(lumped, trial, *moved)
+        return lumped.port_motion(trial, conditions, (gain, tare, place, loads))
 
     def apart(self) -> "tuple[PortedLumped, ModelPatch]":
         """Return the linear model, and the laws that it has beside that, at the prior means."""

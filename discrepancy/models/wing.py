@@ -23,7 +23,8 @@ from discrepancy.models.interface import (
     check_plain,
 )
 from discrepancy.models.memory import Memory
-from discrepancy.models.ported import PortedSystem
+from discrepancy.models.ported import NO_PATCH, PortedSystem
+from discrepancy.models.second_order_motion import Motion
 from discrepancy.models.wing_structure import MovingWing, Outputs, Stiffness, WingStructure
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError, InvalidPatchError, SolutionError
@@ -255,9 +256,17 @@ class WingModel:
             laws = laws_of(self.wing.internal_forces(forces), self.wing.port_rows) if len(forces) else NO_LAWS
             if not trial.is_dynamic:
                 return self._at_rest(trial, outputs, rows, patch, conditions, laws, components)
-            return self._moving(
-                trial, outputs, rows, quantities, patch, conditions, laws, components, refinement
+            moved = self._moved(trial, conditions, patch, laws.ports)
+            motion = self._motion(moved, trial, conditions, patch, laws, refinement)
+            response = motion.response(rows @ moved.basis, quantities)
+            if not components:
+                return response
+            losses = patch.of(LocalStiffnessLoss)
+            across, shear = (
+                motion.values(self._structure.output_rows(outputs, number, losses) @ moved.basis)
+                for number in (1, 2)
             )
+            return Response(response.values, response.rates, across, shear)
         except (InvalidPatchError, SolutionError) as cause:
             raise ModelError(str(cause)) from cause
 
@@ -341,79 +350,60 @@ class WingModel:
         losses[:, :known] = health[:, :known]
         return losses
 
-    def _moving(
+    def _moved(
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch, ports: tuple[str, ...]
+    ) -> MovingWing:
+        losses, warm = tuple(self._losses(conditions.health)[0]), float(trial.temperature[0])
+        structure, place = patch.of(*STRUCTURE), trial.load_place
+        return self._structure.moving(conditions.parameters, losses, structure, warm, place, ports)
+
+    def _motion(
         self,
+        moved: MovingWing,
         trial: Trial,
-        outputs: Outputs,
-        rows: FloatArray,
-        quantities: list[Quantity],
-        patch: ModelPatch,
         conditions: Conditions,
-        laws: Laws,
-        components: bool,
-        refinement: int,
-    ) -> Response:
-        structure = patch.of(*STRUCTURE)
-        losses = self._losses(conditions.health)[0]
-        loads = patch.of(*LOADS)
-        basis, system = self._structure.moving(
-            conditions.parameters,
-            tuple(losses),
-            structure,
-            float(trial.temperature[0]),
-            trial.load_place,
-            laws.ports,
-        )
+        patch: ModelPatch,
+        laws: Laws = NO_LAWS,
+        refinement: int = 1,
+    ) -> Motion:
+        """Return the motion in a dynamic trial."""
+        basis, system = moved
         if trial.kind is TrialKind.RINGDOWN:
             if trial.release is None:
                 raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
-            motion = system.ringdown(
+            return system.ringdown(
                 self.wing.force_row(trial.load_place) @ basis, trial.release, conditions.initial, trial.time,
                 laws, clock=conditions.clock, refinement=refinement,
             )  # fmt: skip
-        else:
-            motion = system.forced(
-                self.wing.force_row(trial.load_place, loads) @ basis,
-                Course.of(trial.time, _amounts(trial, loads)[:, 0], trial.hold), trial.time, laws,
-                clock=conditions.clock, refinement=refinement,
-            )  # fmt: skip
-        response = motion.response(rows @ basis, quantities)
-        if not components:
-            return response
-        losses = structure.of(LocalStiffnessLoss)
-        across, shear = (
-            motion.values(self._structure.output_rows(outputs, number, losses) @ basis) for number in (1, 2)
-        )
-        return Response(response.values, response.rates, across, shear)
+        loads = patch.of(*LOADS)
+        return system.forced(
+            self.wing.force_row(trial.load_place, loads) @ basis,
+            Course.of(trial.time, _amounts(trial, loads)[:, 0], trial.hold), trial.time, laws,
+            clock=conditions.clock, refinement=refinement,
+        )  # fmt: skip
 
-    def ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+    # ------------------------------------------------------------ ports
+
+    def ported(
+        self, trial: Trial, outputs: Outputs, parameters: FloatArray, patch: ModelPatch = NO_PATCH
+    ) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the modes of the prior means."""
-        mean = np.array([item.mean for item in self._parameters])
-        base, moved = (self._moved(trial, values) for values in (mean, parameters))
-        rows = self._structure.output_rows(outputs, 0, ModelPatch())
+        means = np.array([item.mean for item in self._parameters])
+        of = (Conditions(values, health=trial.health[:1]) for values in (means, parameters))
+        base, moved = (self._moved(trial, conditions, patch, STATION_PORTS) for conditions in of)
+        rows = self._structure.output_rows(outputs, 0, patch.of(LocalStiffnessLoss))
         # both bases hold nearly the same shapes of the whole wing
         shapes = np.linalg.lstsq(moved.basis, base.basis @ base.system.shapes, rcond=None)[0]
         return moved.system.ported(rows @ moved.basis, [item for _, item in outputs], np.asarray(shapes))
 
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (N, P) of the ports in a dynamic trial."""
-        moved = self._moved(trial, conditions.parameters, conditions.health)
-        row = self.wing.force_row(trial.load_place) @ moved.basis
-        if trial.kind is TrialKind.RINGDOWN and trial.release is not None:
-            motion = moved.system.ringdown(
-                row, trial.release, conditions.initial, trial.time, NO_LAWS, clock=conditions.clock
-            )
-        else:
-            motion = moved.system.forced(
-                row, Course.of_force(trial), trial.time, NO_LAWS, clock=conditions.clock
-            )
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
+        moved = self._moved(trial, conditions, patch, STATION_PORTS)
+        motion = self._motion(moved, trial, conditions, patch)
         rows = np.array(list(moved.system.ports.values()))
         return motion.values(rows), motion.velocity @ (rows @ moved.system.shapes).T
-
-    def _moved(self, trial: Trial, parameters: FloatArray, health: FloatArray | None = None) -> MovingWing:
-        losses = tuple(self._losses(trial.health[:1] if health is None else health)[0])
-        warm, place = float(trial.temperature[0]), trial.load_place
-        return self._structure.moving(parameters, losses, ModelPatch(), warm, place, STATION_PORTS)
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at the ports of `ported`."""

@@ -118,17 +118,14 @@ def kept_shares(posterior: ParameterPosterior) -> NDArray[np.float64]:
     return np.asarray(posterior.draws.std(axis=0, ddof=1) / truncnorm.std(marginal.low, marginal.high))
 
 
-def _share(share: float) -> str:
-    return "all" if share > 0.995 else f"{100.0 * share:.0f} %"
-
-
 def _untold(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> list[str]:
     said = []
     draws = posterior.draws
     for prior, share in zip(priors, kept_shares(posterior).tolist(), strict=True):
         if share > LEFT:
+            left = "all" if share > 0.995 else f"{100.0 * share:.0f} %"
             said.append(
-                f"The campaign does not tell {prior.name}: {_share(share)} of its prior deviation is left, "
+                f"The campaign does not tell {prior.name}: {left} of its prior deviation is left, "
                 "and what is believed of it is the prior."
             )
     if len(priors) > 1:

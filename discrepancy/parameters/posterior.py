@@ -110,18 +110,14 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
 def is_gaussian(marginal: Marginal, centre: FloatArray, covariance: FloatArray) -> bool:
     """Return whether the energy rises along the principal axes as that of a Gaussian does."""
     least = marginal(centre)
-    for axis in _axes(covariance).T:
+    spread, directions = np.linalg.eigh(covariance)
+    for axis in (directions * np.sqrt(np.maximum(spread, 0.0))).T:
         for size, allowed in CHECKED:
             for side in (-1.0, 1.0):
                 rise = marginal(centre + side * size * axis) - least
                 if not abs(rise - 0.5 * size**2) < allowed:
                     return False
     return True
-
-
-def _axes(covariance: FloatArray) -> FloatArray:
-    spread, directions = np.linalg.eigh(covariance)
-    return np.asarray(directions * np.sqrt(np.maximum(spread, 0.0)))
 
 
 def mass_inside(centre: FloatArray, covariance: FloatArray, low: FloatArray, high: FloatArray) -> float:

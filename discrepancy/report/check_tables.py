@@ -9,18 +9,12 @@ from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.report.text import number, unit_text
-from reporting.page import Column, Table
+from reporting.page import Table, columns, numbers
 from reporting.words import listing
 
 HEADINGS = (
-    "effect",
-    "testable",
-    "shows best at",
-    "parameter",
-    "detectable from",
-    "prior median",
-    "confused with",
-)
+    "effect", "testable", "shows best at", "parameter", "detectable from", "prior median", "confused with",
+)  # fmt: skip
 _KIND_WORDS = {
     TrialKind.STATIC: "a static loading",
     TrialKind.RINGDOWN: "a ring-down",
@@ -39,21 +33,16 @@ def _row(found: Separability, item: Detectability) -> tuple[str, ...]:
     name = item.effect.identifier
     if item.reason:
         return (name, "no", "", "", item.reason.rstrip("."), "", "")
-    others = neighbours(found, name)
-    unit = f" {unit_text(item.unit)}".rstrip()
-    visible = "yes" if item.distance >= DETECTED else "larger than usual only"
+    seen = item.distance >= DETECTED
+    visible, others = "yes" if seen else "larger than usual only", ", ".join(neighbours(found, name))
     if not item.parameter:
-        size = "at once" if item.distance >= DETECTED else "not at its prior median"
-        return (name, visible, item.place, "", size, "", ", ".join(others))
-    return (
-        name,
-        visible if isfinite(item.detectable) else "not visible",
-        item.place,
-        item.parameter.replace("_", " "),
-        f"{number(item.detectable, 2)}{unit}" if isfinite(item.detectable) else "never",
-        f"{number(item.typical, 2)}{unit}",
-        ", ".join(others),
-    )
+        size = "at once" if seen else "not at its prior median"
+        return (name, visible, item.place, "", size, "", others)
+    unit = f" {unit_text(item.unit)}".rstrip()
+    size, typical = (f"{number(value, 2)}{unit}" for value in (item.detectable, item.typical))
+    if not isfinite(item.detectable):
+        visible, size = "not visible", "never"
+    return (name, visible, item.place, item.parameter.replace("_", " "), size, typical, others)
 
 
 def neighbours(found: Separability, name: str) -> list[str]:
@@ -67,14 +56,10 @@ def neighbours(found: Separability, name: str) -> list[str]:
 
 def can_decide_table(found: Separability) -> Table:
     """Return the rows as a table of the page, those that can be tested."""
-    return Table(
-        tuple(Column(title, numeric=title in ("prior median", "detectable from")) for title in HEADINGS),
-        [
-            tuple(cell.replace("_", " ") for cell in row)
-            for row, item in zip(rows_of(found), found.detectability, strict=True)
-            if not item.reason
-        ],
-    )
+    sizes = ("prior median", "detectable from")
+    heads = columns(*(numbers(title) if title in sizes else title for title in HEADINGS))
+    testable = [_row(found, item) for item in found.detectability if not item.reason]
+    return Table(heads, [tuple(cell.replace("_", " ") for cell in row) for row in testable])
 
 
 def confused_lines(found: Separability) -> list[str]:
@@ -125,18 +110,13 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         common = frozenset(TrialKind).intersection(*acts)
         apart = [kind for kind in TrialKind if kind in union - common and kind not in there]
         names = listing(name.replace("_", " ") for name in group)
-        if apart:
-            lines.append(
-                f"To tell {names} apart, add {' or '.join(_KIND_WORDS[kind] for kind in apart)}: some of "
-                "them "
-                "act there and others do not."
-            )
-        else:
-            lines.append(
-                f"To tell {names} apart, vary what was held: another amplitude, sign or place of the "
-                "load, a known "
-                "added mass, another temperature, strain beside displacement."
-            )
+        lines.append(
+            f"To tell {names} apart, add {' or '.join(_KIND_WORDS[kind] for kind in apart)}: some of them "
+            "act there and others do not."
+            if apart
+            else f"To tell {names} apart, vary what was held: another amplitude, sign or place of the load, "
+            "a known added mass, another temperature, strain beside displacement."
+        )
     hidden = [
         item
         for item in found.detectability

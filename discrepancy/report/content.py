@@ -25,12 +25,12 @@ class ReportInput:
         What it came from.
     separability : Separability or None
         What the campaign can decide.
-    intervals : sequence of sequence of PrimitiveInterval
-        Of the patch, by effect; empty without a patch.
-    design : WingDesign or None
-        Of a wing, for the map.
     self_calibration : SelfCalibration or None
         Where it was asked for.
+    design : WingDesign or None
+        Of a wing, for the map.
+    intervals : sequence of sequence of PrimitiveInterval
+        Of the patch, by effect; empty without a patch.
     fmu : str
         Name of the patched FMU, or why there is none; empty if none is due.
     """
@@ -38,9 +38,9 @@ class ReportInput:
     investigation: Investigation
     origin: Origin
     separability: Separability | None = None
-    intervals: Sequence[Sequence[PrimitiveInterval]] = ()
-    design: WingDesign | None = None
     self_calibration: SelfCalibration | None = None
+    design: WingDesign | None = None
+    intervals: Sequence[Sequence[PrimitiveInterval]] = ()
     fmu: str = ""
 
 

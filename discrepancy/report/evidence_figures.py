@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
+from discrepancy.report.kit import name_cells, panels
 from discrepancy.report.text import hypothesis_name, probability_text
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.verdict import ExplainedShare, Hypothesis, Scores
@@ -25,7 +26,8 @@ def evidence_figure(hypotheses: Sequence[Hypothesis]) -> Figure:
     none = next((item for item in hypotheses if not item.effects), None)
     if none is not None and none not in shown:
         shown.append(none)
-    names = [_wrapped(hypothesis_name(item)) for item in shown]
+    names = [hypothesis_name(item) for item in shown]
+    names = [name.replace(" + ", "\n+ ", 1) if len(name) > 38 else name for name in names]  # in two lines
     height = 0.3 * len(shown) + 0.8
     with publication_style():
         figure = new_figure(height)
@@ -58,11 +60,6 @@ def evidence_figure(hypotheses: Sequence[Hypothesis]) -> Figure:
         axes.tick_params(axis="y", length=0)
         axes.set_xlabel("probability among the hypotheses compared")
     return figure
-
-
-def _wrapped(name: str) -> str:
-    """Return a long set of effects in two lines."""
-    return name.replace(" + ", "\n+ ", 1) if len(name) > 38 else name
 
 
 def _signed(value: float) -> str:
@@ -98,11 +95,11 @@ def shares_figure(explained: ExplainedShare) -> Figure:
 def pit_figure(scores: Mapping[str, Scores]) -> Figure:
     """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
     with publication_style():
-        figure = new_figure(1.9)
-        grid = figure.add_gridspec(1, 2, left=0.09, right=0.985, bottom=0.22, top=0.87, wspace=0.18)
+        figure, (row,) = panels(1, 2, 1.9, 0.87, 0.22, left=0.09, wspace=0.18)
+        for spare in row[len(scores) :]:
+            spare.remove()
         top = max(max(item.pit) for item in scores.values())
-        for number, (title, item) in enumerate(scores.items()):
-            axes = figure.add_subplot(grid[0, number])
+        for number, (axes, (title, item)) in enumerate(zip(row, scores.items(), strict=False)):
             count = len(item.pit)
             axes.bar(
                 (np.arange(count) + 0.5) / count, item.pit, 0.94 / count,
@@ -124,7 +121,8 @@ def separability_figure(found: Separability) -> Figure | None:
     if len(names) < 2:
         return None
     # Members of a confusion group stand side by side.
-    order = sorted(range(len(names)), key=lambda n: (_group_number(found, names[n]), n))
+    number = {name: at for at, group in reversed([*enumerate(found.groups)]) for name in group}
+    order = sorted(range(len(names)), key=lambda n: (number.get(names[n], len(found.groups)), n))
     distance = found.distance[np.ix_(order, order)]
     table = np.clip(distance, 0.3, _LARGEST_DISTANCE)
     np.fill_diagonal(table, np.nan)
@@ -135,11 +133,8 @@ def separability_figure(found: Separability) -> Figure | None:
         width = min(0.175 * len(labels) / 7.2 + 0.02, 0.6)
         axes = figure.add_axes((0.26, 1.3 / height, width, 1.0 - 1.4 / height))
         image = axes.imshow(np.ma.masked_invalid(table), cmap=LEVELS, norm=LogNorm(1.0, _LARGEST_DISTANCE))
-        axes.set_facecolor("#f0f1f2")
-        axes.set_xticks(range(len(labels)), labels, rotation=55, ha="right", rotation_mode="anchor")
-        axes.set_yticks(range(len(labels)), labels)
-        axes.tick_params(length=0, labelsize=6.5)
-        axes.spines[:].set_visible(False)
+        name_cells(axes, labels, labels, 55)
+        axes.tick_params(labelsize=6.5)
         for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
             if row != column:
                 axes.plot(column, row, "x", color=PREDICTION, ms=4.0, mew=1.1)
@@ -153,13 +148,6 @@ def separability_figure(found: Separability) -> Figure | None:
     return figure
 
 
-def _group_number(found: Separability, name: str) -> int:
-    for number, group in enumerate(found.groups):
-        if name in group:
-            return number
-    return len(found.groups)
-
-
 def confusion_figure(found: SelfCalibration) -> Figure:
     """Draw the confusion matrix of the workflow on simulated campaigns of this geometry."""
     rows, columns, counts = found.confusion()
@@ -170,20 +158,16 @@ def confusion_figure(found: SelfCalibration) -> Figure:
         axes = figure.add_axes((0.27, 1.35 / height, width, 1.0 - 1.5 / height))
         share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         axes.imshow(np.where(counts > 0, share, np.nan), cmap=LEVELS, vmin=0.0, vmax=1.0, aspect="auto")
-        axes.set_facecolor("#f0f1f2")
         for (row, column), value in np.ndenumerate(counts):
             if value:
                 axes.text(
                     column, row, str(value), ha="center", va="center", fontsize=6.5,
                     color="white" if share[row, column] < 0.6 else "black",
                 )  # fmt: skip
-        axes.set_xticks(
-            range(len(columns)), [name.replace("_", " ") for name in columns], rotation=55, ha="right",
-            rotation_mode="anchor",
-        )  # fmt: skip
-        axes.set_yticks(range(len(rows)), [name.replace("_", " ") for name in rows])
-        axes.tick_params(length=0, labelsize=6.5)
-        axes.spines[:].set_visible(False)
+        name_cells(
+            axes, (name.replace("_", " ") for name in rows), (name.replace("_", " ") for name in columns), 55
+        )
+        axes.tick_params(labelsize=6.5)
         axes.set_ylabel("what was hidden")
         axes.set_xlabel("verdict")
     return figure

@@ -1,6 +1,6 @@
 """Sections on what was found: verdict, next experiment, where the gap is."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import isfinite, isnan
 
 from discrepancy.judgement.conclusion import named_effects
@@ -9,6 +9,7 @@ from discrepancy.report.content import ReportInput
 from discrepancy.report.sizes import definite_unit, size_sentence
 from discrepancy.report.text import (
     NAMING,
+    WORDS,
     added_label,
     catalogue_of,
     estimate_text,
@@ -25,9 +26,9 @@ from discrepancy.report.text import (
     shares_sentence,
     unit_text,
 )
-from discrepancy.verdict import NamedEffect, Proof, Scores, VerdictKind
+from discrepancy.verdict import Proof, Scores, VerdictKind
 from discrepancy.workflow import Investigation
-from reporting.page import Column, Page, Table
+from reporting.page import Page, Table, columns, numbers
 from reporting.words import counted, listing
 
 LEAST_SHARE = 0.05
@@ -56,12 +57,12 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
         )
     if not verdict.effects:
         return
-    for effect in _distinct(verdict.effects):
+    for effect in {item.identifier: item for item in verdict.effects}.values():
         entry = catalogue.get(effect.identifier)
         if entry is not None:
             page.add_paragraph(
                 f"{effect.name[0].upper()}{effect.name[1:]}: {formula(entry.equation)}. Its signature: "
-                f"{_sentence(formula(entry.signature))} Source: {_sentence(entry.reference)}"
+                f"{formula(entry.signature).rstrip('.')}. Source: {entry.reference.rstrip('.')}."
             )
     rows = []
     for effect in verdict.effects:
@@ -76,19 +77,11 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
             )  # fmt: skip
     page.add_table(
         Table(
-            (
-                Column("effect"), Column("place"), Column("parameter"), Column("value", numeric=True),
-                Column("90 % interval", numeric=True), Column("unit"),
-            ),
-            rows,
+            columns("effect", "place", "parameter", *map(numbers, ("value", "90 % interval")), "unit"), rows
         ),
-        {
-            VerdictKind.NAMED: "Most probable values and 90 % intervals.",
-            VerdictKind.NAMED_IN_PART: "Most probable values and 90 % intervals, wider for what is left.",
-            VerdictKind.FAMILY: "Most probable values and 90 % intervals; the shape was fitted.",
-        }.get(verdict.kind, "Most probable values and 90 % intervals of each, were it there alone."),
+        WORDS["sizes"].get(verdict.kind, WORDS["sizes"]["other"]),
         title="What is added" if verdict.kind in NAMING else "What could be added",
-    )  # fmt: skip
+    )
     _add_primitives(page, content)
 
 
@@ -137,14 +130,6 @@ def _scored(proof: Proof) -> tuple[Scores, Scores, str]:
     return proof.fitted_before, proof.fitted_after, "fitted"
 
 
-def _sentence(text: str) -> str:
-    return text.rstrip(".") + "."
-
-
-def _distinct(effects: Sequence[NamedEffect]) -> list[NamedEffect]:
-    return list({effect.identifier: effect for effect in effects}.values())
-
-
 def _add_primitives(page: Page, content: ReportInput) -> None:
     rows = []
     found = content.investigation
@@ -171,15 +156,7 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
     )  # fmt: skip
     fmu = f" {content.fmu}" if content.fmu else ""
     page.add_table(
-        Table(
-            (
-                Column("number"),
-                Column("value", numeric=True),
-                Column("90 % interval", numeric=True),
-                Column("unit"),
-            ),
-            rows,
-        ),
+        Table(columns("number", *map(numbers, ("value", "90 % interval")), "unit"), rows),
         f"patch.json holds it in SI units, ready for the model and its FMU.{marked}{fmu}",
         title="The change of the model",
     )
@@ -231,20 +208,15 @@ def add_next(page: Page, investigation: Investigation) -> None:
     )
     if sentence := when_sentence(investigation.verdict.windows):
         page.add_paragraph(sentence)
+    rows = [
+        (item.description, item.reason, f"{item.information:.2f}", f"{item.cost:g}")
+        for item in investigation.verdict.next_experiments
+    ]
     page.add_table(
-        Table(
-            (
-                Column("test"), Column("why"), Column("information", "nat", numeric=True),
-                Column("cost", "trials", numeric=True),
-            ),
-            [
-                (item.description, item.reason, f"{item.information:.2f}", f"{item.cost:g}")
-                for item in investigation.verdict.next_experiments
-            ],
-        ),
+        Table(columns("test", "why", numbers("information", "nat"), numbers("cost", "trials")), rows),
         "Cost is relative to one more trial of a kind that was done already.",
         title="Proposed tests, best first",
-    )  # fmt: skip
+    )
 
 
 def add_location(page: Page, investigation: Investigation) -> None:
@@ -268,24 +240,12 @@ def add_location(page: Page, investigation: Investigation) -> None:
     findings = [item for item in location.disagreements if item.share >= LEAST_SHARE][:SHOWN_FINDINGS]
     for item in findings:
         page.add_paragraph(f"• {item.sentence}")
+    rows = [
+        (test.name, number(test.statistic, 4), p_value_text(test.p_value), "yes" if test.rejected else "no")
+        for test in location.tests
+    ]
     page.add_table(
-        Table(
-            (
-                Column("test"),
-                Column("statistic", numeric=True),
-                Column("p", numeric=True),
-                Column("disagrees"),
-            ),
-            [
-                (
-                    test.name,
-                    number(test.statistic, 4),
-                    p_value_text(test.p_value),
-                    "yes" if test.rejected else "no",
-                )
-                for test in location.tests
-            ],
-        ),
+        Table(columns("test", numbers("statistic"), numbers("p"), "disagrees"), rows),
         "Residuals of the model as it was on fitted trials, each against what noise would leave after the "
         "fit; "
         "Holm's rule at 1 % over the tests.",

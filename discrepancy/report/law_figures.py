@@ -5,24 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
-from discrepancy.location.backbone import Backbone, backbones, restoring_force_surface
+from discrepancy.location.backbone import Backbone, RestoringForceSurface, backbones, restoring_force_surface
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.report.motion_figures import AFTER, before_label, mode_frequencies
-from reporting.figures import (
-    OBSERVED,
-    PAST,
-    PREDICTION,
-    REFERENCE,
-    new_figure,
-    publication_style,
-)
+from discrepancy.report.kit import models, panels, plain_powers
+from discrepancy.report.motion_figures import mode_frequencies
+from reporting.figures import OBSERVED, REFERENCE, publication_style
 
 FloatArray = NDArray[np.float64]
 
@@ -100,34 +93,34 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     channel = _clearest(items, frequencies[0])
     frequencies = _all_frequencies(items, channel, frequencies)
     measured = _backbones(items, channel, frequencies, None)
-    curves = [(_backbones(items, channel, frequencies, "prediction"), PREDICTION, "--", before_label(after))]
-    if after is not None:
-        curves.append((_backbones(_ringdowns(after), channel, frequencies, "prediction"), PAST, "-", AFTER))
-    modes = [mode for mode in sorted(measured) if sum(len(c.time) for c in measured[mode]) >= LEAST_POINTS][
-        :2
+    curves = [
+        (_backbones(_ringdowns(item.residuals), channel, frequencies, "prediction"), item)
+        for item in models(before, after)
     ]
+    modes = [n for n in sorted(measured) if sum(len(c.time) for c in measured[n]) >= LEAST_POINTS][:2]
     if not modes:
         return None
     factor, unit = UNITS[before.channels[channel].quantity].drawn
     with publication_style():
-        figure = new_figure(2.3 * len(modes) + 0.3)
-        grid = figure.add_gridspec(
-            len(modes), 2, left=0.09, right=0.985, bottom=0.19 / len(modes) + 0.02,
-            top=1.0 - 0.22 / (2.3 * len(modes)), hspace=0.4, wspace=0.26,
+        figure, cells = panels(
+            len(modes), 2, 2.3 * len(modes) + 0.3, 1.0 - 0.22 / (2.3 * len(modes)), 0.19 / len(modes) + 0.02,
+            left=0.09, hspace=0.4, wspace=0.26,
         )  # fmt: skip
         for row, mode in enumerate(modes):
-            for place, (name, label) in enumerate(
-                (("frequency", "frequency, Hz"), ("damping_ratio", "damping ratio, %"))
+            for place, (name, label, scale) in enumerate(
+                (("frequency", "frequency, Hz", 1.0), ("damping_ratio", "damping ratio, %", 100.0))
             ):
-                axes = figure.add_subplot(grid[row, place])
-                scale = 100.0 if name == "damping_ratio" else 1.0
-                for found, colour, dashes, text in curves:
-                    _draw_curves(axes, found.get(mode, []), name, factor, scale, colour, dashes, text)
+                axes = cells[row][place]
+                for found, shown in curves:
+                    for number, curve in enumerate(found.get(mode, [])):
+                        axes.plot(
+                            factor * curve.amplitude, scale * getattr(curve, name), shown.dashes,
+                            color=shown.colour, lw=1.1, alpha=0.8,
+                            label="_nolegend_" if number else shown.label,
+                        )  # fmt: skip
                 _draw_points(axes, measured[mode], name, factor, scale)
                 axes.set_xscale("log")
-                axes.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
-                axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-                axes.xaxis.set_minor_locator(NullLocator())
+                plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
                 axes.set_ylabel(label)
                 axes.set_title(f"{'abcd'[2 * row + place]}  mode {mode}", loc="left")
                 axes.set_xlabel(f"amplitude of {channel}, {unit}")
@@ -185,24 +178,6 @@ def _draw_points(axes: Axes, curves: Sequence[Backbone], name: str, factor: floa
         label = "_nolegend_"
 
 
-def _draw_curves(
-    axes: Axes,
-    curves: Sequence[Backbone],
-    name: str,
-    factor: float,
-    scale: float,
-    colour: str,
-    dashes: str,
-    label: str,
-) -> None:
-    for curve in curves:
-        axes.plot(
-            factor * curve.amplitude, scale * getattr(curve, name), dashes, color=colour, lw=1.1, alpha=0.8,
-            label=label,
-        )  # fmt: skip
-        label = "_nolegend_"
-
-
 def _range(axes: Axes, curves: Sequence[Backbone], name: str, scale: float) -> None:
     """Show what was measured and its surroundings, whatever a wrong model does."""
     values = scale * np.concatenate([getattr(curve, name) for curve in curves])
@@ -230,75 +205,59 @@ def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure
     item = items[number]
     column = item.column(channel)
     values = np.where(item.used[:, column], item.trial.values[:, column], item.prediction[:, column])
-    signals = [(values, "measured"), (item.prediction[:, column], "before")]
-    if after is not None:
-        signals.append((_ringdowns(after)[number].prediction[:, column], "after"))
+    shown = models(before, after)
+    signals = [values, *(_ringdowns(one.residuals)[number].prediction[:, column] for one in shown)]
     others = _others(values, item.trial.interval, frequencies[0])
     edge = round(1.0 / (frequencies[0] * item.trial.interval))  # where the filter has seen one side only
     try:
-        surfaces = {
-            name: restoring_force_surface(
+        measured, *predicted = (
+            restoring_force_surface(
                 item.trial.time[edge:-edge],
                 _first_mode(signal, item.trial.interval, frequencies[0], others)[edge:-edge],
                 frequencies[0],
             )
-            for signal, name in signals
-        }
+            for signal in signals
+        )
     except (FitError, ValueError):
         return None
-    rate = 2.0 * np.pi * frequencies[0]
-    shown = surfaces["measured"]
-    top = float(np.abs(shown.displacement).max())
-    design = np.column_stack((shown.displacement, shown.velocity, np.ones_like(shown.velocity)))
-    line = np.linalg.lstsq(design, -shown.acceleration, rcond=None)[0]
-    styles = {
-        "before": (PREDICTION, "--", before_label(after)),
-        "after": (PAST, "-", AFTER),
-    }
+    rate, top = 2.0 * np.pi * frequencies[0], float(np.abs(measured.displacement).max())
+    line = np.linalg.lstsq(_line(measured), -measured.acceleration, rcond=None)[0]
+
+    def rest(surface: RestoringForceSurface, over: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+        left = 100.0 * (-surface.acceleration - _line(surface) @ line) / (rate**2 * top)
+        x, v = surface.displacement / top, surface.velocity / (rate * top)
+        along, other = (v, x) if over == "velocity" else (x, v)
+        near = np.abs(other) < 0.35 * np.hypot(x, v)
+        return _binned(along[near], left[near])
+
+    plain = True
     with publication_style():
-        figure = new_figure(2.5)
-        grid = figure.add_gridspec(1, 2, left=0.09, right=0.985, bottom=0.17, top=0.9, wspace=0.26)
-        seen: list[float] = []
-        hidden: list[float] = []
-        for place, (name, label) in enumerate(
-            (("velocity", "velocity / largest"), ("displacement", "displacement / largest"))
-        ):
-            axes = figure.add_subplot(grid[0, place])
-            for key, surface in surfaces.items():
-                table = np.column_stack(
-                    (surface.displacement, surface.velocity, np.ones_like(surface.velocity))
-                )
-                rest = 100.0 * (-surface.acceleration - table @ line) / (rate**2 * top)
-                x, v = surface.displacement / top, surface.velocity / (rate * top)
-                along, other = (v, x) if name == "velocity" else (x, v)
-                near = np.abs(other) < 0.35 * np.hypot(x, v)
-                middles, means, errors = _binned(along[near], rest[near])
-                if key == "measured":
-                    axes.errorbar(
-                        middles,
-                        means,
-                        errors,
-                        fmt="o",
-                        ms=2.8,
-                        color=OBSERVED,
-                        elinewidth=0.7,
-                        label="measured",
-                    )
-                else:
-                    colour, dashes, text = styles[key]
-                    axes.plot(middles, means, dashes, color=colour, lw=1.2, label=text)
-                if key == "measured":
-                    seen.append(float(np.nanstd(means)) if np.isfinite(means).any() else 0.0)
-                    hidden.append(float(np.nanmedian(errors)) if np.isfinite(errors).any() else 1.0)
+        figure, (row,) = panels(1, 2, 2.5, 0.9, 0.17, left=0.09, wspace=0.26)
+        for axes, over, title in zip(
+            row, ("velocity", "displacement"), ("a  while passing through rest", "b  while turning back"),
+            strict=True,
+        ):  # fmt: skip
+            middles, means, errors = rest(measured, over)
+            axes.errorbar(
+                middles, means, errors, fmt="o", ms=2.8, color=OBSERVED, elinewidth=0.7, label="measured"
+            )
+            seen = float(np.nanstd(means)) if np.isfinite(means).any() else 0.0
+            hidden = float(np.nanmedian(errors)) if np.isfinite(errors).any() else 1.0
+            plain = plain and seen < 3.0 * hidden
+            for surface, one in zip(predicted, shown, strict=True):
+                middles, means, _ = rest(surface, over)
+                axes.plot(middles, means, one.dashes, color=one.colour, lw=1.2, label=one.label)
             axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
-            axes.set_xlabel(label)
-            axes.set_ylabel("force less linear part, %" if place == 0 else "")
-            axes.set_title(("a  while passing through rest", "b  while turning back")[place], loc="left")
-            if place == 0:
-                axes.legend(loc="best")
-    if all(size_ < 3.0 * error for size_, error in zip(seen, hidden, strict=True)):
-        return None
-    return figure, f"{channel} in {item.trial.name}"
+            axes.set_xlabel(f"{over} / largest")
+            axes.set_title(title, loc="left")
+        row[0].set_ylabel("force less linear part, %")
+        row[0].legend(loc="best")
+    return None if plain else (figure, f"{channel} in {item.trial.name}")
+
+
+def _line(surface: RestoringForceSurface) -> FloatArray:
+    """Return the columns (N, 3) of a linear force."""
+    return np.column_stack((surface.displacement, surface.velocity, np.ones_like(surface.velocity)))
 
 
 def _first_mode(signal: FloatArray, interval: float, frequency: float, others: Sequence[float]) -> FloatArray:
@@ -314,12 +273,9 @@ def _first_mode(signal: FloatArray, interval: float, frequency: float, others: S
 def _binned(along: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     edges = np.linspace(-1.0, 1.0, FORCE_BINS + 1)
     place = np.clip(np.digitize(along, edges) - 1, 0, FORCE_BINS - 1)
-    rows = [
-        (0.5 * (edges[n] + edges[n + 1]), values[place == n].mean(),
-         values[place == n].std() / np.sqrt(np.sum(place == n)))
-        if np.sum(place == n) >= 3
-        else (0.5 * (edges[n] + edges[n + 1]), np.nan, np.nan)
-        for n in range(FORCE_BINS)
-    ]  # fmt: skip
-    table = np.array(rows).reshape(-1, 3)
-    return table[:, 0], table[:, 1], table[:, 2]
+    means, errors = np.full(FORCE_BINS, np.nan), np.full(FORCE_BINS, np.nan)
+    for n in range(FORCE_BINS):
+        inside = values[place == n]
+        if len(inside) >= 3:
+            means[n], errors[n] = inside.mean(), inside.std() / np.sqrt(len(inside))
+    return 0.5 * (edges[:-1] + edges[1:]), means, errors

@@ -10,27 +10,14 @@ from scipy.signal import welch
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.dependence import predicted_frequencies
 from discrepancy.location.residuals import ResidualSet
+from discrepancy.report.kit import draw_noise, models, panels
 from discrepancy.report.residual_figures import size
-from reporting.figures import (
-    OBSERVED,
-    PAST,
-    PREDICTION,
-    REFERENCE,
-    TRUTH,
-    new_figure,
-    publication_style,
-)
+from reporting.figures import OBSERVED, REFERENCE, TRUTH, new_figure, publication_style
 
 FloatArray = NDArray[np.float64]
 
-AFTER = "with the effect"
 COMPARABLE = 6.0
 """Ratio of residuals before and after up to which they are drawn at one scale."""
-
-
-def before_label(after: ResidualSet | None) -> str:
-    """Return what the model is called that has no effect added."""
-    return "model" if after is None else "model as it was"
 
 
 @dataclass(frozen=True)
@@ -44,17 +31,13 @@ class Worst:
 def worst_record(before: ResidualSet) -> Worst | None:
     """Return the dynamic record whose residuals exceed the noise most; None without one."""
     found = [
-        (size(item, column), number, name)
+        (found, number, name)
         for number, item in enumerate(before.trials)
         if item.trial.is_dynamic
         for column, name in enumerate(item.trial.channels)
-        if item.used[:, column].any()
+        if item.used[:, column].any() and np.isfinite(found := size(item, column))
     ]
-    found = [row for row in found if np.isfinite(row[0])]
-    if not found:
-        return None
-    _, number, name = max(found)
-    return Worst(number, name)
+    return Worst(*max(found)[1:]) if found else None
 
 
 def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure:
@@ -63,58 +46,39 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     column = item.column(worst.channel)
     factor, unit = UNITS[before.channels[worst.channel].quantity].drawn
     time, used = item.trial.time, item.used[:, column]
+    shown = models(before, after)
     with publication_style():
-        rows = 3 if after is not None else 2
-        figure = new_figure(1.45 * rows + 0.35)
-        grid = figure.add_gridspec(
-            rows, 1, left=0.095, right=0.985, bottom=0.38 / (1.45 * rows), top=1.0 - 0.2 / (1.45 * rows),
-            hspace=0.34, height_ratios=[1.25, *([1.0] * (rows - 1))],
+        count = 1 + len(shown)
+        figure, cells = panels(
+            count, 1, 1.45 * count + 0.35, 1.0 - 0.2 / (1.45 * count), 0.38 / (1.45 * count), left=0.095,
+            hspace=0.34, height_ratios=[1.25, *([1.0] * len(shown))],
         )  # fmt: skip
-        axes = figure.add_subplot(grid[0, 0])
-        axes.plot(
-            time[used],
-            factor * item.trial.values[used, column],
-            ".",
-            ms=1.8,
-            color=OBSERVED,
-            label="measured",
-        )
-        axes.plot(
-            time,
-            factor * item.prediction[:, column],
-            "--",
-            lw=0.9,
-            color=PREDICTION,
-            label=before_label(after),
-        )
-        if after is not None:
-            other = after.trials[worst.trial]
-            axes.plot(time, factor * other.prediction[:, column], lw=0.9, color=PAST, label=AFTER)
+        (axes,), *below = cells
+        values = factor * item.trial.values[used, column]
+        axes.plot(time[used], values, ".", ms=1.8, color=OBSERVED, label="measured")
+        for one in shown:
+            predicted = factor * one.residuals.trials[worst.trial].prediction[:, column]
+            axes.plot(time, predicted, one.dashes, lw=0.9, color=one.colour, label=one.label)
         axes.set_ylabel(f"{worst.channel}, {unit}")
         axes.set_title(f"a  {worst.channel} in {item.trial.name}", loc="left")
         axes.legend(ncol=3, loc="upper right")
         axes.margins(x=0.01)
-        panels = [(item, PREDICTION, f"b  residual, {before_label(after)}")]
-        if after is not None:
-            alike = size(item, column) < COMPARABLE * size(after.trials[worst.trial], column)
-            title = f"c  residual, {AFTER}" + ("" if alike else " (own scale)")
-            panels.append((after.trials[worst.trial], PAST, title))
-        for number, (each, colour, title) in enumerate(panels, start=1):
-            below = figure.add_subplot(grid[number, 0], sharex=axes)
-            noise = factor * float(each.noise_deviation[column])
-            below.axhspan(
-                -2.0 * noise, 2.0 * noise, color=REFERENCE, alpha=0.3, lw=0.0, label="noise, ± 2 s0"
-            )
-            below.plot(time[used], factor * each.residual[used, column], lw=0.6, color=colour)
-            below.set_ylabel(f"residual, {unit}")
-            below.set_title(title, loc="left")
-            below.margins(x=0.01)
-            if number == 1:
-                below.legend(loc="upper right")
-        if after is not None and alike:
-            limits = [limit for below in figure.axes[1:] for limit in below.get_ylim()]
-            for below in figure.axes[1:]:
-                below.set_ylim(min(limits), max(limits))
+        sizes = [size(one.residuals.trials[worst.trial], column) for one in shown]
+        alike = sizes[0] < COMPARABLE * sizes[-1]
+        for number, ((panel,), one) in enumerate(zip(below, shown, strict=True)):
+            each = one.residuals.trials[worst.trial]
+            panel.sharex(axes)
+            draw_noise(panel, factor * float(each.noise_deviation[column]), 0.3)
+            panel.plot(time[used], factor * each.residual[used, column], lw=0.6, color=one.colour)
+            panel.set_ylabel(f"residual, {unit}")
+            own = " (own scale)" if number and not alike else ""
+            panel.set_title(f"{'bc'[number]}  residual, {one.label}{own}", loc="left")
+            panel.margins(x=0.01)
+        below[0][0].legend(loc="upper right")
+        if alike:
+            limits = [limit for (panel,) in below for limit in panel.get_ylim()]
+            for (panel,) in below:
+                panel.set_ylim(min(limits), max(limits))
         figure.axes[-1].set_xlabel("time, s")
         for above in figure.axes[:-1]:
             above.tick_params(labelbottom=False)
@@ -123,14 +87,11 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
 
 def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure | None:
     """Draw spectra of the residuals of the worst channel over all dynamic trials, with that of the noise."""
-    items = [(before, PREDICTION, "--", before_label(after))] + (
-        [(after, PAST, "-", AFTER)] if after is not None else []
-    )
-    drawn = []
-    for residuals, colour, dashes, label in items:
-        spectrum = _spectrum(residuals, worst.channel)
-        if spectrum is not None:
-            drawn.append((*spectrum, colour, dashes, label))
+    drawn = [
+        (*spectrum, item)
+        for item in models(before, after)
+        if (spectrum := _spectrum(item.residuals, worst.channel)) is not None
+    ]
     if not drawn:
         return None
     noise = before.channels[worst.channel].noise
@@ -140,17 +101,11 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
         if noise is not None and noise.samples is not None and noise.interval and len(noise.samples) >= 32:
             count = min(len(noise.samples), 128)
             at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
-            axes.plot(
-                at[1:],
-                power[1:] * 0.5 / noise.interval,
-                color=OBSERVED,
-                lw=0.8,
-                alpha=0.6,
-                label="noise record",
-            )
+            power = power[1:] * 0.5 / noise.interval
+            axes.plot(at[1:], power, color=OBSERVED, lw=0.8, alpha=0.6, label="noise record")
         axes.axhline(1.0, color=TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
-        for at, power, colour, dashes, label in drawn:
-            axes.plot(at, power, dashes, color=colour, lw=1.1, label=label)
+        for at, power, item in drawn:
+            axes.plot(at, power, item.dashes, color=item.colour, lw=1.1, label=item.label)
         for number, frequency in enumerate(mode_frequencies(before)[:4], start=1):
             axes.axvline(frequency, color=REFERENCE, lw=0.6, ls=":")
             axes.annotate(

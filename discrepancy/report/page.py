@@ -10,11 +10,11 @@ from discrepancy.report.grounds import (
     add_inclusion,
     add_not_fitted,
     add_origin,
+    add_parameters,
     add_proof,
     add_self_calibration,
     add_separability,
 )
-from discrepancy.report.parameter_table import add_parameters
 from discrepancy.verdict import VerdictKind
 from reporting.page import Page
 

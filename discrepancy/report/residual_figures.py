@@ -1,29 +1,21 @@
 """Where the gap is: residuals on the wing, by channel and trial, and over the load."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Channel, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Channel, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.report.kit import Shown, draw_noise, models, name_cells, panels, scale_of, size_bar, titles
 from fe.wing.design import WingDesign
-from reporting.figures import (
-    LEVELS,
-    OBSERVED,
-    PAST,
-    PREDICTION,
-    REFERENCE,
-    new_figure,
-    publication_style,
-)
+from reporting.figures import LEVELS, OBSERVED, publication_style
 
 FloatArray = NDArray[np.float64]
 
@@ -62,19 +54,11 @@ def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray
     for place, item in enumerate(residuals.trials):
         for column, name in enumerate(item.trial.channels):
             table[channels.index(name), place] = size(item, column)
-    return channels, [_with_role(item.trial) for item in residuals.trials], table
-
-
-def _with_role(trial: Trial) -> str:
-    """Return the name of a trial, which says whether it is held out."""
-    return f"{trial.name} (held out)" if trial.held_out and "held out" not in trial.name else trial.name
-
-
-def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
-    """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end."""
-    found = np.asarray(values, dtype=float)
-    largest = float(np.nanmax(found, initial=1.0))
-    return LogNorm(0.7, max(largest, 3.0))
+    names = [
+        f"{trial.name} (held out)" if trial.held_out and "held out" not in trial.name else trial.name
+        for trial in (item.trial for item in residuals.trials)
+    ]
+    return channels, names, table
 
 
 def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, tuple[float, float]]:
@@ -99,24 +83,19 @@ def planform_figure(before: ResidualSet, after: ResidualSet | None, design: Wing
     if not places:
         return None
     norm = scale_of([value for row in sizes for value in row.values()])
-    titles = ("a  model as it was", "b  with the effect") if after is not None else ("model as it is",)
     with publication_style():
-        figure = new_figure(1.62 * len(sizes) + 0.35)
-        grid = figure.add_gridspec(
-            len(sizes), 1, left=0.07, right=0.86, top=0.94 if len(sizes) > 1 else 0.88,
-            bottom=0.20 / len(sizes) + 0.04, hspace=0.30,
+        figure, rows = panels(
+            len(sizes), 1, 1.62 * len(sizes) + 0.35, 0.94 if after is not None else 0.88,
+            0.20 / len(sizes) + 0.04, left=0.07, right=0.86, hspace=0.30,
         )  # fmt: skip
-        for number, (row, title) in enumerate(zip(sizes, titles, strict=True)):
-            axes = figure.add_subplot(grid[number, 0])
+        for (axes,), row, title in zip(rows, sizes, titles(models(before, after)), strict=True):
             _draw_planform(axes, design)
             _draw_gauges(axes, before.channels, places, row, norm, design)
             axes.set_title(title, loc="left")
-            if number == len(sizes) - 1:
-                axes.set_xlabel("distance from the root, m")
-            else:
-                axes.tick_params(labelbottom=False)
             axes.set_ylabel("chord, m")
-        _size_bar(figure, norm, (0.885, 0.2, 0.016, 0.66))
+            axes.tick_params(labelbottom=axes is rows[-1][0])
+        rows[-1][0].set_xlabel("distance from the root, m")
+        size_bar(figure, norm, (0.885, 0.2, 0.016, 0.66))
     return figure
 
 
@@ -150,14 +129,13 @@ def _draw_planform(axes: Axes, design: WingDesign) -> None:
 
 def _draw_gauges(
     axes: Axes,
-    channels: dict[str, Channel] | object,
+    channels: Mapping[str, Channel],
     places: dict[str, tuple[float, float]],
     sizes: dict[str, float],
     norm: Normalize,
     design: WingDesign,
 ) -> None:
     form = design.planform
-    assert hasattr(channels, "__getitem__")
     for name, (station, fraction) in places.items():
         if name not in sizes:
             continue
@@ -178,50 +156,28 @@ def _draw_gauges(
         )
 
 
-def _size_bar(figure: Figure, norm: Normalize, place: tuple[float, float, float, float]) -> None:
-    axes = figure.add_axes(place)
-    bar = figure.colorbar(ScalarMappable(norm, LEVELS), cax=axes)
-    bar.set_label("rms residual / noise")
-    largest = float(norm.vmax or 1.0)
-    bar.ax.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0) if largest < 50.0 else (1.0,)))
-    bar.ax.yaxis.set_minor_locator(NullLocator())
-    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    bar.outline.set_linewidth(0.5)
-
-
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
     """Draw the sizes of the residuals by channel and trial, before and after at one scale."""
-    tables = [size_table(item) for item in (before, after) if item is not None]
+    shown = models(before, after)
+    tables = [size_table(item.residuals) for item in shown]
     channels, trials, _ = tables[0]
     norm = scale_of(np.concatenate([table.ravel() for _, _, table in tables]))
-    titles = ("a  model as it was", "b  with the effect") if after is not None else ("model as it is",)
-    longest = max(len(name) for name in trials)
-    below = min(0.22 + 0.042 * longest, 1.5)
+    below = min(0.22 + 0.042 * max(len(name) for name in trials), 1.5)
     height = max(0.22 * len(channels), 0.9) + below + 0.35
     with publication_style():
-        figure = new_figure(height)
-        grid = figure.add_gridspec(
-            1, len(tables), left=0.11, right=0.885 if len(tables) > 1 else 0.60, bottom=below / height,
-            top=1.0 - 0.28 / height, wspace=0.06,
+        figure, (row,) = panels(
+            1, len(tables), height, 1.0 - 0.28 / height, below / height, left=0.11,
+            right=0.60 if after is None else 0.885, wspace=0.06,
         )  # fmt: skip
-        for number, ((_, _, table), title) in enumerate(zip(tables, titles, strict=True)):
-            axes = figure.add_subplot(grid[0, number])
+        for number, (axes, (_, _, table), title) in enumerate(zip(row, tables, titles(shown), strict=True)):
             axes.imshow(np.ma.masked_invalid(table), cmap=LEVELS, norm=norm, aspect="auto")
-            _heat_axes(axes, channels if number == 0 else [""] * len(channels), trials, title)
+            name_cells(axes, [""] * len(channels) if number else channels, trials, 40)
+            axes.set_title(title, loc="left")
             if len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS:
                 _write_cells(axes, table, norm)
-        right = 0.905 if len(tables) > 1 else 0.62
-        _size_bar(figure, norm, (right, below / height, 0.016, 1.0 - (below + 0.28) / height))
+        right = 0.62 if after is None else 0.905
+        size_bar(figure, norm, (right, below / height, 0.016, 1.0 - (below + 0.28) / height))
     return figure
-
-
-def _heat_axes(axes: Axes, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
-    axes.set_yticks(range(len(rows)), list(rows))
-    axes.set_xticks(range(len(columns)), list(columns), rotation=40, ha="right", rotation_mode="anchor")
-    axes.tick_params(length=0)
-    axes.spines[:].set_visible(False)
-    axes.set_title(title, loc="left")
-    axes.set_facecolor("#f0f1f2")
 
 
 def _write_cells(axes: Axes, table: FloatArray, norm: Normalize) -> None:
@@ -236,47 +192,30 @@ def _write_cells(axes: Axes, table: FloatArray, norm: Normalize) -> None:
 
 def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None:
     """Draw residuals of static trials and flights over the load, by quantity; None without such trials."""
-    kinds = [(TrialKind.STATIC, "force, N"), (TrialKind.FLIGHT, "load factor")]
-    panels = []
-    for kind, label in kinds:
+    found = []
+    for kind, label in ((TrialKind.STATIC, "force, N"), (TrialKind.FLIGHT, "load factor")):
+        measured = {name for i in before.trials if i.trial.kind is kind for name in i.trial.channels}
         for quantity in Quantity:
-            names = [
-                name
-                for name, channel in before.channels.items()
-                if channel.quantity is quantity
-                and any(name in i.trial.channels for i in before.trials if i.trial.kind is kind)
-            ]
-            if names:
-                panels.append((kind, label, quantity, names))
-    if not panels:
+            channels = before.channels.items()
+            names = [name for name, item in channels if item.quantity is quantity and name in measured]
+            found += [(kind, label, quantity, names)] if names else []
+    if not found:
         return None
-    panels = panels[:4]
-    columns = min(len(panels), 2)
-    rows = (len(panels) + columns - 1) // columns
+    found = found[:4]
+    columns = min(len(found), 2)
+    rows = (len(found) + columns - 1) // columns
     with publication_style():
-        figure = new_figure(2.25 * rows + 0.3)
-        grid = figure.add_gridspec(
-            rows, columns, left=0.085, right=0.985, bottom=0.2 / rows + 0.02, top=1.0 - 0.24 / (2.25 * rows),
+        figure, cells = panels(
+            rows, columns, 2.25 * rows + 0.3, 1.0 - 0.24 / (2.25 * rows), 0.2 / rows + 0.02, left=0.085,
             hspace=0.42, wspace=0.24,
         )  # fmt: skip
-        for number, (kind, label, quantity, names) in enumerate(panels):
-            axes = figure.add_subplot(grid[number // columns, number % columns])
+        for spare in cells[-1][len(found) - columns * (rows - 1) :]:
+            spare.remove()
+        for number, (kind, label, quantity, names) in enumerate(found):
+            axes = cells[number // columns][number % columns]
             factor, unit = UNITS[quantity].drawn
-            noise = _draw_loads(
-                axes,
-                before,
-                kind,
-                names,
-                factor,
-                PREDICTION,
-                "o",
-                "model" if after is None else "model as it was",
-            )
-            if after is not None:
-                _draw_loads(axes, after, kind, names, factor, PAST, "D", "with the effect")
-            axes.axhspan(
-                -2.0 * noise, 2.0 * noise, color=REFERENCE, alpha=0.25, lw=0.0, label="noise, ± 2 s0"
-            )
+            noise, *_ = [_draw_loads(axes, item, kind, names, factor) for item in models(before, after)]
+            draw_noise(axes, noise, 0.25)
             axes.axhline(0.0, color=OBSERVED, lw=0.6)
             axes.set_xlabel(label)
             axes.set_ylabel(f"residual, {unit}")
@@ -286,32 +225,23 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
     return figure
 
 
-def _draw_loads(
-    axes: Axes,
-    residuals: ResidualSet,
-    kind: TrialKind,
-    names: Sequence[str],
-    factor: float,
-    colour: str,
-    marker: str,
-    label: str,
-) -> float:
-    noise = 0.0
-    shift = 0.0 if marker == "o" else 0.006
-    for item in residuals.trials:
+def _draw_loads(axes: Axes, shown: Shown, kind: TrialKind, names: Sequence[str], factor: float) -> float:
+    """Draw the residuals of a model, and return the largest deviation of the noise."""
+    noise, label = 0.0, shown.label
+    shift = 0.0 if shown.marker == "o" else 0.006
+    for item in shown.residuals.trials:
         if item.trial.kind is not kind:
             continue
         load = item.trial.force if kind is TrialKind.STATIC else item.trial.load_factor
         wide = float(np.ptp(load)) or 1.0
-        for name in names:
-            if name not in item.trial.channels:
-                continue
+        for name in (name for name in names if name in item.trial.channels):
             column = item.column(name)
             used = item.used[:, column]
             noise = max(noise, factor * float(item.noise_deviation[column]))
             axes.plot(
-                load[used] + shift * wide, factor * item.residual[used, column], marker, ms=2.8, lw=0.0,
-                mfc="none" if item.trial.held_out else colour, mec=colour, mew=0.7, alpha=0.8, label=label,
+                load[used] + shift * wide, factor * item.residual[used, column], shown.marker, ms=2.8, lw=0.0,
+                mfc="none" if item.trial.held_out else shown.colour, mec=shown.colour, mew=0.7, alpha=0.8,
+                label=label,
             )  # fmt: skip
             label = "_nolegend_"
     return noise

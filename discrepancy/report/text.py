@@ -1,36 +1,18 @@
 """Numbers and sentences of the report and of the summary on the terminal."""
 
 import re
+import tomllib
+from collections.abc import Callable
 from math import floor, isfinite, isnan, log10
+from pathlib import Path
+from typing import Any
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.verdict import Estimate, ExplainedShare, Hypothesis, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 
-MEANING = {
-    VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed: what the model leaves is noise.",
-    VerdictKind.NAMED: "The name has the probability, the evidence and the fit that a name needs: it passed "
-    "every gate that could be applied.",
-    VerdictKind.NAMED_IN_PART: "The name is the most probable one and closes most of the gap on trials that "
-    "it did not see, but what it leaves is more than noise and has no name: the numbers hold as far as that.",
-    VerdictKind.FAMILY: "The kind of the effect is known, its exact law is not one of the catalogue: the "
-    "shape below was fitted.",
-    VerdictKind.GROUP: "Something is missing. Each member of the group fits the data; the figures after "
-    "adding an effect are those of its most probable member, which is no name.",
-    VerdictKind.UNEXPLAINED: "There is a gap, and nothing in the catalogue fits it well enough to be named.",
-    VerdictKind.DATA_ERROR: "The data are at fault; nothing was fitted. Mend them, do not correct them to "
-    "fit the model.",
-    VerdictKind.BELOW_LIMIT: "The data do not decide between noise and a small effect.",
-}
-"""What each kind of verdict means, in a sentence, where the channels have noise records."""
-
-UNJUDGED = {
-    VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed. Whether what the model leaves is "
-    "noise could not be judged.",
-    VerdictKind.NAMED: "The name has the probability and the evidence that a name needs. The gate of "
-    "absolute fit could not be applied: it is not known whether that is all.",
-}
-"""The same, where the absolute fit could not be judged: no noise record, or too few readings."""
+WORDS: dict[str, Any] = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+"""What each kind of verdict means, also where the absolute fit could not be judged, and words of figures."""
 
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
 """Verdicts that say what is missing, if not all of it."""
@@ -49,31 +31,27 @@ def estimate_text(estimate: Estimate) -> tuple[str, str]:
     return show(estimate.value), f"{show(estimate.low)} to {show(estimate.high)}"
 
 
-class rounded:  # noqa: N801 - used as a function
-    """Format numbers alike: two significant digits of a spread.
+def rounded(value: float, spread: float) -> Callable[[float], str]:
+    """Return what formats numbers alike: with two significant digits of a spread.
 
     Parameters
     ----------
     value, spread : float
         Typical value and its uncertainty.
     """
+    largest, power, decimals = max(abs(value), abs(spread)), 0, 3
+    if largest > 0.0 and not 1e-3 <= largest < 1e5:
+        power = floor(log10(largest))
+    if spread > 0.0 and isfinite(spread):
+        decimals = min(max(1 - floor(log10(spread)) + power, 0), 9)
 
-    def __init__(self, value: float, spread: float) -> None:
-        largest = max(abs(value), abs(spread))
-        self._power = 0
-        if largest > 0.0 and not 1e-3 <= largest < 1e5:
-            self._power = floor(log10(largest))
-        if spread > 0.0 and isfinite(spread):
-            self._decimals = min(max(1 - floor(log10(spread)) + self._power, 0), 9)
-        else:
-            self._decimals = 3
-
-    def __call__(self, value: float) -> str:
-        """Return the number as text."""
+    def show(value: float) -> str:
         if not isfinite(value):
             return "not known" if isnan(value) else "unbounded"
-        text = f"{value / 10.0**self._power:.{self._decimals}f}".replace("-", "\N{MINUS SIGN}")
-        return text + (f"e{self._power}" if self._power else "")
+        text = f"{value / 10.0**power:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+        return text + (f"e{power}" if power else "")
+
+    return show
 
 
 def probability_text(probability: float) -> str:
@@ -118,12 +96,7 @@ def headline(verdict: Verdict) -> str:
         text = re.sub(whole, lambda _, name=name: name, text)  # type: ignore[misc]
     if isnan(verdict.probability) or "probability" in text:
         return text + "."
-    about = {
-        VerdictKind.NOTHING_MISSING: "probability that nothing is missing",
-        VerdictKind.GROUP: "together they have the probability",
-        VerdictKind.FAMILY: "probability",
-        VerdictKind.BELOW_LIMIT: "together with none they have the probability",
-    }.get(verdict.kind)
+    about = WORDS["probability"].get(verdict.kind)
     if about is None:
         return text + "."
     return f"{text} ({about} {probability_text(verdict.probability)})."
@@ -159,7 +132,8 @@ def remainders_sentence(verdict: Verdict) -> str:
 def meaning(verdict: Verdict) -> str:
     """Return what the verdict means, in a sentence."""
     judged = all(gate.passed is not None for gate in verdict.gates if gate.name == "absolute fit")
-    return MEANING[verdict.kind] if judged else UNJUDGED.get(verdict.kind, MEANING[verdict.kind])
+    told: str = WORDS["meaning"][verdict.kind]
+    return told if judged else WORDS["unjudged"].get(verdict.kind, told)
 
 
 def hypothesis_name(hypothesis: Hypothesis) -> str:
@@ -188,11 +162,8 @@ def added_label(investigation: Investigation) -> str:
 
 def catalogue_of(investigation: Investigation) -> dict[str, Effect]:
     """Return the effects that could be tested, by identifier."""
-    return (
-        {}
-        if investigation.search is None
-        else {item.identifier: item for item in investigation.search.effects}
-    )
+    effects = () if investigation.search is None else investigation.search.effects
+    return {item.identifier: item for item in effects}
 
 
 _GREEK = {

@@ -9,8 +9,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from discrepancy.location.change_points import GapWindow, Moment
-from discrepancy.report.residual_figures import scale_of
+from discrepancy.report.kit import scale_of
+from discrepancy.verdict import GapWindow, Moment
 from reporting.figures import LEVELS, OBSERVED, REFERENCE, new_figure, publication_style
 
 MOST_RECORDS = 12

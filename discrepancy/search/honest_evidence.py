@@ -6,9 +6,9 @@ hypothesis leaves noise, thousands of nats separate what a model of a real thing
 
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.remainder_inference import RemainderPrior, infer, with_remainder
+from discrepancy.missing_force.naming import key_of
 from discrepancy.search_settings import SEARCH
 
-from .hypotheses import key_of
 from .strategy import Search
 
 

@@ -2,28 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import comb, exp, log
+from math import exp
 
 from scipy.special import logsumexp
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.fits.problem import Problem
-from discrepancy.search_settings import SEARCH
+from discrepancy.missing_force.naming import Key, key_of, log_prior
 
-Key = tuple[tuple[str, str], ...]
 Tell = Callable[[str], None]
 
 
 def in_silence(what: str) -> None:
     """Tell nobody."""
-
-
-def key_of(candidate: Candidate) -> Key:
-    """Return what tells candidates apart: sorted (identifier, place)."""
-    return tuple(sorted((term.label, term.place) for term in candidate.terms))
 
 
 @dataclass
@@ -63,20 +56,8 @@ class Hypotheses:
         self.exact[()] = self.none
 
     def log_prior(self, candidate: Candidate) -> float:
-        """Return ln of the prior probability of a candidate at its places.
-
-        A free shape has to gain what the shape gate asks for.
-        """
-        count = len(candidate.terms)
-        if count == 0:
-            return log(SEARCH.prior_none)
-        sets = comb(len(self.effects), count)
-        places = sum(log(self._places(term.effect)) for term in candidate.terms)
-        free = sum(SHAPE_GAIN for term in candidate.terms if term.free_shape)
-        return log((1.0 - SEARCH.prior_none) * SEARCH.set_shares[count - 1] / sets) - places - free
-
-    def _places(self, effect: Effect) -> int:
-        return len(effect.places(self.problem.setting))
+        """Return ln of the prior probability of a candidate at its places."""
+        return log_prior(candidate, len(self.effects), self.problem.setting)
 
     def score(self, found: CandidateFit) -> float:
         """Return ln (evidence times prior), up to a constant."""

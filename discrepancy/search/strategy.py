@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.catalogue.windowed import in_events
+from discrepancy.catalogue.library import in_events
+from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
@@ -15,12 +16,13 @@ from discrepancy.fits.linearisation import Point
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
+from discrepancy.missing_force.naming import Explained, ForceSearch, key_of, sees_forces
 from discrepancy.models.wrapped import has_law
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import MicroSlip, ModelPatch
 
 from .growing_records import Beginnings
-from .hypotheses import Hypotheses, Tell, in_silence, key_of
+from .hypotheses import Hypotheses, Tell, in_silence
 from .starting_points import acts_within, are_related, pairs, starts
 
 FloatArray = NDArray[np.float64]
@@ -40,6 +42,8 @@ class Search(Hypotheses):
 
     beginnings: Beginnings = field(init=False)
     longest: int = field(init=False, default=0)
+    force: ForceSearch | None = field(init=False, default=None)
+    forces: list[Explained] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -164,6 +168,34 @@ class Search(Hypotheses):
                 self.settle()
             if move.needed(self):
                 move.make(self)
+
+    def by_force(self) -> bool:
+        """Fit the sets of effects that follow the missing force best; False where that is not seen."""
+        if not sees_forces(self.problem) or not all(data.trial.is_dynamic for data in self.problem.trials):
+            return False
+        self.tell("looking for the missing force")
+        force = ForceSearch(self.problem)
+        try:
+            force.locate()
+            self.forces = force.name(self.effects)
+        except (ModelError, np.linalg.LinAlgError) as cause:
+            self.tell(f"the missing force cannot be seen: {cause}")
+            return False
+        self.force = force
+        best = force.score(self.forces[0], len(self.effects))
+        close = [
+            item
+            for item in self.forces
+            if item.candidate.terms and force.score(item, len(self.effects)) > best - SEARCH.followed
+        ][: SEARCH.far_fits]
+        for number, item in enumerate(close):
+            names = " and ".join(item.candidate.identifiers)
+            self.tell(f"fitting {names} to the end, {len(close) - number - 1} more")
+            found = attempt(self.problem, item.candidate, force.whole_point(item))
+            if found is not None:
+                self.keep(found, exact=True)
+        self.settle()
+        return True
 
     def unexplained(self) -> bool:
         """Whether the best candidate cannot be shown to explain the data."""
@@ -375,7 +407,9 @@ STRATEGY = (
 """Simple causes before others: one effect, one law of free shape, more effects, any two; then fewer again."""
 
 
-def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:
+def search(
+    problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence, *, by_force: bool = True
+) -> Search:
     """Fit the model without effect, then search the catalogue.
 
     Parameters
@@ -387,6 +421,8 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
         or ended is tried so too.
     tell : callable
         Takes a few words on what is fitted, and how much is left.
+    by_force : bool
+        Whether the missing force leads, where it can be seen.
 
     Returns
     -------
@@ -401,7 +437,8 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
     usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)
-    found.run()
+    if not (by_force and found.by_force()):
+        found.run()
     return found
 
 

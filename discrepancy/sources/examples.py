@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -53,8 +53,8 @@ class ExamplePlan:
         Of a ring-down and its samples [s].
     load_place : str or tuple of float
         Where the force acts.
-    static_channels, dynamic_channels, flight_channels : tuple of str
-        Names of the channels that each kind of trial measures; empty: all.
+    flight_channels : tuple of str
+        Names of the channels that flights measure; empty: all.
     """
 
     channels: tuple[Channel, ...]
@@ -64,16 +64,11 @@ class ExamplePlan:
     duration: float = 2.0
     interval: float = 0.002
     load_place: str | tuple[float, float] = "tip_load"
-    static_channels: tuple[str, ...] = ()
-    dynamic_channels: tuple[str, ...] = ()
-    flight_channels: tuple[str, ...] = field(default=())
+    flight_channels: tuple[str, ...] = ()
 
     def names(self, kind: TrialKind) -> tuple[str, ...]:
         """Return the names of the channels that a kind of trial measures."""
-        chosen = {
-            TrialKind.STATIC: self.static_channels,
-            TrialKind.FLIGHT: self.flight_channels,
-        }.get(kind, self.dynamic_channels)
+        chosen = self.flight_channels if kind is TrialKind.FLIGHT else ()
         return chosen or tuple(channel.name for channel in self.channels)
 
 
@@ -159,7 +154,7 @@ def plan_for(
         interval=period / 50.0,
         load_place=load_place,
     )
-    trial = _blank("", TrialKind.STATIC, plan, np.array([plan.force]), start=0.0, run="")
+    trial = _blank("", TrialKind.STATIC, plan, np.array([plan.force]), 0.0)
     bare = Campaign("", {channel.name: channel for channel in channels}, (), None, {}, "")
     seen = np.abs(observe(model, bare, trial, ModelPatch(), prior_mean(bare, model, trial)).values[0])
     sized = []
@@ -279,36 +274,13 @@ def _trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
 
 
 def _blank(
-    name: str,
-    kind: TrialKind,
-    plan: ExamplePlan,
-    rows: np.ndarray,
-    *,
-    start: float,
-    run: str,
-    release: Release | None = None,
-    held_out: bool = False,
+    name: str, kind: TrialKind, plan: ExamplePlan, rows: np.ndarray, start: float, **given: Any
 ) -> Trial:
     """Return a trial without readings; `rows` are forces, load factors or times."""
-    names, count = plan.names(kind), len(rows)
-    zeros = np.zeros(count)
-    return Trial(
-        name=name,
-        kind=kind,
-        channels=names,
-        values=np.zeros((count, len(names))),
-        used=np.ones((count, len(names)), dtype=bool),
-        time=rows if kind is TrialKind.RINGDOWN else np.full(count, start),
-        force=rows if kind is TrialKind.STATIC else zeros,
-        load_factor=rows if kind is TrialKind.FLIGHT else zeros,
-        load_place=plan.load_place,
-        temperature=zeros,
-        start=start,
-        run=run,
-        health=np.zeros((count, 2)),
-        health_deviation=np.zeros((count, 2)),
-        release=release,
-        held_out=held_out,
+    time = rows if kind is TrialKind.RINGDOWN else np.full(len(rows), start)
+    what = {TrialKind.STATIC: {"force": rows}, TrialKind.FLIGHT: {"load_factor": rows}}.get(kind, {})
+    return Trial.plain(
+        name, kind, plan.names(kind), time, load_place=plan.load_place, start=start, **what, **given
     )
 
 
@@ -329,7 +301,7 @@ def _measure(
     for column, name in enumerate(trial.channels):
         channel = campaign.channels[name]
         zero = channel.offset_deviation if np.isfinite(channel.offset_deviation) else 0.0
-        noise = 0.0 if channel.noise is None else channel.noise.standard_deviation * trial.noise_factor
+        noise = channel.noise_in(trial)
         values[:, column] = values[:, column] * gains[name] + zero * generator.normal()
         values[:, column] += noise * generator.normal(size=len(values))
     return replace(trial, values=values)

@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -37,12 +36,8 @@ from reporting.words import counted
 FloatArray = NDArray[np.float64]
 
 RUN_FILE, CONFIG_FILE = "run.nc", "config.json"
-DESIGN_FILE, CALIBRATION_FILE, BINDING_FILE = (
-    "asset/design.toml",
-    "asset/calibration.nc",
-    "asset/binding.toml",
-)
-MODEL_PATCH_FILE = "asset/model_patch.json"
+DESIGN_FILE, CALIBRATION_FILE = "asset/design.toml", "asset/calibration.nc"
+BINDING_FILE, MODEL_PATCH_FILE = "asset/binding.toml", "asset/model_patch.json"
 PATCH_NAME, PATCH_STEP = "model_patch", "model_patch_from_step"
 """Attributes of `run.nc` where a watch adopted a patch on the way: its file, and the first step with it."""
 STRAIN = "strain"
@@ -151,17 +146,15 @@ def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign
     channels = {
         name: Channel(name, Quantity.STRAIN, f"strain[{name[1:]}]", NoiseRecord(noise, inf)) for name in names
     }
-    whole = Trial(
-        name="turns", kind=TrialKind.FLIGHT, channels=names,
-        values=np.where(used, strain, 0.0), used=used, time=time,
-        force=np.zeros(size), load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
-        load_place="tip_load", temperature=temperature, start=0.0, run=str(run.attrs.get("scenario", "run")),
-        health=mean, health_deviation=deviation,
+    whole = Trial.plain(
+        "turns", TrialKind.FLIGHT, names, time, values=np.where(used, strain, 0.0), used=used,
+        load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64), temperature=temperature,
+        run=str(run.attrs.get("scenario", "run")), health=mean, health_deviation=deviation,
     )  # fmt: skip
     held = held_out_turns(size, plan.block, plan.held_out_share)
-    trials = [_rows(whole, ~held, "turns", held_out=False)]
+    trials = [whole.rows(~held)]
     if held.any():
-        trials.append(_rows(whole, held, "turns held out", held_out=True))
+        trials.append(whole.rows(held, name="turns held out", held_out=True))
     lost = int(used.size - used.sum())
     return Campaign(
         name=str(run.attrs.get("title", folder.name)),
@@ -211,7 +204,8 @@ def run_model(folder: Path | str) -> Model:
     patch = patch_of_run(folder)
     if patch is not None:
         try:
-            effects = load_patch(patch).for_outputs(_outputs(folder))
+            sensors = len(_run(folder)["observed"]["sensor"])
+            effects = load_patch(patch).for_outputs(output_channels(sensors))
         except FmuError as cause:
             raise CampaignFileError(f"The patch of the twin's model cannot be read: {cause}") from cause
         for effect in effects:
@@ -348,14 +342,3 @@ def _calibrated(run: xr.DataTree) -> dict[str, tuple[float, float]]:
     draws = np.asarray(run["calibration"]["draw_value"].values, dtype=np.float64)
     spread = float(draws.std(ddof=1)) if len(draws) > 1 else 0.0
     return {name: (float(draws.mean()), spread)} if name and spread > 0.0 else {}
-
-
-def _outputs(folder: Path) -> Sequence[tuple[str, str]]:
-    return output_channels(len(_run(folder)["observed"]["sensor"]))
-
-
-def _rows(trial: Trial, rows: NDArray[np.bool_], name: str, *, held_out: bool) -> Trial:
-    parts = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
-    return replace(
-        trial, name=name, held_out=held_out, **{part: getattr(trial, part)[rows] for part in parts}
-    )

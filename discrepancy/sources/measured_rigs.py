@@ -5,7 +5,7 @@ The data are not part of the package; `docs/measured_rigs.md` says where they ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,119 +22,23 @@ FALLING = 3.0
 CUT = 0.04
 """Left out at both ends of a fall: hands let go, and the ground comes [s]."""
 HELD_OUT = ("fall_14", "fall_5")
-LEVEL_NOISE = 0.02
-"""Deviation of the tank's level sensor by the sixth differences of its record [V]."""
 LARGEST_LEVEL = 10.0
 """Where the tank's level sensor ends: readings there are left out [V]."""
 SMOOTHED = 0.12
 """Window of the local cubic through the pendulum's angle [s]; its encoder counts in 0.0029 rad."""
 STEP = 0.02
 """A sample of the pendulum is the mean over this [s]: one of its slower record, six of its faster one."""
-TORQUE_NOISE = 0.02
-"""Deviation of the pendulum's torque by the (median) sixth differences of its slower record [N m]."""
-
 THE_WING = "real_wing"
 """Among the rigs of the command line, the one with a model of its own (`real_wing.write_wing_campaign`)."""
-
-PHONE = """format = 1
-name = "Body that falls"
-mass = 1.0
-free = true
-
-[[load]]
-name = "gravity"
-vector = -9.81
-through = "mass"
-
-[[output]]
-name = "accelerometer"
-vector = 1.0
-quantity = "acceleration"
-constant = 9.81
-
-[[port]]
-name = "air"
-vector = 1.0
+SHIPPED = Path(__file__).with_name("rigs")
+"""Model and campaign of each rig. Deviations of noise are those of the sixth differences of its records."""
+TRIAL = """
+[[trial]]
+name = "{name}"
+kind = "driven"
+file = "{name}.csv"
+begins = "unknown"
 """
-
-TANKS = """format = 1
-name = "Two tanks, outflow in proportion to the level"
-capacity = [1.0, 1.0]                      # levels in V of the lower one's sensor
-
-[[conductance_part]]
-name = "upper outlet"
-matrix = [[0.014, 0.0], [-0.014, 0.0]]     # 1/s
-
-[[conductance_part]]
-name = "lower outlet"
-matrix = [[0.0, 0.0], [0.0, 0.014]]
-
-[[input]]
-name = "pump"
-vector = [0.029, 0.0]
-quantity = "voltage"
-
-[[output]]
-name = "lower level"
-vector = [0.0, 1.0]
-quantity = "voltage"
-
-[[port]]
-name = "upper outlet"
-vector = [1.0, 0.0]
-acts = [1.0, -1.0]                         # what leaves or overflows the upper tank enters the lower one
-
-[[port]]
-name = "lower outlet"
-vector = [0.0, 1.0]
-"""
-
-PENDULUM = """format = 1
-name = "Pendulum on a motor"
-mass = 0.14                                # kg m2
-free = true
-damping = { matrix = 0.1 }                 # N m s
-
-[[input]]
-name = "angle"
-vector = 1.0
-quantity = "angle"
-
-[[output]]
-name = "torque"
-reaction = "angle"
-quantity = "torque"
-
-[[port]]
-name = "pivot"
-vector = 1.0
-
-[[law]]
-name = "weight"
-kind = "sine_force"
-port = "pivot"
-coefficient = 2.7                          # m g l [N m]
-wave_number = 1.0
-phase = 0.0
-"""
-
-
-def _parameters(*terms: tuple[str, str, float]) -> str:
-    """Return parameters: name, what it scales, its deviation."""
-    rows = [
-        f'\n[[parameter]]\nname = "{name}"\nterms = "{term}"\ndeviation = {deviation}\n'
-        "low = 0.01\nhigh = 10.0\n"
-        for name, term, deviation in terms
-    ]
-    return "".join(rows)
-
-
-TANKS += _parameters(
-    ("upper_outlet", "upper outlet", 0.5), ("lower_outlet", "lower outlet", 0.5), ("pump_gain", "pump", 0.5)
-)
-PENDULUM += _parameters(
-    ("inertia", "mass", 0.1), ("friction", "damping", 0.5), ("weight_factor", "weight", 0.1)
-)
 
 
 def write_rig_campaign(rig: str, data: Path, folder: Path) -> Path:
@@ -149,10 +53,15 @@ def write_rig_campaign(rig: str, data: Path, folder: Path) -> Path:
     """
     if rig not in RIGS:
         raise CampaignFileError(f"There is no rig {rig!r}: give one of {', '.join((THE_WING, *RIGS))}.")
-    texts = RIGS[rig](Path(data))
-    last = "campaign.toml"
-    for name in (*(name for name in texts if name != last), last):
-        atomic_write_text(folder / name, texts[name])
+    tables = RIGS[rig](Path(data))
+    campaign, model = (
+        (SHIPPED / rig / name).read_text(encoding="utf-8") for name in ("campaign.toml", "model.toml")
+    )
+    for name in (name for name in tables if name.startswith("fall_")):  # as many as were published
+        trial = name.removesuffix(".csv")
+        campaign += TRIAL.format(name=trial) + ("held_out = true\n" if trial in HELD_OUT else "")
+    for name, text in {"model.toml": model, **tables, "campaign.toml": campaign}.items():
+        atomic_write_text(folder / name, text)
     return folder
 
 
@@ -180,29 +89,6 @@ def _table(names: Sequence[str], columns: Sequence[FloatArray]) -> str:
     return "\n".join([",".join(names), *(",".join(row) for row in rows)]) + "\n"
 
 
-def _means(table: FloatArray, joined: int) -> FloatArray:
-    """Return the means of so many rows each, (N // joined, C); what is left over at the end is dropped."""
-    whole = len(table) // joined
-    return np.asarray(table[: whole * joined].reshape(whole, joined, -1).mean(axis=1))
-
-
-def _section(kind: str, content: Mapping[str, str]) -> str:
-    return "\n".join(["", f"[[{kind}]]", *(f"{key} = {value}" for key, value in content.items())]) + "\n"
-
-
-def _driven(name: str, begins: str, held_out: bool) -> str:
-    return _section(
-        "trial",
-        {
-            "name": f'"{name}"',
-            "kind": '"driven"',
-            "file": f'"{name}.csv"',
-            "begins": f'"{begins}"',
-            **({"held_out": "true"} if held_out else {}),
-        },
-    )
-
-
 def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
     """Return times [s] from the release and readings z [m/s^2] of the longest fall in a record."""
     data = _numbers(file, ("time", "x", "y", "z"))
@@ -219,79 +105,38 @@ def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
 def _phone(data: Path) -> dict[str, str]:
     """Return the falls; the sensor shows acceleration less gravity: nought in a free fall, and its bias."""
     rest = _numbers(data / "at_rest.txt", ("time", "x", "y", "z"), None, 0)
-    campaign = 'format = 1\nname = "Falling phone"\n\n[noise]\nfile = "noise.csv"\n' + _section(
-        "channel",
-        {
-            "name": '"z"',
-            "quantity": '"acceleration"',
-            "unit": '"m/s2"',
-            "output": '"accelerometer"',
-            "offset_deviation": "0.3  # the sensor's bias",
-        },
-    )
-    texts = {"model.toml": PHONE, "noise.csv": _table(("time", "z"), (np.round(rest[:, 0], 9), rest[:, 3]))}
     files = sorted(data.glob("fall_*.csv"), key=lambda path: path.stem.split("_")[1].zfill(9))
     if not files:
         raise CampaignFileError(
             f"There is no fall_NUMBER.csv in {data}: give the folder of the published records."
         )
-    for file in files:
-        texts[f"{file.stem}.csv"] = _table(("time", "z"), fall_of(file))
-        campaign += _driven(file.stem, "unknown", file.stem in HELD_OUT)
-    return texts | {"campaign.toml": campaign}
+    falls = {file.name: _table(("time", "z"), fall_of(file)) for file in files}
+    return {"noise.csv": _table(("time", "z"), (np.round(rest[:, 0], 9), rest[:, 3])), **falls}
 
 
 def _tanks(data: Path) -> dict[str, str]:
     """Return the record for estimation, and the one for validation, held out."""
     table = _numbers(data / "dataBenchmark.csv", ("uEst", "uVal", "yEst", "yVal"))
     time: FloatArray = 4.0 * np.arange(len(table), dtype=np.float64)
-    campaign = 'format = 1\nname = "Two tanks"\n'
-    campaign += _section(
-        "channel",
-        {
-            "name": '"level"',
-            "quantity": '"voltage"',
-            "unit": '"V"',
-            "output": '"lower level"',
-            "noise": f"{{ standard_deviation = {LEVEL_NOISE}, degrees_of_freedom = 200 }}",
-        },
-    )
-    campaign += _section(
-        "input", {"name": '"pump"', "quantity": '"voltage"', "unit": '"V"', "hold": '"zero_order"'}
-    )
-    texts = {"model.toml": TANKS}
-    for column, name in enumerate(("estimation", "validation")):
-        level = table[:, 2 + column].copy()
-        level[level >= LARGEST_LEVEL] = np.nan
-        texts[f"{name}.csv"] = _table(("time", "pump", "level"), (time, table[:, column], level))
-        campaign += _driven(name, "unknown", column == 1)
-    return texts | {"campaign.toml": campaign}
+    pumps, levels = table[:, :2].T, table[:, 2:].T
+    levels[levels >= LARGEST_LEVEL] = np.nan
+    return {
+        f"{name}.csv": _table(("time", "pump", "level"), (time, pump, level))
+        for name, pump, level in zip(("estimation", "validation"), pumps, levels, strict=True)
+    }
 
 
 def _pendulum(data: Path) -> dict[str, str]:
     """Return angle in, torque out: of a rod that turns over, a motion from torques would soon be another."""
-    campaign = 'format = 1\nname = "Pendulum on a motor"\n'
-    campaign += _section(
-        "channel",
-        {
-            "name": '"torque"',
-            "quantity": '"torque"',
-            "unit": '"N m"',
-            "output": '"torque"',
-            "offset_deviation": "0.1  # N m",
-            "noise": f"{{ standard_deviation = {TORQUE_NOISE}, degrees_of_freedom = 20 }}",
-        },
-    )
-    campaign += _section("input", {"name": '"angle"', "quantity": '"angle"', "unit": '"rad"'})
-    texts = {"model.toml": PENDULUM}
+    tables = {}
     for name in ("pd_trajectory", "ilqr"):
         table = _numbers(data / f"{name}.csv", ("time", "position", "velocity", "torque"))
         joined = max(round(STEP / float(np.median(np.diff(table[:, 0])))), 1)
-        time, angle, _, torque = _means(table, joined).T
+        whole = len(table) // joined * joined  # what is left over at the end is dropped
+        time, angle, _, torque = table[:whole].reshape(-1, joined, table.shape[1]).mean(axis=1).T
         angle = savgol_filter(angle, 2 * round(0.5 * SMOOTHED / STEP) + 1, 3)
-        texts[f"{name}.csv"] = _table(("time", "angle", "torque"), (np.round(time, 9), angle, torque))
-        campaign += _driven(name, "still", name == "ilqr")
-    return texts | {"campaign.toml": campaign}
+        tables[f"{name}.csv"] = _table(("time", "angle", "torque"), (np.round(time, 9), angle, torque))
+    return tables
 
 
 RIGS: dict[str, Callable[[Path], dict[str, str]]] = {
@@ -299,4 +144,4 @@ RIGS: dict[str, Callable[[Path], dict[str, str]]] = {
     "two_tanks": _tanks,
     "pendulum": _pendulum,
 }
-"""What makes the files of a campaign from a published folder, by the name of the rig."""
+"""What makes the tables of a campaign from a published folder, by the name of the rig."""

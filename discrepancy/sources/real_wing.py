@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 
@@ -122,30 +122,24 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
     noise = pre_trigger_record(
         scatter * np.hypot(1.0, READING_ERROR / spread), _interval(windows), SIGNAL, str(data)
     )
-    channels = {
-        SIGNAL: Channel(SIGNAL, Quantity.SIGNAL, ROOT_GAUGE, noise, inf, inf),
-    }
+    channels = {SIGNAL: Channel(SIGNAL, Quantity.SIGNAL, ROOT_GAUGE, noise, inf, inf)}
     trials: list[Trial] = []
     if pairs is not None:
         displacement_deviation = np.hypot(
             pairs.displacement_standard_deviation,
             pairs.load_standard_deviation * float(np.median(pairs.displacement / pairs.load)),
         )
-        channels[TIP] = Channel(
-            TIP,
-            Quantity.DISPLACEMENT,
-            "load_point_displacement",
-            NoiseRecord(float(displacement_deviation), inf),
-        )
+        at_tip = NoiseRecord(float(displacement_deviation), inf)
+        channels[TIP] = Channel(TIP, Quantity.DISPLACEMENT, "load_point_displacement", at_tip)
         trials += _loading_runs(pairs)
     for number, (time, signal) in enumerate(windows, start=1):
         trials.append(
-            replace(
-                _trial(f"release {number}", TrialKind.RINGDOWN, (SIGNAL,), signal[:, None], time),
+            Trial.plain(
+                f"release {number}", TrialKind.RINGDOWN, (SIGNAL,), time, values=signal[:, None],
                 release=Release(plan.release, 1.0, at_rest=False, mode_count=plan.mode_count),
                 held_out=number in plan.held_out,
             )
-        )
+        )  # fmt: skip
     return Campaign(
         "The real wing of Kapteyn et al. 2021",
         channels,
@@ -234,25 +228,10 @@ def _loading_runs(pairs: LoadDisplacementData) -> list[Trial]:
     trials = []
     for number in np.unique(pairs.run).tolist():
         rows = pairs.run == number
-        trial = _trial(
-            f"loading run {number + 1}",
-            TrialKind.STATIC,
-            (TIP,),
-            pairs.displacement[rows][:, None],
-            np.zeros(rows.sum()),
-        )
-        trials.append(replace(trial, force=pairs.load[rows], run=f"run {number + 1}"))
+        trials.append(
+            Trial.plain(
+                f"loading run {number + 1}", TrialKind.STATIC, (TIP,), np.zeros(rows.sum()),
+                values=pairs.displacement[rows][:, None], force=pairs.load[rows], run=f"run {number + 1}",
+            )
+        )  # fmt: skip
     return trials
-
-
-def _trial(
-    name: str, kind: TrialKind, channels: tuple[str, ...], values: FloatArray, time: FloatArray
-) -> Trial:
-    size = len(values)
-    zeros = np.zeros(size)
-    return Trial(
-        name=name, kind=kind, channels=channels, values=values,
-        used=np.ones(values.shape, dtype=bool), time=time,
-        force=zeros, load_factor=zeros, load_place="tip_load", temperature=zeros, start=0.0, run="",
-        health=np.zeros((size, 2)), health_deviation=np.zeros((size, 2)),
-    )  # fmt: skip

@@ -6,8 +6,9 @@ NumPy and relative imports only: this file is copied into the FMU.
 import ast
 import operator
 from collections.abc import Callable, Collection, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import lru_cache, reduce
 from math import cos, exp, isfinite, log, sin, sqrt, tan
 from typing import Any
 
@@ -55,6 +56,11 @@ _OF_ARRAYS: dict[str, Callable[..., Any]] = {
 }
 
 
+@lru_cache(maxsize=1024)  # an expression is evaluated at every step of a fit
+def _parsed(text: str) -> ast.expr:
+    return ast.parse(text, mode="eval").body
+
+
 @dataclass(frozen=True)
 class Expression:
     """An arithmetic expression such as "0.1 * mass_ratio * modal_mass".
@@ -90,7 +96,7 @@ class Expression:
                 f"{self.where} must have at most {LONGEST} characters, but has {len(self.text)}."
             )
         try:
-            return ast.parse(self.text.strip(), mode="eval").body
+            return _parsed(self.text.strip())
         except (SyntaxError, ValueError, RecursionError, MemoryError) as cause:
             raise InvalidPatchError(
                 f"{self.where} is not an arithmetic expression: {self.text!r}."
@@ -163,7 +169,7 @@ class Expression:
 
     def with_numbers(self, values: Mapping[str, float]) -> str:
         """Return the text with numbers in the place of names."""
-        return ast.unparse(_Numbers(values).visit(self._tree()))
+        return ast.unparse(_Numbers(values).visit(deepcopy(self._tree())))
 
 
 class _Numbers(ast.NodeTransformer):

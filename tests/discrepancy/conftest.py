@@ -59,10 +59,9 @@ class Bench:
                 jacobian[:, :, 2 * mode + 1] = (-time * wave).real[:, np.newaxis] * shape
                 jacobian[:, :, 4 + 2 * number + mode] = (wave / size).real[:, np.newaxis] * shape
             self._add(
-                Trial(
-                    f"release {number + 1}", TrialKind.RINGDOWN, NAMES, value, np.ones_like(value, bool),
-                    time, np.zeros(count), np.zeros(count), "tip_load", np.zeros(count), 100.0 * number, "A",
-                    np.zeros((count, 2)), np.zeros((count, 2)), Release(amplitude), held_out[number],
+                Trial.plain(
+                    f"release {number + 1}", TrialKind.RINGDOWN, NAMES, time, values=value,
+                    start=100.0 * number, run="A", release=Release(amplitude), held_out=held_out[number],
                 ),
                 value, rate, jacobian,
             )  # fmt: skip
@@ -72,11 +71,9 @@ class Bench:
             jacobian = np.zeros((len(force), 4, width))
             jacobian[:, :, -1] = value
             self._add(
-                Trial(
-                    "steps", TrialKind.STATIC, NAMES, value, np.ones_like(value, bool),
-                    10.0 * np.arange(len(force)), force, np.zeros(len(force)), "tip_load",
-                    np.linspace(0.0, 3.0, len(force)) ** 2, 0.0, "A", np.zeros((len(force), 2)),
-                    np.zeros((len(force), 2)), None, False,
+                Trial.plain(
+                    "steps", TrialKind.STATIC, NAMES, 10.0 * np.arange(len(force)), values=value, force=force,
+                    temperature=np.linspace(0.0, 3.0, len(force)) ** 2, run="A",
                 ),
                 value, None, jacobian,
             )  # fmt: skip

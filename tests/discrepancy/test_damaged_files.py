@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.catalogue.user_entries import effects_of_file
+from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.errors import DiscrepancyError
 from discrepancy.models.fmu_file import load_fmu_model
 from discrepancy.models.lumped_file import SHIPPED_MODELS, load_lumped

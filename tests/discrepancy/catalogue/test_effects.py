@@ -13,13 +13,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.cantilever import LENGTH, TIP, Cantilever, campaign
+from benchmarks.effect_pictures import FLOWS
 from discrepancy.campaign.noise import aliased
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
-from discrepancy.catalogue import outflow
-from discrepancy.catalogue.clock_and_lines import mains_lines
-from discrepancy.catalogue.damping import loss_integral
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Effect, Prior, Setting
 from discrepancy.catalogue.library import library
+from discrepancy.catalogue.places import mains_lines
+from discrepancy.catalogue.scales import loss_integral
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
@@ -42,7 +42,7 @@ from fe.runtime.patch import (
     StiffnessDrift,
 )
 
-BEAM = [effect for effect in library() if effect not in outflow.EFFECTS]  # flows need a store: test_outflow
+BEAM = [effect for effect in library() if effect.identifier not in FLOWS]  # flows need a store: test_outflow
 VANISHING = pytest.mark.parametrize(
     "effect",
     [effect for effect in BEAM if any(item.magnitude for item in effect.parameters)],

@@ -11,8 +11,8 @@ import pytest
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Event
 from discrepancy.campaign.writing import write_campaign
+from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.catalogue.user_entries import effects_of_file
 from discrepancy.errors import CampaignDataError, CampaignFileError, CatalogueError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel

@@ -10,9 +10,9 @@ import pytest
 from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Campaign, Release, TrialKind
-from discrepancy.catalogue.damping import loss_integral
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import library
+from discrepancy.catalogue.scales import loss_integral
 from discrepancy.models.wing import WingModel
 from fe.runtime.patch import PowerDamping, PowerStiffness
 from fe.runtime.patch_arrays import PatchArrays

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from math import inf
+from typing import Any
 
 import numpy as np
 import pytest
@@ -112,37 +113,15 @@ def blank_trial(
     rows: FloatArray,
     *,
     start: float = 0.0,
-    run: str = "A",
-    load_place: str = "tip_load",
-    release: Release | None = None,
-    health: FloatArray | None = None,
-    health_deviation: FloatArray | None = None,
-    held_out: bool = False,
-    noise_factor: float = 1.0,
     temperature: float = 0.0,
+    **given: Any,
 ) -> Trial:
     """Return a trial without readings; `rows` are forces of a static trial, times of a dynamic one."""
-    count = len(rows)
-    zeros = np.zeros(count)
-    return Trial(
-        name=name,
-        kind=kind,
-        channels=tuple(channels),
-        values=np.zeros((count, len(channels))),
-        used=np.ones((count, len(channels)), dtype=bool),
-        time=rows if kind is not TrialKind.STATIC else start + 10.0 * np.arange(count),
-        force=rows if kind is TrialKind.STATIC else zeros,
-        load_factor=zeros,
-        load_place=load_place,
-        temperature=np.full(count, temperature),
-        start=start,
-        run=run,
-        health=np.zeros((count, 2)) if health is None else health,
-        health_deviation=np.zeros((count, 2)) if health_deviation is None else health_deviation,
-        release=release,
-        held_out=held_out,
-        noise_factor=noise_factor,
-    )
+    time = rows
+    if kind is TrialKind.STATIC:
+        time, given = start + 10.0 * np.arange(len(rows)), {"force": rows, **given}
+    given = {"run": "A", "temperature": np.full(len(rows), temperature), **given}
+    return Trial.plain(name, kind, tuple(channels), time, start=start, **given)
 
 
 def offset_effect(identifier: str = "offset", deviation: float = 0.3) -> Effect:
@@ -274,8 +253,7 @@ def closed_problem(
         for name in OUTPUTS
     }
     force = np.linspace(-1.0, 2.0, 9)
-    spread = np.full((len(force), 2), 0.1) if health else None
-    prior_loss = np.full((len(force), 2), 0.3) if health else None
+    spread, prior_loss = (np.full((len(force), 2), size if health else 0.0) for size in (0.1, 0.3))
     time = 0.01 * np.arange(samples)
     trials = []
     if "static" in kinds:

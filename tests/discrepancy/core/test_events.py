@@ -18,10 +18,9 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
+from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.library import effect_by_identifier, library
-from discrepancy.catalogue.user_entries import effects_of_file
-from discrepancy.catalogue.windowed import in_events
+from discrepancy.catalogue.library import effect_by_identifier, in_events, library
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.linearisation import Point
@@ -93,7 +92,7 @@ begin = "moment"
 @pytest.fixture(scope="module")
 def campaign() -> Campaign:
     rng = np.random.default_rng(7)
-    time, zeros = np.linspace(0.0, 8.0, 201), np.zeros(201)
+    time = np.linspace(0.0, 8.0, 201)
     friction = PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0)
     patch = ModelPatch(
         (replace(friction, windows=tuple(Window(name, begin) for name, begin in BEGIN.items())),)
@@ -104,10 +103,9 @@ def campaign() -> Campaign:
             rng.normal() * np.sin(2.0 * np.pi * f * time + rng.uniform(0, 6)) for f in (0.4, 0.9, 1.3, 1.7)
         ]
         trials.append(
-            Trial(
-                name, TrialKind.FORCED, ("x",), np.zeros((201, 1)), np.ones((201, 1), bool), time,
-                3.0 * np.sum(parts, axis=0), zeros, "push", zeros, 0.0, "", np.zeros((201, 2)),
-                np.zeros((201, 2)), begins=Start.STILL, held_out=name == "second",
+            Trial.plain(
+                name, TrialKind.FORCED, ("x",), time, force=3.0 * np.sum(parts, axis=0), load_place="push",
+                begins=Start.STILL, held_out=name == "second",
             )
         )  # fmt: skip
     channels = {"x": Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(NOISE, 500.0))}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,14 +13,7 @@ from hypothesis import strategies as st
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.checks.outliers import sample_outliers, wrong_ends
-from discrepancy.checks.quality import (
-    FaultKind,
-    check_against_model,
-    check_data,
-    mark_outliers,
-    require_sound,
-)
-from discrepancy.errors import CampaignDataError
+from discrepancy.checks.quality import FaultKind, check_against_model, check_data, mark_outliers
 from discrepancy.sources.examples import ExamplePlan, example_campaign
 from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain
 
@@ -118,8 +112,7 @@ def test_unit_slips(oscillator, campaign, name: str, factor: float, guess: str) 
         faults = check_against_model(replace(slipped, channels=channels), oscillator)
         assert (FaultKind.UNIT_SLIP, name) in found(faults)
         assert {fault.channel for fault in faults} == {name}
-        with pytest.raises(CampaignDataError, match=guess):
-            require_sound(faults)
+        assert re.search(guess, " ".join(fault.sentence for fault in faults if fault.fatal))
 
 
 def test_no_slip_between_units_that_the_quantity_does_not_have(oscillator, campaign) -> None:
@@ -200,13 +193,9 @@ def test_outputs_and_lengths(oscillator, campaign) -> None:
     release = next(trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN)
 
     def cut(count: int, step: int = 1) -> Campaign:
-        rows = slice(0, count, step)
-        short = replace(
-            release, values=release.values[rows], used=release.used[rows], time=release.time[rows],
-            force=release.force[rows], load_factor=release.load_factor[rows],
-            temperature=release.temperature[rows],
-        )  # fmt: skip
-        return replace(campaign, trials=(short,))
+        rows = np.arange(len(release.time)) % step == 0
+        rows[count:] = False
+        return replace(campaign, trials=(release.rows(rows),))
 
     assert (FaultKind.TOO_SHORT, "") in found(check_against_model(cut(100), oscillator))
     assert found(check_against_model(cut(401), oscillator)) == set()
@@ -269,7 +258,6 @@ def test_noise_records(campaign) -> None:
 
     (fault,) = check_data(with_noise(None))
     assert (fault.kind, fault.channel, fault.fatal) == (FaultKind.NO_NOISE_RECORD, "g0", False)
-    require_sound((fault,))
     (fault,) = check_data(with_noise(NoiseRecord(1e-5, 200.0)))
     assert fault.kind is FaultKind.NOISE_LABEL
     assert "says 1e-05" in fault.sentence
@@ -280,12 +268,9 @@ def test_noise_label_against_repeats() -> None:
     rows = 6
 
     def trial(number: int) -> Trial:
-        zeros = np.zeros(rows)
-        return Trial(
-            str(number), TrialKind.STATIC, ("x",), (np.arange(rows) + rng.normal(size=rows))[:, None],
-            np.ones((rows, 1), dtype=bool), zeros, np.arange(rows) * 1.0, zeros, "x", zeros, 0.0, "A",
-            np.zeros((rows, 2)), np.zeros((rows, 2)),
-        )  # fmt: skip
+        values = (np.arange(rows) + rng.normal(size=rows))[:, None]
+        force = np.arange(rows) * 1.0
+        return Trial.plain(str(number), TrialKind.STATIC, ("x",), np.zeros(rows), values=values, force=force)
 
     def campaign(stated: float) -> Campaign:
         channel = Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(stated, 100.0))
@@ -374,12 +359,8 @@ def test_rows_of_static_trials(campaign) -> None:
         values = 1e-3 * load + curve * load**2 + 5e-6 * np.random.default_rng(count).normal(size=count)
         if spoilt is not None:
             values[spoilt] += 1e-3
-        zeros = np.zeros(count)
-        return Trial(
-            name, TrialKind.STATIC, ("x",), values[:, None], np.ones((count, 1), dtype=bool), zeros, load,
-            zeros, "x", zeros, 0.0, "A",
-            np.zeros((count, 2)), np.zeros((count, 2)),
-        )  # fmt: skip
+        zeros, column = np.zeros(count), values[:, None]
+        return Trial.plain(name, TrialKind.STATIC, ("x",), zeros, values=column, force=load, run="A")
 
     def left_out(*trials: Trial, noise: float | None = 5e-6) -> list[list[int]]:
         record = None if noise is None else NoiseRecord(noise, 100.0)

@@ -14,15 +14,14 @@ from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, T
 
 
 def trial(name: str, kind: TrialKind, top: float, count: int = 4, run: str = "A", channels=("x",)) -> Trial:
-    rows, zeros = np.linspace(0.0, top, count), np.zeros(count)
-    shape = (count, len(channels))
-    release = Release(top) if kind is TrialKind.RINGDOWN else None
-    force, load_factor = (rows if kind is item else zeros for item in (TrialKind.STATIC, TrialKind.FLIGHT))
-    values = np.arange(float(count * len(channels))).reshape(shape)
-    return Trial(
-        name, kind, tuple(channels), values, np.ones(shape, dtype=bool), rows, force, load_factor, "x", zeros,
-        0.0, run, np.zeros((count, 2)), np.zeros((count, 2)), release,
-    )  # fmt: skip
+    rows = np.linspace(0.0, top, count)
+    drive = {
+        TrialKind.RINGDOWN: {"release": Release(top)},
+        TrialKind.STATIC: {"force": rows},
+        TrialKind.FLIGHT: {"load_factor": rows},
+    }.get(kind, {})
+    values = np.arange(float(count * len(channels))).reshape(count, len(channels))
+    return Trial.plain(name, kind, tuple(channels), rows, values=values, load_place="x", run=run, **drive)
 
 
 def campaign(*trials: Trial) -> Campaign:

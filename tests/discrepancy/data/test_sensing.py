@@ -30,16 +30,10 @@ def campaign() -> Campaign:
         "g1": Channel("g1", Quantity.STRAIN, "strain[1]", None),
     }
     time = np.arange(200) * 0.005
-    zeros = np.zeros(200)
 
     def trial(name: str, kind: TrialKind, names: tuple[str, ...], **more: object) -> Trial:
-        shape = (200, len(names))
-        values = {
-            "values": np.zeros(shape), "used": np.ones(shape, dtype=bool), "time": time, "force": zeros,
-            "load_factor": zeros, "load_place": "x", "temperature": zeros, "start": 60.0, "run": "A",
-            "health": np.zeros((200, 2)), "health_deviation": np.zeros((200, 2)),
-        }  # fmt: skip
-        return Trial(name=name, kind=kind, channels=names, **(values | more))  # type: ignore[arg-type]
+        usual = {"load_place": "x", "start": 60.0, "run": "A"}
+        return Trial.plain(name, kind, names, more.pop("time", time), **(usual | more))
 
     trials = (
         trial("ring", TrialKind.RINGDOWN, ("g1", "tip"), release=Release(0.05)),

@@ -233,24 +233,9 @@ def refusal(path: Path) -> str:
 def test_300_damaged_files_are_read_or_refused_in_one_sentence(tmp_path: Path) -> None:
     rng = random.Random(7)
     pieces = [
-        b"",
-        b";",
-        b",",
-        b"\t",
-        b'"',
-        b"\n",
-        b"\r",
-        b"nan",
-        b"1e999",
-        b"\xff",
-        b"[",
-        b"(" * 50,
-        b"9" * 400,
-        b"=",
-        b"#",
-        b":",
-        b"31.2.26 1:2:3",
-    ]
+        b"", b";", b",", b"\t", b'"', b"\n", b"\r", b"nan", b"1e999", b"\xff", b"[", b"(" * 50, b"9" * 400,
+        b"=", b"#", b":", b"31.2.26 1:2:3",
+    ]  # fmt: skip
     started, outcomes = time.monotonic(), set()
     for content, *_ in [*ODD.values()] * 22:
         damaged = bytearray(content)
@@ -269,14 +254,10 @@ def test_300_damaged_files_are_read_or_refused_in_one_sentence(tmp_path: Path) -
 @pytest.mark.parametrize(
     "content",
     [
-        b"(" * 200_000,
-        b"a" * 200_000,
-        b"1" * 200_000,
-        b"a [" + b"m " * 90_000 + b"];b\n1;2\n",
-        b"1," * 100_000,
-        b'"' * 99_999,
+        b"(" * 200_000, b"a" * 200_000, b"1" * 200_000, b"a [" + b"m " * 90_000 + b"];b\n1;2\n",
+        b"1," * 100_000, b'"' * 99_999,
     ],
-)
+)  # fmt: skip
 def test_long_lines_take_no_long_time(tmp_path: Path, content: bytes) -> None:
     started = time.monotonic()
     with pytest.raises(CampaignFileError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from math import inf, nan
 from pathlib import Path
@@ -16,7 +17,15 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.document_types import PRIMITIVE_UNITS
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.document import Origin, json_schema, shipped_schema
-from discrepancy.files.patch import PATCH_SCHEMA, PatchDocument, primitive_intervals, read_patch, write_patch
+from discrepancy.files.patch import (
+    PATCH_SCHEMA,
+    PatchDocument,
+    StoredPatch,
+    patch_effects,
+    primitive_intervals,
+    read_patch,
+    write_patch,
+)
 from discrepancy.files.residuals import read_residuals, write_residuals
 from discrepancy.files.verdict import VERDICT_SCHEMA, VerdictDocument, read_verdict, write_verdict
 from discrepancy.judgement.proof import prove
@@ -98,33 +107,30 @@ def test_a_verdict_comes_back_equal(tmp_path: Path, make_bench) -> None:
     assert again.read_bytes() == path.read_bytes()
 
 
+def stored_patch(*effects: NamedEffect, draws: Sequence[Sequence[ModelPatch]] = ()) -> StoredPatch:
+    found = patch_effects(effects, draws)
+    return StoredPatch(VerdictKind.NAMED, "Two.", found, {}, (STIFFNESS,), ORIGIN)
+
+
 def test_a_patch_comes_back_identical_with_its_intervals(tmp_path: Path) -> None:
     generator = np.random.default_rng(1)
     draws = [
         ModelPatch((PowerDamping("root", float(c), 0.0, 0.0, 0.1, 5e-324),))
         for c in generator.normal(1.0 / 3.0, 0.02, 4000)
     ]
-    path = write_patch(
-        tmp_path / "patch.json",
-        (FRICTION, MASS),
-        ORIGIN,
-        (draws, ()),
-        sentence="Two.",
-        parameters=(STIFFNESS,),
-    )
-    back = read_patch(path)
-    assert same((back.sentence, back.parameters), ("Two.", (STIFFNESS,)))
+    stored = stored_patch(FRICTION, MASS, draws=(draws, ()))
+    back = read_patch(write_patch(tmp_path / "patch.json", stored))
+    assert same(back, stored)
     assert back.patch == FRICTION.patch + MASS.patch
-    assert same(back.effects, (FRICTION, MASS))
-    assert back.origin.data_hash == "ab" * 32
-    first = back.intervals[0][0]
+    friction, mass = (effect.intervals for effect in back.effects)
+    first = friction[0]
     assert (first.primitive, first.parameter, first.unit) == (0, "coefficient", "N or N m")
     assert first.low == pytest.approx(1.0 / 3.0 - 1.645 * 0.02, abs=2e-3)
     assert first.high == pytest.approx(1.0 / 3.0 + 1.645 * 0.02, abs=2e-3)
-    assert [(i.primitive, i.parameter, i.unit) for i in back.intervals[1][:3]] == [
+    assert [(i.primitive, i.parameter, i.unit) for i in mass[:3]] == [
         (0, "mass", "kg"), (0, "station", "m"), (1, "coefficient", "N or N m"),
     ]  # fmt: skip
-    assert np.isnan(back.intervals[1][0].low)
+    assert np.isnan(mass[0].low)
 
 
 @settings(max_examples=60, deadline=None)
@@ -152,7 +158,7 @@ def test_every_primitive_with_any_numbers_survives_the_file(
         primitives.append(PRIMITIVES[kind](**values, windows=tuple(windows)))
     effect = replace(MASS, patch=ModelPatch(tuple(primitives)))
     path = tmp_path_factory.mktemp("patch") / "patch.json"
-    back = read_patch(write_patch(path, (effect,), ORIGIN)).patch
+    back = read_patch(write_patch(path, stored_patch(effect))).patch
     assert back == effect.patch
     assert same(back, effect.patch)  # tells 0.0 from -0.0
 
@@ -229,7 +235,7 @@ def test_nothing_is_written_where_it_cannot_be(tmp_path: Path) -> None:
     with pytest.raises(FileNotWrittenError, match="is a folder"):
         write_verdict(tmp_path, VERDICT, None, ORIGIN)
     with pytest.raises(VerdictFileError, match="each of 2 effects"):
-        write_patch(tmp_path / "patch.json", (FRICTION, MASS), ORIGIN, ((),))
+        patch_effects((FRICTION, MASS), ((),))
     other = ModelPatch((Line("g1", 50.0, 1.0, 0.0),))
     with pytest.raises(VerdictFileError, match="Draw 1 of the posterior has the primitives line"):
         primitive_intervals(MASS.patch, (other,))

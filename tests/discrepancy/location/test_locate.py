@@ -343,11 +343,9 @@ def test_one_linear_mode_does_not_explain_the_real_ring_downs() -> None:
         strict=True,
     ):
         S = sensitivity(jacobian[:, np.newaxis], covariance, np.array([noise]))
-        zero = np.zeros(t.size)
-        trial = Trial(
-            record.source, TrialKind.RINGDOWN, ("strain",), s[:, np.newaxis], np.ones((t.size, 1), bool), t,
-            zero, zero, "tip_load", zero, 0.0, "", np.zeros((t.size, 2)), np.zeros((t.size, 2)), Release(1.0),
-        )  # fmt: skip
+        ring = TrialKind.RINGDOWN
+        values = s[:, np.newaxis]
+        trial = Trial.plain(record.source, ring, ("strain",), t, values=values, release=Release(1.0))
         leverage = np.sum(S**2, axis=2)
         items.append(
             FittedTrial(

@@ -49,10 +49,16 @@ def trial_of(
     )  # fmt: skip
 
 
-def dense(trial: SeenTrial, process: Process, per_second: int = 4000) -> tuple[FloatArray, FloatArray]:
+def dense(
+    trial: SeenTrial,
+    process: Process,
+    per_second: int = 4000,
+    window: tuple[float, float] = (-np.inf, np.inf),
+) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (N C, N C) of the readings by the force, and of force and readings (N, N C).
 
-    By quadrature of what a kernel over all pairs of moments does to an impulse response; nothing is stepped.
+    By quadrature of what a kernel over all pairs of moments, those of a window, does to an impulse response;
+    nothing is stepped.
     """
     step = 1.0 / per_second
     moments = np.arange(0.0, trial.time[-1] + 0.5 * step, step) + 0.5 * step
@@ -63,6 +69,8 @@ def dense(trial: SeenTrial, process: Process, per_second: int = 4000) -> tuple[F
         kernel *= 1.0 + rate * apart
     else:
         kernel = process.size**2 * np.exp(-apart / process.time)
+    inside = (moments > window[0]) & (moments < window[1])
+    kernel *= np.outer(inside, inside)
     answers = np.zeros((len(trial.time), 2, len(moments)))
     nearest = np.zeros((len(trial.time), len(moments)))
     generator = trial.system.generator
@@ -74,6 +82,9 @@ def dense(trial: SeenTrial, process: Process, per_second: int = 4000) -> tuple[F
         v = -decay * (np.cos(turn * since) - RATIO * FREQUENCY / turn * np.sin(turn * since)) * step
         place = np.clip(now / step - 0.5, 0.0, len(moments) - 1.001)
         nearest[k, int(place)], nearest[k, int(place) + 1] = 1.0 - place % 1.0, place % 1.0
+        if now in window:  # what begins or ends at a sample does so before it
+            nearest[k] = 0.0
+            nearest[k, round(now / step)] = 1.0
         answers[k, 0] = x
         answers[k, 1] = generator[1, 0] * x + generator[1, 1] * v - nearest[k]
     rows = (answers / trial.deviation[:, None]).reshape(-1, len(moments))
@@ -91,7 +102,7 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough: bool, uneven:
     used = random.uniform(size=(40, 2)) > 0.2
     trial = trial_of(time, residual, used=used)
     process = Process(2.0, 0.15, rough)
-    filtered = Filtered(trial, 0, process)
+    filtered = Filtered(trial, {0: process})
     covariance, cross = dense(trial, process)
     at = np.flatnonzero(used.ravel())
     covariance = covariance[np.ix_(at, at)] + np.eye(len(at))
@@ -100,46 +111,46 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough: bool, uneven:
     found = filtered.whitened(trial.residual[None])
     value = -0.5 * float(np.sum(found**2)) - filtered.log_determinant
     assert value == pytest.approx(wanted, abs=0.05 if rough else 0.02)
-    _, force = filtered.smoothed(trial.residual)
+    force = filtered.smoothed(trial.residual)[1][0]
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
     np.testing.assert_allclose(force[::PARTS], mean, atol=0.02 * process.size)
     variance = process.size**2 - np.einsum(
         "nk,kn->n", cross[:, at], np.linalg.solve(covariance, cross[:, at].T)
     )
-    np.testing.assert_allclose(filtered.deviation(), np.sqrt(variance), atol=0.02 * process.size)
+    np.testing.assert_allclose(filtered.deviation(0), np.sqrt(variance), atol=0.02 * process.size)
 
 
 def test_steady_gains_are_those_of_every_step() -> None:
     random = np.random.default_rng(4)
     time = 0.02 * np.arange(900)
     trial = trial_of(time, random.standard_normal((900, 2)))
-    filtered = Filtered(trial, 0, PROCESS)
+    filtered = Filtered(trial, {0: PROCESS})
     slots = filtered._passed[1]
     assert slots[-1] < 450  # most steps share one
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
     object.__setattr__(jittered, "steps", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
-    every = Filtered(jittered, 0, PROCESS)
+    every = Filtered(jittered, {0: PROCESS})
     assert every._passed[1][-1] == 899
     np.testing.assert_allclose(
         filtered.whitened(trial.residual[None]), every.whitened(trial.residual[None]), atol=1e-7
     )
     np.testing.assert_allclose(
-        filtered.smoothed(trial.residual)[1], every.smoothed(trial.residual)[1], atol=1e-7
+        filtered.smoothed(trial.residual)[1][0], every.smoothed(trial.residual)[1][0], atol=1e-7
     )
-    np.testing.assert_allclose(filtered.deviation(), every.deviation(), atol=1e-8)
+    np.testing.assert_allclose(filtered.deviation(0), every.deviation(0), atol=1e-8)
 
 
 def test_the_state_between_samples_is_that_of_samples_in_between() -> None:
     random = np.random.default_rng(5)
     count = 30
     residual = random.standard_normal((count, 2))
-    coarse = Filtered(trial_of(0.04 * np.arange(count), residual), 0, PROCESS)
+    coarse = Filtered(trial_of(0.04 * np.arange(count), residual), {0: PROCESS})
     dense_count = (count - 1) * PARTS + 1
     filled, used = np.zeros((dense_count, 2)), np.zeros((dense_count, 2), dtype=bool)
     filled[::PARTS], used[::PARTS] = residual, True
-    fine = Filtered(trial_of(0.04 / PARTS * np.arange(dense_count), filled, used=used), 0, PROCESS)
-    added, force = coarse.smoothed(residual)
-    other, again = fine.smoothed(filled)
+    fine = Filtered(trial_of(0.04 / PARTS * np.arange(dense_count), filled, used=used), {0: PROCESS})
+    added, (force,) = coarse.smoothed(residual)
+    other, (again,) = fine.smoothed(filled)
     np.testing.assert_allclose(force, again[::PARTS], atol=1e-9)
     np.testing.assert_allclose(added, other[::PARTS], atol=1e-9)
 
@@ -151,7 +162,7 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
     local = random.standard_normal((2, 60, 2))
     share, rate = 0.8, 12.0
     trial = trial_of(time, residual, local=local, coloured=((0, share, rate),))
-    found = regression([Filtered(trial, 0, PROCESS)], [residual], [np.zeros((0, 60, 2))])
+    found = regression([Filtered(trial, {0: PROCESS})], [residual], [np.zeros((0, 60, 2))])
     value = -0.5 * found.products[0, 0] - found.log_determinant
     covariance, _ = dense(trial, PROCESS)
     noise = np.eye(120)
@@ -168,7 +179,7 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
 def test_a_long_correlation_within_a_short_step_stays_finite() -> None:
     """Backwards the force would grow by e^1000 within a step."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
-    filtered = Filtered(trial, 0, Process(1.0, 1e-3))
+    filtered = Filtered(trial, {0: Process(1.0, 1e-3)})
     assert np.isfinite(filtered.log_determinant)
     assert np.all(np.isfinite(filtered.smoothed(trial.residual)[1]))
 

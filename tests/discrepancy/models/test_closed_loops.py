@@ -10,7 +10,6 @@ from scipy.integrate import solve_ivp
 
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Hold, Quantity, RecordedInput, Start, Trial, TrialKind
-from discrepancy.catalogue import outflow
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
@@ -99,11 +98,7 @@ def model_of(text: str) -> LumpedModel:
 
 
 def driven(time: FloatArray, item: RecordedInput, begins: Start = Start.STILL) -> Trial:
-    zero, pair = np.zeros(len(time)), np.zeros((len(time), 2))
-    return Trial(
-        "driven", TrialKind.DRIVEN, ("a", "b"), pair, pair == 0.0, time, zero, zero, "tip_load", zero,
-        0.0, "", pair, pair, begins=begins, inputs=(item,),
-    )  # fmt: skip
+    return Trial.plain("driven", TrialKind.DRIVEN, ("a", "b"), time, begins=begins, inputs=(item,))
 
 
 def integrated(rate: Any, time: FloatArray, first: FloatArray) -> FloatArray:
@@ -204,7 +199,7 @@ def test_what_leaves_one_store_enters_the_next_and_flows_over_when_full() -> Non
 
 def test_flows_are_offered_at_states_and_forces_are_not() -> None:
     setting = tank_setting()
-    for effect in outflow.EFFECTS:
+    for effect in (effect_by_identifier(name, library()) for name in ("outflow", "overflow")):
         assert effect.unavailable(setting) is None
         assert effect.places(setting) == ("outlet",)
         middle = {item.name: item.prior.value(0.0) for item in effect.parameters}

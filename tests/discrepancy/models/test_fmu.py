@@ -118,13 +118,8 @@ def patch(*items: Primitive) -> ModelPatch:
 
 
 def trial(kind: TrialKind, count: int = 300, **changes: Any) -> Trial:
-    base: dict[str, Any] = {
-        "name": "a trial", "kind": kind, "channels": (), "values": np.zeros((count, 0)),
-        "used": np.ones((count, 0), bool), "time": np.arange(count) * 0.01, "force": np.zeros(count),
-        "load_factor": np.zeros(count), "load_place": "mass", "temperature": np.zeros(count), "start": 0.0,
-        "run": "A", "health": np.zeros((1, 2)), "health_deviation": np.zeros((1, 2)),
-    }  # fmt: skip
-    return Trial(**{**base, **changes})
+    time = changes.pop("time", 0.01 * np.arange(count))
+    return Trial.plain("a trial", kind, (), time, **{"load_place": "mass", **changes})
 
 
 NO_CHANGE = ModelPatch()

@@ -22,10 +22,8 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.catalogue.damping import QUADRATIC_DAMPING
 from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.hysteresis import BOUC_WEN_HYSTERESIS, JOINT_MICRO_SLIP
-from discrepancy.catalogue.stiffness import BREATHING_CRACK, CUBIC_STIFFNESS, FREE_PLAY
+from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
 from discrepancy.models.input_course import Course, Drive
 from discrepancy.models.interface import Conditions
@@ -164,16 +162,8 @@ def model_of(text: str) -> LumpedModel:
 
 
 def trial(time: FloatArray, *inputs: RecordedInput, **changes: Any) -> Trial:
-    count = len(time)
-    base: dict[str, Any] = {
-        "name": "a trial", "kind": TrialKind.DRIVEN, "channels": (), "values": np.zeros((count, 0)),
-        "used": np.ones((count, 0), bool), "time": time, "force": np.zeros(count),
-        "load_factor": np.zeros(count), "load_place": "tip_load",
-        "temperature": np.zeros(count), "start": 0.0,
-        "run": "A", "health": np.zeros((1, 2)), "health_deviation": np.zeros((1, 2)), "begins": Start.STILL,
-        "inputs": inputs,
-    }  # fmt: skip
-    return Trial(**{**base, **changes})
+    said: dict[str, Any] = {"kind": TrialKind.DRIVEN, "begins": Start.STILL, "inputs": inputs, **changes}
+    return Trial.plain("a trial", said.pop("kind"), said.pop("channels", ()), time, **said)
 
 
 def shown(
@@ -504,9 +494,11 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
     given = Campaign("", {"height": channel}, (falls,), None, {}, "")
     setting = Setting(given, model, model.scales(given))
     assert not setting.scales.ports["air"].turns
-    for effect in (JOINT_MICRO_SLIP, BOUC_WEN_HYSTERESIS, CUBIC_STIFFNESS, FREE_PLAY, BREATHING_CRACK):
-        assert "motion that turns" in (effect.unavailable(setting) or "")
-    assert QUADRATIC_DAMPING.unavailable(setting) is None
+    for name in (
+        "joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack",
+    ):  # fmt: skip
+        assert "motion that turns" in (effect_by_identifier(name, library()).unavailable(setting) or "")
+    assert effect_by_identifier("quadratic_damping", library()).unavailable(setting) is None
     still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
     assert model.scales(still).ports["air"].turns
 

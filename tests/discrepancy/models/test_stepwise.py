@@ -41,14 +41,7 @@ def jittered(count: int, interval: float, share: float, seed: int = 1) -> FloatA
 
 
 def trial(kind: TrialKind, time: FloatArray, **changes: Any) -> Trial:
-    count = len(time)
-    base: dict[str, Any] = {
-        "name": "a trial", "kind": kind, "channels": (), "values": np.zeros((count, 0)),
-        "used": np.ones((count, 0), bool), "time": time, "force": np.zeros(count),
-        "load_factor": np.zeros(count), "load_place": "end", "temperature": np.zeros(count), "start": 0.0,
-        "run": "A", "health": np.zeros((1, 2)), "health_deviation": np.zeros((1, 2)),
-    }  # fmt: skip
-    return Trial(**{**base, **changes})
+    return Trial.plain("a trial", kind, (), time, **{"load_place": "end", **changes})
 
 
 def shown(model: LumpedModel, what: Trial, *items: Primitive, refinement: int = 1) -> FloatArray:

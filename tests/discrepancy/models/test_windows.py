@@ -58,15 +58,10 @@ OUTPUTS = (("x", Quantity.DISPLACEMENT), ("x", Quantity.ACCELERATION))
 
 
 def trial(kind: TrialKind, name: str = "run", time: FloatArray = TIME) -> Trial:
-    count, zeros = len(time), np.zeros(len(time))
-    released = kind is TrialKind.RINGDOWN
-    return Trial(
-        name, kind, ("x",), np.zeros((count, 1)), np.ones((count, 1), dtype=bool), time,
-        zeros if released else np.interp(time, TIME, FORCE), zeros, "push", zeros, 0.0, "",
-        np.zeros((count, 2)), np.zeros((count, 2)),
-        release=Release(0.05, mode_count=1) if released else None,
-        begins=Start.SETTLED if released else Start.STILL,
-    )  # fmt: skip
+    if kind is TrialKind.RINGDOWN:
+        return Trial.plain(name, kind, ("x",), time, load_place="push", release=Release(0.05, mode_count=1))
+    force = np.interp(time, TIME, FORCE)
+    return Trial.plain(name, kind, ("x",), time, load_place="push", force=force, begins=Start.STILL)
 
 
 def response(given: Trial, *items: Primitive) -> FloatArray:

@@ -335,16 +335,10 @@ def test_a_parameter_far_from_its_prior_is_said(tmp_path: Path) -> None:
     ("more", "priors", "cause", "words"),
     [
         (
-            "[parameters.q]\nmean = 1.0\ndeviation = 0.1",
+            "[parameters.q]\nmean = 1\ndeviation = 0.1",
             (1.0, 0.1, 0.5, 1.5),
             CampaignDataError,
             "does not have",
-        ),
-        (
-            "[parameters.p1]\nmean = 2.0\ndeviation = 0.1",
-            (1.0, 0.1, 0.5, 1.5),
-            CampaignDataError,
-            r"p1 = 2, outside the range 0.5 to 1.5",
         ),
         ("", (1.0, 0.0, 0.5, 1.5), ModelError, r"curve.toml has no parameter to calibrate"),
     ],
@@ -365,7 +359,7 @@ def test_a_mean_outside_the_range_is_said_before_the_model_is_asked(tmp_path: Pa
 
     more = "[parameters.p1]\nmean = 2.0\ndeviation = 0.1"
     campaign = campaign_of(tmp_path, spring(FORCE, np.array([1.0])), more=more)
-    with pytest.raises(CampaignDataError, match=r"p1 = 2, outside the range .* correct \[parameters.p1\]"):
+    with pytest.raises(CampaignDataError, match=r"range 0.5 to 1.5 .* correct \[parameters.p1\]"):
         calibrate_parameters(campaign, choice_of(law, (1.0, 0.1, 0.5, 1.5)))
 
 

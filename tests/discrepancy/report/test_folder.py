@@ -43,7 +43,7 @@ def test_the_folder_of_a_named_effect(drag: Investigation, written: Path) -> Non
     patch = read_patch(folder / "patch.json")
     assert patch.patch == drag.verdict.effects[0].patch
     assert patch.verdict is VerdictKind.NAMED
-    row = patch.intervals[0][0]
+    row = patch.effects[0].intervals[0]
     assert row.low < row.value < row.high
     residuals = read_residuals(folder / "residuals.nc")
     assert len(residuals.trials) == len(drag.campaign.trials)
@@ -53,8 +53,8 @@ def test_the_folder_of_a_named_effect(drag: Investigation, written: Path) -> Non
 
 
 def test_a_report_repeats_bit_for_bit(drag: Investigation, able: Separability, written: Path) -> None:
-    intervals = read_patch(written / "patch.json").intervals
-    content = ReportInput(drag, ORIGIN, able, intervals)
+    effects = read_patch(written / "patch.json").effects
+    content = ReportInput(drag, ORIGIN, able, intervals=[effect.intervals for effect in effects])
     figures = report_figures(content)
     page = render_report(content, draw(figures), figures)
     assert page == next(written.glob("*.html")).read_text(encoding="utf-8")

@@ -26,13 +26,7 @@ from discrepancy.report.residual_figures import (
     size_table,
 )
 from discrepancy.report.sizes import si_sizes, size_sentence
-from discrepancy.report.text import (
-    formula,
-    headline,
-    number,
-    probability_text,
-    rounded,
-)
+from discrepancy.report.text import formula, headline, number, probability_text, rounded
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import Investigation, patch_draws
 from fe.runtime.patch import (

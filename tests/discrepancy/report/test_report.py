@@ -22,12 +22,9 @@ from discrepancy.report.check_tables import (
 from discrepancy.report.content import ReportInput
 from discrepancy.report.figures import draw, report_figures
 from discrepancy.report.findings import add_verdict, closing_sentence
-from discrepancy.report.grounds import add_gates
+from discrepancy.report.grounds import add_gates, parameter_rows
 from discrepancy.report.page import render_report
-from discrepancy.report.parameter_table import parameter_rows
-from discrepancy.report.residual_figures import (
-    size_table,
-)
+from discrepancy.report.residual_figures import size_table
 from discrepancy.report.text import (
     headline,
     number,

@@ -15,10 +15,10 @@ from fmpy.validation import validate_fmu
 
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
 from discrepancy.files.document import Origin
-from discrepancy.files.patch import fmu_outputs, read_patch, write_patch
+from discrepancy.files.patch import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
 from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
-from discrepancy.verdict import NamedEffect
+from discrepancy.verdict import NamedEffect, VerdictKind
 from fe.runtime.patch import (
     STRUCTURE,
     BoucWen,
@@ -414,7 +414,8 @@ def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
     patch = ModelPatch((SensorGain("g3", 0.25),))
     named = NamedEffect("gauge_gain", "Gauge gain", "g3", "gain", (), (), patch)
     origin = Origin("chain", "wing", "ab" * 32, "cd" * 32, "uav-twin", collect_provenance(1))
-    path = write_patch(tmp_path / "patch.json", (named,), origin, channels=outputs)
+    stored = StoredPatch(VerdictKind.NAMED, "", patch_effects((named,)), outputs, (), origin)
+    path = write_patch(tmp_path / "patch.json", stored)
     assert read_patch(path).channels == outputs
     packed = build_fmu(
         model, tmp_path / "wing.fmu", patch=load_patch(path), arrays=arrays, activate=True

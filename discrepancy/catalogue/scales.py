@@ -1,0 +1,148 @@
+"""What the names in an entry's arithmetic stand for: natural scales of campaign, model and place.
+
+A force F = F_0 |v / (A w)|^p |x / A|^a sgn v takes F_0 A 2 B((p + 2) / 2, (a + 1) / 2) from a harmonic motion
+x = A sin w t in each cycle (B is the beta function), a viscous damper of ratio zeta 2 pi zeta k A^2. Equal
+losses give the equivalent viscous ratio zeta_eq = F_0 B / (pi k A); B is the name `cycle_loss`.
+
+Spread over a wing, a force acts at each place by its share w of the area, on the place's motion r x, x the
+mean's: the loss is sum w r^(p + a + 1) times as large.
+"""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from functools import partial
+from math import inf, pi
+
+from scipy.special import beta
+
+from discrepancy.campaign.records import TrialKind
+from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.places import Kinds, Target, channels, largest_reading, trials
+from discrepancy.errors import CatalogueError
+from discrepancy.models.interface import PortScale
+from fe.runtime.patch import EVERY_CHANNEL
+
+LARGEST_SHARE = 0.9
+"""Largest share of a port's stiffness at rest that a force which does not fall with the speed may have."""
+
+
+@dataclass(frozen=True)
+class Here:
+    """Where a law is to be built: setting, what its place stands for, trials that it changes, parameters."""
+
+    setting: Setting
+    target: Target
+    kinds: Kinds
+    values: Mapping[str, float]
+
+    @property
+    def port(self) -> PortScale:
+        """Natural scales of the port; raises `CatalogueError` if the model has no such port."""
+        ports = self.setting.scales.ports
+        if self.target.name not in ports:
+            raise CatalogueError(
+                f"The model {self.setting.model.name!r} has no port {self.target.name!r}; "
+                f"it has {', '.join(ports) or 'none'}."
+            )
+        return ports[self.target.name]
+
+    @property
+    def stiffness_at_rest(self) -> float:
+        """Stiffness of the port at rest [N/m or N m/rad]."""
+        port = self.port
+        return port.stiffness if port.static_stiffness is None else port.static_stiffness
+
+
+def loss_integral(velocity_exponent: float, displacement_exponent: float) -> float:
+    """Return B((p + 2) / 2, (a + 1) / 2): half the loss of a cycle over F_0 A; 2 for p = a = 0."""
+    return float(beta(0.5 * velocity_exponent + 1.0, 0.5 * displacement_exponent + 0.5))
+
+
+def _cycle_loss(here: Here) -> float:
+    p = max(here.values["velocity_exponent"], 0.0)
+    a = max(here.values["displacement_exponent"], 0.0) * _held(here)
+    return loss_integral(p, a) * here.port.mean_power(p + a + 1.0)
+
+
+def _held(here: Here) -> float:
+    return 0.0 if here.port.free else 1.0  # a port that nothing holds has no zero
+
+
+def _holding_force(here: Here) -> float:
+    """Return the largest force that lets the port move: more, not falling with the speed, holds it still."""
+    port = here.port
+    if port.static_stiffness is None or port.driven or here.values["velocity_exponent"] >= 1.0:
+        return inf
+    return LARGEST_SHARE * port.static_stiffness * port.displacement
+
+
+def _largest_displacement(here: Here) -> float:
+    port = here.port
+    return port.displacement if port.largest_displacement is None else port.largest_displacement
+
+
+def _largest_reading(here: Here) -> float:
+    names: tuple[str, ...] = (here.target.name,)
+    if here.target.name == EVERY_CHANNEL:
+        recorded = channels(here.setting, here.kinds)
+        names = tuple(item.name for item in recorded if here.target.quantity in ("", item.quantity.value))
+    return largest_reading(here.setting, names, here.kinds)
+
+
+def _largest_release(here: Here) -> float:
+    releases = [
+        abs(trial.release.displacement)
+        for trial in trials(here.setting, frozenset({TrialKind.RINGDOWN}))
+        if trial.release is not None and here.target.name in trial.channels
+    ]
+    return max(releases, default=0.0) or 1.0
+
+
+def _station(end: int, here: Here) -> float:
+    return (here.setting.model.stations() or (0.0, 0.0))[end]
+
+
+def _scale(name: str, here: Here) -> float:
+    return float(getattr(here.setting.scales, name))
+
+
+SCALES: dict[str, Callable[[Here], float]] = {
+    **{
+        name: partial(_scale, name)
+        for name in (
+            "length", "tip_stiffness", "modal_mass", "angular_frequency", "force", "load_factor", "duration",
+            "campaign_time",
+        )
+    },
+    "pi": lambda here: pi,
+    "root_station": partial(_station, 0),
+    "tip_station": partial(_station, 1),
+    "joint_elements": lambda here: here.setting.joint_elements,
+    "largest_reading": _largest_reading,
+    "largest_release": _largest_release,
+    "number": lambda here: here.target.number,
+    "port_displacement": lambda here: here.port.displacement,
+    "port_stiffness": lambda here: here.port.stiffness,
+    "port_angular_frequency": lambda here: here.port.angular_frequency,
+    "port_stiffness_at_rest": lambda here: here.stiffness_at_rest,
+    "port_largest_displacement": _largest_displacement,
+    "port_holding_force": _holding_force,
+    "port_is_held": _held,
+    "mean_power": lambda here: here.port.mean_power(here.values["exponent"] + 1.0),
+    "cycle_loss": _cycle_loss,
+}  # fmt: skip
+"""Every name: the value where a law is built [SI].
+
+`number` is what the place has of it (side of a skin, frequency of a line), `mean_power` of the motion of a
+spread force with `exponent`.
+"""
+_OF_SHAPES = {
+    "mean_power": {"exponent"},
+    "cycle_loss": {"velocity_exponent", "displacement_exponent"},
+    "port_holding_force": {"velocity_exponent"},
+}
+
+
+def names_with(parameters: Collection[str]) -> frozenset[str]:
+    """Return the names that may be used beside an effect's parameters; some need a shape among these."""
+    return frozenset(name for name in SCALES if _OF_SHAPES.get(name, set()) <= {*parameters})

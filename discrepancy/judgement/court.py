@@ -1,0 +1,221 @@
+"""Hypotheses along the missing force before a court: which may be named, what speaks against the others."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import logsumexp
+from scipy.stats import chi2
+
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.gates import ABSOLUTE_LEVEL
+from discrepancy.fits.problem import Problem
+from discrepancy.missing_force.naming import Explained, ForceSearch, Key, key_of
+from discrepancy.missing_force.shares import ForceShare, ForceShares
+from discrepancy.search.starting_points import acts_within
+from discrepancy.search_settings import SEARCH
+
+COUNTER = -0.1
+"""Share below which trials in which a law has hardly any force speak against it all the same."""
+
+
+@dataclass
+class Court:
+    """Hypotheses along the missing force, with the share that each is of it."""
+
+    problem: Problem
+    search: ForceSearch
+    ranked: Sequence[Explained]
+    count: int
+
+    @cached_property
+    def shares(self) -> ForceShares:
+        """What each is of the missing force."""
+        return ForceShares(self.search)
+
+    @cached_property
+    def _known(self) -> dict[tuple[int, bool], ForceShare]:
+        return {}
+
+    def share(self, item: Explained, *, held_out: bool) -> ForceShare:
+        """Return the share that a hypothesis is of the missing force."""
+        key = (id(item), held_out)
+        if key not in self._known:
+            self._known[key] = self.shares.of(item, held_out=held_out)
+        return self._known[key]
+
+    def told(self, item: Explained) -> ForceShare:
+        """Return the share that counts: in trials not fitted, if there are any that can test it."""
+        if self.shares.has_held_out:
+            outside = self.share(item, held_out=True)
+            if outside.tested:
+                return outside
+        return self.share(item, held_out=False)
+
+    def score(self, item: Explained) -> float:
+        """Return ln (evidence times prior) of a hypothesis [nat]."""
+        return self.search.score(item, self.count)
+
+    # ---------------------------------------------------------------- who may be named
+
+    def against(self, item: Explained) -> str:
+        """Return why a hypothesis is no name; empty where nothing speaks against it."""
+        acts = any(self.acts(term) for term in item.candidate.terms)
+        if not acts and np.abs(item.effect).max(initial=0.0) > SEARCH.stand_in_range:
+            return "it is an error of the readings far beyond what is usual"
+        least = SEARCH.least_end if acts else SEARCH.least_share
+        inside = self.share(item, held_out=False)
+        if _is_little(inside, least):
+            return f"it is {part(inside)} where it was fitted"
+        if self.shares.has_held_out and not self._survives(item, least):
+            return f"it is {part(self.share(item, held_out=True))} in trials that were not fitted"
+        names = self.problem.shared.gain_channels
+        count = len(item.shared) - len(names)
+        proper = self.problem.shared.precision > 0.0
+        for what, own in (("calibrated parameters", slice(count)), ("gains", slice(count, None))):
+            u = item.shared[own][proper[own]]
+            if u.size and chi2.sf(u @ u / SEARCH.widened**2, u.size) < ABSOLUTE_LEVEL:
+                return f"it needs {what} far beside their priors: are these what you would bet on?"
+        return ""
+
+    def _survives(self, item: Explained, least: float) -> bool:
+        """Whether trials that were not fitted bear a hypothesis out, or have no force by which they could."""
+        outside = self.share(item, held_out=True)
+        if not outside.tested:
+            return outside.value > COUNTER
+        return not _is_little(outside, least)
+
+    def acts(self, term: Term) -> bool:
+        """Whether a term acts on the structure, and is no description of readings."""
+        return acts_within(term.effect, self.problem.setting)
+
+    @cached_property
+    def contenders(self) -> list[Explained]:
+        """Hypotheses that data do not exclude and nothing speaks against, most probable first.
+
+        Errors of the readings beside laws take up what is left, whatever it is: they are no part of a name.
+        """
+        found: dict[Key, tuple[Explained, float]] = {}
+        for item in self.ranked:
+            core = self._core(item)
+            if core is not None and key_of(core.candidate) not in found and not self.against(core):
+                found[key_of(core.candidate)] = core, self.score(item)
+        best = max((score for _, score in found.values()), default=0.0)
+        return [item for item, score in found.values() if score > best - SEARCH.contenders]
+
+    def _core(self, item: Explained) -> Explained | None:
+        """Return a hypothesis without errors of the readings beside its laws; None without an effect."""
+        acts = [self.acts(term) for term in item.candidate.terms]
+        if all(acts) or not any(acts):
+            return item if acts else None
+        parts = item.candidate.parts(item.effect)
+        kept = [number for number, within in enumerate(acts) if within]
+        candidate = Candidate(tuple(item.candidate.terms[number] for number in kept))
+        known = next((one for one in self.ranked if key_of(one.candidate) == key_of(candidate)), None)
+        if known is None:
+            values = np.concatenate([parts[number] for number in kept])
+            known = self.search.followed(self.search.whole, candidate, values)
+        return known
+
+    def slimmed(self, best: Explained) -> Explained:
+        """Return the simplest hypothesis that is as much of the missing force."""
+        own = {_family(term) for term in best.candidate.terms}
+        able = {key_of(item.candidate): item for item in (*self.ranked, *self._singles(best))}
+        inside, outside = self.share(best, held_out=False).value, self.told(best).value
+        simpler = [
+            item for item in able.values()
+            if item.candidate.terms and _freedom(item) < _freedom(best)
+            and {_family(term) for term in item.candidate.terms} <= own
+            and self.share(item, held_out=False).value > inside - 3.0 * SEARCH.slim
+            and self.told(item).value > outside - SEARCH.slim
+            and not self.against(item)
+        ]  # fmt: skip
+        return min(simpler, key=lambda item: (_freedom(item), -self.score(item)), default=best)
+
+    def _singles(self, best: Explained) -> list[Explained]:
+        """Return the effects of a hypothesis each alone, where there are several."""
+        parts, terms = best.candidate.parts(best.effect), best.candidate.terms
+        if len(terms) < 2:
+            return []
+        known = {key_of(item.candidate) for item in self.ranked}
+        alone = [(Candidate((term,)), part) for term, part in zip(terms, parts, strict=True)]
+        found = [
+            self.search.followed(self.search.whole, candidate, part)
+            for candidate, part in alone
+            if key_of(candidate) not in known
+        ]
+        return [item for item in found if item is not None]
+
+    def probability(self, item: Explained) -> float:
+        """Return the probability of a hypothesis with all that hold its effects or their families."""
+        own = {_family(term) for term in item.candidate.terms}
+        acts = any(self.acts(term) for term in item.candidate.terms)
+        kept = [
+            one for one in self.ranked
+            if not one.candidate.terms or one is item or not acts or not self._refuted(one)
+        ]  # fmt: skip
+        scores = np.array([self.score(one) for one in kept])
+        holds = np.array([own <= {_family(term) for term in one.candidate.terms} for one in kept])
+        if not holds.any():
+            return 0.0
+        return float(np.exp(logsumexp(scores[holds]) - logsumexp(scores)))
+
+    def _refuted(self, item: Explained) -> bool:
+        """Whether trials show that a hypothesis is not what is missing."""
+        if self.share(item, held_out=False).interval[1] < SEARCH.least_share:
+            return True
+        return self.shares.has_held_out and not self._survives(item, 0.0)
+
+    def rivals(self, best: Explained) -> list[Explained]:
+        """Return other names that neither evidence nor trials tell from the best one."""
+        own, share = {_family(term) for term in best.candidate.terms}, self.told(best)
+        found: list[Explained] = []
+        for item in self.contenders:
+            families = {_family(term) for term in item.candidate.terms}
+            same = names(item) == names(best) or (families == own and _is_free(item))
+            if same or names(item) > names(best) or len(item.candidate.terms) > len(best.candidate.terms):
+                continue
+            close = self.score(item) > self.score(best) - SEARCH.force_rival
+            known = any(names(item) == names(other) for other in found)
+            if close and not known and not share.told_from(self.told(item)):
+                found.append(item)
+        return found
+
+
+def _is_little(share: ForceShare, least: float) -> bool:
+    low, high = share.interval
+    return high < SEARCH.least_share or low < least
+
+
+def _family(term: Term) -> tuple[str, str]:
+    return term.effect.family, term.place
+
+
+def names(item: Explained) -> set[tuple[str, str]]:
+    """Return effects and places of a hypothesis."""
+    return {(term.effect.identifier, term.place) for term in item.candidate.terms}
+
+
+def _is_free(item: Explained) -> bool:
+    return any(term.free_shape for term in item.candidate.terms)
+
+
+def _freedom(item: Explained) -> tuple[int, int]:
+    return len(item.candidate.terms), sum(term.free_shape for term in item.candidate.terms)
+
+
+def of_what(share: ForceShare) -> str:
+    """Return what a share is one of."""
+    return "what the missing force does to predictions" if share.ahead else "the missing force"
+
+
+def percent(share: ForceShare) -> str:
+    """Return a share with its interval."""
+    low, high = share.interval
+    return f"{100.0 * share.value:.3g} % ({100.0 * low:.3g} to {100.0 * high:.3g})"
+
+
+def part(share: ForceShare) -> str:
+    """Return a share with its interval, and what it is one of."""
+    return f"{percent(share)} of {of_what(share)}"

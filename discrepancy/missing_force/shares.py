@@ -1,0 +1,235 @@
+"""What share of the missing force a hypothesis is, in trials that were fitted and in those that were not."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.problem import Problem
+
+from .columns import Columns
+from .naming import Explained, ForceSearch
+from .trial import SeenTrial, seen_trial
+from .view import Motion, View
+
+FloatArray = NDArray[np.float64]
+
+WINDOWS, SHORTEST = 12, 8
+"""Blocks into which a trial is cut, and samples of a block at least."""
+WITHIN = 2.0
+"""Prior deviations within which parameters stay where the missing force without any effect is told."""
+TESTED = 0.1
+"""Share of the missing force from which on a law has one that these trials can test."""
+DRAWS, SEED = 2000, 0
+TURNS = 3
+"""Times that the motion of a trial that was not fitted is looked at along the law that it shows."""
+BINS, LEAST_IN_BIN = 24, 4
+
+
+@dataclass(frozen=True, eq=False)
+class ForceShare:
+    """A share of the missing force: 1 - mean square of what is left over mean square of the force.
+
+    Attributes
+    ----------
+    before, after, noise : (B,) ndarray
+        Sums of squares by block, and what the noise of the readings alone makes of them.
+    held_out : bool
+        Whether of trials that were not fitted.
+    trials : int
+        How many.
+    left, whole : float
+        Root mean square of the force at the port of the law (or where most is missing) beside it, and of all
+        of it [N, N m or the port's flow].
+    ahead : bool
+        Whether squares are of what the forces do to readings over a block, from its begin: the error of
+        predictions; else of the forces, over what they do to the state.
+    tested : bool
+        Whether the law has a force there that could be seen.
+    """
+
+    before: FloatArray
+    after: FloatArray
+    noise: FloatArray
+    held_out: bool
+    trials: int
+    left: float
+    whole: float
+    ahead: bool
+    tested: bool
+
+    @property
+    def value(self) -> float:
+        """The share."""
+        return float(_share(self.before.sum(), self.after.sum(), self.noise.sum()))
+
+    def drawn(self) -> FloatArray:
+        """Return the share at draws of blocks with replacement (Kuensch 1989, Ann. Statist. 17, 1217)."""
+        count = len(self.before)
+        times = np.random.default_rng(SEED).multinomial(count, np.full(count, 1.0 / count), DRAWS)
+        return _share(times @ self.before, times @ self.after, times @ self.noise)
+
+    def told_from(self, other: "ForceShare") -> bool:
+        """Whether this share is larger than that of another hypothesis beyond chance (5 %)."""
+        return bool(np.quantile(self.drawn() - other.drawn(), 0.05) > 0.0)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Ends of its 90 % interval."""
+        low, high = np.quantile(self.drawn(), (0.05, 0.95))
+        return float(low), float(high)
+
+
+class ForceShares:
+    """Shares of the missing force, by hypothesis.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        Whose hypotheses they are.
+    """
+
+    def __init__(self, search: ForceSearch) -> None:
+        self.search = search
+        campaign = search.problem.campaign
+        held = tuple(trial for trial in campaign.held_out if trial.is_dynamic)
+        self._outside: tuple[Columns, View] | None = None
+        self._bare: dict[bool, tuple[View, list[Motion]]] = {}
+        if held:
+            problem = Problem(
+                campaign, search.problem.model.inner, search.problem.setting, held, like=search.problem
+            )
+            numbers = range(len(problem.trials))
+            point = Point(search.point.shared, problem.start(search.whole.candidate).local, np.zeros(0))
+            trials = [seen_trial(problem, number, point) for number in numbers]
+            self._outside = Columns(problem, numbers, point), View(trials, problem.shared.precision)
+
+    @property
+    def has_held_out(self) -> bool:
+        """Whether there are trials in motion that were not fitted."""
+        return self._outside is not None
+
+    def of(self, found: Explained, *, held_out: bool) -> ForceShare:
+        """Return the share that a hypothesis is, of trials that were fitted or of those held out.
+
+        Of the forces, or of what they do to predictions, whichever tells more: fast forces hardly move a free
+        mass, slow ones are little beside them.
+        """
+        view, motions = self.motions(found, held_out=held_out)
+        without = self._without(held_out)[1]
+        laws = {
+            self.search.ports.index(t.place) for t in found.candidate.terms if t.place in self.search.ports
+        }
+        port_of = laws or set(self.search.best().processes)
+        system = view.trials[0].system
+        weight = {
+            port: float(np.hypot(np.linalg.norm(system.actions[port]), np.linalg.norm(system.through[port])))
+            for port in motions[0].left
+        }
+        of_force, of_readings = [], []
+        filters = view.filtered({**found.processes, **self.search.whole.processes})
+        for trial, motion, bare, one in zip(view.trials, motions, without, filters, strict=True):
+            shown = dict(zip(one.processes, one.smoothed(_noise(trial))[1], strict=True))
+            count = len(trial.time)
+            edges = np.linspace(0, count, min(WINDOWS, max(1, count // SHORTEST)) + 1).astype(int)
+            for begin, end in pairwise(edges.tolist()):
+                samples = slice(begin * trial.parts, end * trial.parts, trial.parts)
+                kinds = (bare.forces, motion.left, shown)
+                of_force.append(
+                    [
+                        sum(float(np.sum((weight[p] * force[samples]) ** 2)) for p, force in forces.items())
+                        for forces in kinds
+                    ]
+                )
+                of_readings.append([float(np.sum(trial.ahead(forces, begin, end) ** 2)) for forces in kinds])
+        left, whole, own = (
+            max(_size([forces[p] for forces in kind if p in forces]) for p in port_of)
+            for kind in (
+                [motion.left for motion in motions],
+                [bare.forces for bare in without],
+                [motion.laws for motion in motions],
+            )
+        )
+        shares = [
+            ForceShare(
+                table[0],
+                table[1],
+                table[2],
+                held_out,
+                len(motions),
+                left,
+                whole,
+                ahead,
+                not laws or own**2 > TESTED * whole**2,
+            )
+            for table, ahead in ((np.array(of_force).T, False), (np.array(of_readings).T, True))
+        ]
+        return max(shares, key=lambda share: share.interval[0])
+
+    def _without(self, held_out: bool) -> tuple[View, list[Motion]]:
+        """Return motion and missing force without any effect, parameters being within twice their priors."""
+        if held_out not in self._bare:
+            found = self.search.whole
+            bound = np.where(found.view.shared_precision > 0.0, WITHIN, np.inf)
+            mean = np.clip(found.solution.mean, -bound, bound)
+            bare = replace(found, solution=replace(found.solution, mean=mean))
+            self._bare[held_out] = self.motions(bare, held_out=held_out)
+        return self._bare[held_out]
+
+    def motions(self, found: Explained, *, held_out: bool) -> tuple[View, list[Motion]]:
+        """Return motion and missing force of each trial beside a hypothesis, and the view that shows them.
+
+        What is left is a force of the size that is missing without any effect: it takes up all that it can.
+        """
+        wide = {**found.processes, **self.search.whole.processes}
+        if not held_out:
+            return found.view, found.view.along(wide, found.solution)[2]
+        assert self._outside is not None
+        columns, view = self._outside
+        solution = replace(found.solution, mean=found.shared)
+        motions = view.along(wide, solution)[2]
+        for _ in range(TURNS):
+            known = columns.of(view, motions, found.candidate, found.effect) if len(found.effect) else None
+            own = columns.of_patch(view, motions, self.search.laws) if len(self.search.laws) else None
+            view = replace(view, motions=motions, known=known, own=own)
+            motions = view.along(wide, solution)[2]
+        return view, motions
+
+
+def _share(before: FloatArray, after: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return 1 - (after - noise) / (before - noise), nought where nothing is missing."""
+    gap = before - noise
+    return np.where(gap > 0.0, 1.0 - np.maximum(after - noise, 0.0) / np.where(gap > 0.0, gap, 1.0), 0.0)
+
+
+def _noise(trial: SeenTrial) -> FloatArray:
+    """Return readings (N, C) of noise alone, over its deviation."""
+    generator = np.random.default_rng(SEED)
+    found = generator.standard_normal(trial.residual.shape)
+    for channel, share, rate in trial.coloured:
+        kept = np.exp(-rate * np.diff(trial.time, prepend=trial.time[0]))
+        slow = np.zeros(len(found))
+        for k, fresh in enumerate(generator.standard_normal(len(found))):
+            slow[k] = fresh if k == 0 else kept[k] * slow[k - 1] + np.sqrt(1.0 - kept[k] ** 2) * fresh
+        found[:, channel] = np.sqrt(1.0 - share) * found[:, channel] + np.sqrt(share) * slow
+    return np.asarray(found * trial.used)
+
+
+def _size(forces: Sequence[FloatArray]) -> float:
+    if not forces:
+        return 0.0
+    return float(np.sqrt(np.mean(np.concatenate(forces) ** 2)))
+
+
+def order_of(variable: FloatArray, force: FloatArray) -> float:
+    """Return the share of a force's variance that its mean at like values of a variable is, (N,) each."""
+    count = len(force)
+    bins = min(BINS, count // LEAST_IN_BIN)
+    if bins < 2 or not np.ptp(variable) > 0.0:
+        return 0.0
+    parts = np.array_split(force[np.argsort(variable, kind="stable")], bins)
+    within = sum(float(np.sum((part - part.mean()) ** 2)) for part in parts) / (count - bins)
+    return max(1.0 - within / max(float(np.var(force, ddof=1)), 1e-300), 0.0)

@@ -1,0 +1,186 @@
+"""When there is a gap in the records in time: events of the missing force, or of what readings show.
+
+Where a model tells how its ports move, an event is a force at the port that tells most, or on the reading of
+one channel where that tells more, beside all unknowns of the records. Elsewhere it acts on the pattern over
+the channels in which the residuals of a fit are largest.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import TrialKind
+from discrepancy.errors import DiscrepancyError
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.problem import Problem
+from discrepancy.location.residuals import ResidualSet
+from discrepancy.models.ported import PortedSystem, shows_ports
+from discrepancy.verdict import GapWindow, Moment
+
+from .events import GROUND, MOST_EVENTS, Events, changes, events
+from .filtered import Process
+from .force import of_nothing
+from .naming import Explained, ForceSearch, seen
+from .trial import SeenTrial
+from .view import View
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IN_TIME = frozenset(TrialKind) - {TrialKind.STATIC}
+
+SHOWS = 0.2
+"""Share of the largest channel's size from which on a channel shows a gap."""
+READING_SIZES, READING_TIMES = (3.0, 30.0, 300.0), (0.02, 0.3)
+"""Processes on a reading that are weighed against the force: over the noise, over the record's length."""
+
+
+def gap_windows(
+    problem: Problem, fit: CandidateFit, residuals: ResidualSet, *, seed: int = 0
+) -> tuple[GapWindow, ...]:
+    """Return when there is a gap of the model as it was, in records held out too.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    fit : CandidateFit
+        Of the verdict: where its law at a port, acting throughout, tells more than events, there are none.
+    residuals : ResidualSet
+        Of the model as it was; those of trials whose force cannot be seen are looked at themselves.
+    seed : int
+        Of the draw that restores what the fit has absorbed.
+    """
+    dynamic = tuple(item.trial for item in residuals.trials if item.trial.is_dynamic)
+    if not dynamic or not shows_ports(problem.model.inner):
+        return residual_windows(residuals, seed=seed)
+    try:
+        found = _of_force(problem.with_trials(dynamic), fit)
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # no verdict rests on it
+        return residual_windows(residuals, seed=seed)
+    return found + residual_windows(residuals, seed=seed, kinds=frozenset({TrialKind.FLIGHT}))
+
+
+def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
+    """Return when a force is missing at the port, or the reading, that tells most."""
+    search = ForceSearch(problem)
+    at = search.locate()
+    port = max(at, key=lambda name: at[name].evidence)
+    law = _law_at(search, fit, port)
+    number, found = _most_telling(search.ports.index(port), search.rough(port))
+    if found.evidence < of_nothing(found) + GROUND:
+        return ()
+    best = events(found.view, number, found.processes[number], -np.inf if law is None else law.evidence)
+    shown = []
+    for trial, motion in zip(found.view.trials, found.motions, strict=True):
+        force = motion.forces[number]
+        shown.append(trial.readings(trial.pushed(number, force), {number: force}))
+    return _windows(best, [data.trial.channels for data in problem.trials], shown, with_effect=False)
+
+
+def _law_at(search: ForceSearch, fit: CandidateFit, port: str) -> Explained | None:
+    """Return the hypothesis of the laws that a verdict has at a port; None where it has none."""
+    parts = zip(fit.candidate.terms, fit.candidate.parts(fit.point.effect), strict=True)
+    laws = [(term, part) for term, part in parts if term.place == port]
+    if not laws:
+        return None
+    candidate = Candidate(tuple(term for term, _ in laws))
+    return search.followed(search.at[port], candidate, np.concatenate([part for _, part in laws]))
+
+
+def residual_windows(
+    residuals: ResidualSet,
+    *,
+    seed: int = 0,
+    with_effect: bool = False,
+    kinds: frozenset[TrialKind] = IN_TIME,
+) -> tuple[GapWindow, ...]:
+    """Return when the residuals of a hypothesis are more than noise, in trials of some kinds.
+
+    `with_effect`: whether it is the best one, not the model as it was.
+    """
+    found: tuple[GapWindow, ...] = ()
+    white = residuals.white(np.random.default_rng((seed, 1)))
+    for item, series in zip(residuals.trials, white, strict=True):
+        if item.trial.kind in kinds and item.used.any() and len(series) > 1:
+            one, pattern = of_series(item.trial.name, item.trial.time, series, item.used)
+            if one.evidence < of_nothing(one) + GROUND:
+                continue
+            best = events(one.view, 0, one.processes[0])
+            shown = one.motions[0].forces[0][:, None] * pattern
+            found += _windows(best, [item.trial.channels], [shown], with_effect=with_effect)
+    return found
+
+
+def _most_telling(port: int, at: Explained) -> tuple[int, Explained]:
+    """Return the missing force, or what one channel shows where that tells more, and its port first."""
+    view, best = at.view, (port, at)
+    trials = view.trials
+    for channel in range(min(trial.residual.shape[1] for trial in trials)):
+        on_reading = replace(view, trials=[_reading(trial, channel) for trial in trials])
+        length = max(float(np.ptp(trial.time)) for trial in trials)
+        processes = [
+            {0: Process(size, time * length, rough=True)}
+            for size, time in product(READING_SIZES, READING_TIMES)
+        ]
+        about = max(processes, key=lambda item: on_reading.solve(item).evidence)
+        if on_reading.solve(about).evidence > best[1].evidence:
+            best = 0, seen(on_reading, about, about)
+    return best
+
+
+def _reading(trial: SeenTrial, channel: int) -> SeenTrial:
+    """Return a trial whose only port is a reading; a unit of its force is the deviation of the noise."""
+    shown = np.zeros((1, len(trial.deviation)))
+    shown[0, channel] = -trial.deviation[channel]
+    still = np.zeros((len(trial.positions), 1))
+    none = np.zeros((1, len(trial.system.generator)))
+    system = replace(
+        trial.system, ports=("reading",), actions=none, positions=none, speeds=none, through=shown
+    )
+    return replace(trial, system=system, positions=still, speeds=still, by_unknowns=())
+
+
+def of_series(
+    name: str, time: FloatArray, series: FloatArray, used: BoolArray
+) -> tuple[Explained, FloatArray]:
+    """Return residuals in noises (N, C) as a record of one reading: their largest pattern (C,), which too."""
+    series = np.where(used, series, 0.0)
+    pattern = np.linalg.svd(series, full_matrices=False)[2][:1]
+    deviation = 1.0 + np.sqrt((series.shape[1] - 1) / len(time))  # of the largest pattern of noise alone
+    none, columns = np.zeros((1, 0)), np.zeros((0, len(time), 1))
+    still = np.zeros((len(time), 1))
+    system = PortedSystem(np.zeros((0, 0)), ("readings",), none, none, none, none, -np.ones((1, 1)))
+    trial = SeenTrial(
+        name, time, series @ pattern.T / deviation, np.any(used, axis=1).reshape(-1, 1),
+        np.array([deviation]), (),
+        columns, columns, np.zeros(0), system, (), 1, still, still, False,
+    )  # fmt: skip
+    size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
+    about = {0: Process(size, 0.1 * float(np.ptp(time)), rough=True)}
+    found = seen(View([trial], np.zeros(0)), about, about)
+    return found, pattern[0]
+
+
+def _windows(
+    best: Events, channels: Sequence[tuple[str, ...]], shown: Sequence[FloatArray], *, with_effect: bool
+) -> tuple[GapWindow, ...]:
+    """Return the windows of events, given by trial the channels and what these show of the force (N, C)."""
+    windows = []
+    for number, (trial, on) in enumerate(zip(best.search.view.trials, best.paths, strict=True)):
+        ends = (float(trial.time[0]), float(trial.time[-1]))
+        at = changes(on)
+        if len(at) > 2 * MOST_EVENTS:
+            on, at = np.ones_like(on), at[:0]
+        moments = [Moment(*map(float, item)) for item in best.moments(number)] if len(at) else []
+        edges, known = [0, *at, len(on)], [None, *moments, None]
+        for k in np.flatnonzero(on[edges[:-1]]):
+            size = np.sqrt(np.mean(shown[number][edges[k] : edges[k + 1]] ** 2, axis=0))
+            rows = zip(channels[number], size > SHOWS * size.max(), strict=True)
+            names = tuple(name for name, shows in rows if shows)
+            largest = float(size.max())
+            windows.append(GapWindow(trial.name, names, known[k], known[k + 1], *ends, largest, with_effect))
+    return tuple(windows)

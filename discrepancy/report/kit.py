@@ -1,0 +1,92 @@
+"""What the figures of residuals have in common: panels, the two models, maps of sizes."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from numpy.typing import NDArray
+
+from discrepancy.location.residuals import ResidualSet
+from reporting.figures import LEVELS, PAST, PREDICTION, REFERENCE, new_figure
+
+AFTER = "with the effect"
+EMPTY = "#f0f1f2"
+"""Colour of cells of a map that hold nothing."""
+
+
+class Shown(NamedTuple):
+    """Residuals of a model, and how it is drawn."""
+
+    residuals: ResidualSet
+    colour: str
+    dashes: str
+    marker: str
+    label: str
+
+
+def models(before: ResidualSet, after: ResidualSet | None) -> list[Shown]:
+    """Return the model as it was and, where there is one, with the effect."""
+    if after is None:
+        return [Shown(before, PREDICTION, "--", "o", "model")]
+    return [
+        Shown(before, PREDICTION, "--", "o", "model as it was"), Shown(after, PAST, "-", "D", AFTER),
+    ]  # fmt: skip
+
+
+def titles(shown: Sequence[Shown]) -> list[str]:
+    """Return the titles of panels of one model each."""
+    return [f"{'ab'[n]}  {item.label}" for n, item in enumerate(shown)] if shown[1:] else ["model as it is"]
+
+
+def panels(
+    rows: int, columns: int, height: float, top: float, bottom: float, **grid: Any
+) -> tuple[Figure, list[list[Axes]]]:
+    """Return a figure of a height [in] and its panels; the rest is in shares of the figure, as in a grid."""
+    figure = new_figure(height)
+    cells = figure.add_gridspec(rows, columns, top=top, bottom=bottom, **{"right": 0.985, **grid})
+    return figure, [[figure.add_subplot(cells[row, n]) for n in range(columns)] for row in range(rows)]
+
+
+def draw_noise(axes: Axes, deviation: float, opacity: float) -> None:
+    """Draw the band of two deviations of the noise."""
+    axes.axhspan(
+        -2.0 * deviation, 2.0 * deviation, color=REFERENCE, alpha=opacity, lw=0.0, label="noise, ± 2 s0"
+    )
+
+
+def plain_powers(axis: Axis, parts: tuple[float, ...]) -> None:
+    """Label a logarithmic axis with plain numbers at parts of its decades."""
+    axis.set_major_locator(LogLocator(10.0, parts))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def name_cells(axes: Axes, rows: Iterable[str], columns: Iterable[str], slant: float) -> None:
+    """Name the rows and columns of a map."""
+    rows, columns = list(rows), list(columns)
+    axes.set_xticks(range(len(columns)), columns, rotation=slant, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(len(rows)), rows)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    axes.set_facecolor(EMPTY)
+
+
+def scale_of(values: Sequence[float] | NDArray[np.float64]) -> Normalize:
+    """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end."""
+    found = np.asarray(values, dtype=float)
+    largest = float(np.nanmax(found, initial=1.0))
+    return LogNorm(0.7, max(largest, 3.0))
+
+
+def size_bar(figure: Figure, norm: Normalize, place: tuple[float, float, float, float]) -> None:
+    """Draw the colour scale of sizes of residuals."""
+    bar = figure.colorbar(ScalarMappable(norm, LEVELS), cax=figure.add_axes(place))
+    bar.set_label("rms residual / noise")
+    plain_powers(bar.ax.yaxis, (1.0, 2.0, 5.0) if float(norm.vmax or 1.0) < 50.0 else (1.0,))
+    bar.outline.set_linewidth(0.5)
