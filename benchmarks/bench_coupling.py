@@ -19,7 +19,7 @@ from fmu_asset.coupling.structure import Component, Connector, Setting, SystemSt
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from scenarios import binding_files
 from twin_master.scenario.reading import load_scenario
 

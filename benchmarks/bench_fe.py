@@ -33,7 +33,7 @@ begin = time.perf_counter()
 from fe.reduction.model_cache import wing_fields
 from fe.reduction.fields import write_wing_vtu
 wing = wing_fields()
-write_wing_vtu(sys.argv[1], wing, young_modulus_factor=1.0, stiffness_loss=(0.4, 0.2), load_factor=3.0)
+write_wing_vtu(sys.argv[1], wing, wing.model.vector(stiffness_loss=(0.4, 0.2), load_factor=3.0))
 print(json.dumps({"wall": time.perf_counter() - begin}))
 """
 STATES = 12
@@ -70,6 +70,7 @@ def _against_the_full_model() -> list[Measurement]:
     from fe.full.operators import assemble
     from fe.full.statics import solve_static
     from fe.reduction.model_cache import reduced_model
+    from fe.runtime.state import TIP_FORCE
     from fe.runtime.transient import ModalIntegrator
     from fe.wing.design import load_design
 
@@ -88,35 +89,31 @@ def _against_the_full_model() -> list[Measurement]:
         begin = time.perf_counter()
         full = solve_static(operators, e, z, *load)
         full_times.append(time.perf_counter() - begin)
-        reduced = model.static_response(e, z, *load)
+        vector = model.vector(stiffness_loss=z, young_modulus_factor=e)
+        reduced = model.static_response(vector, load=np.array(load))
         largest = np.abs(full.strain).max()
         error = np.abs(reduced.strain - full.strain).max()
         errors.append(error / largest)
         bounds.append(reduced.strain_error_bound / largest)
         effectivities.append(reduced.strain_error_bound / error)
-        tip_errors.append(abs(reduced.tip_displacement / full.tip_displacement - 1.0))
+        tip_errors.append(abs(reduced.displacement[0] / full.tip_displacement - 1.0))
         if number % 2:
             masses = random.uniform((0.05, 0.0), (0.30, 0.30))
             frequency = eigenmodes(operators, e, z, *masses, count=6).frequency
-            frequency_errors.append(np.abs(model.modes(e, z, *masses).frequency / frequency - 1.0).max())
+            named = dict(zip(("servo_mass", "pitot_mass"), masses, strict=True))
+            found = model.modes(named, z, young_modulus_factor=e).frequency
+            frequency_errors.append(np.abs(found / frequency - 1.0).max())
     assert min(effectivities) >= 1.0, "the certified bound does not hold"
 
-    state = (1.0, (0.4, 0.2))
-    one = median_seconds(lambda: model.static_response(*state, 3.0), inner=500)
-    losses = random.uniform(0, 0.8, (1000, 2))
-    many = median_seconds(lambda: model.static_strains(1.0, losses, 3.0)) / len(losses)
-    modes = median_seconds(lambda: model.modes(*state, 0.169, 0.134), inner=50)
-    integrator = ModalIntegrator(
-        model,
-        young_modulus_factor=1.0,
-        stiffness_loss=(0.0, 0.0),
-        servo_mass=0.169,
-        pitot_mass=0.134,
-        damping_alpha=1.0735,
-        damping_beta=7.3124e-4,
-    )
-    at = integrator.released(0.02)
-    step = median_seconds(lambda: integrator.response(integrator.advance(at, 0.01, (3.0, 0.0))), inner=200)
+    state = model.vector(stiffness_loss=(0.4, 0.2), load_factor=3.0)
+    one = median_seconds(lambda: model.static_response(state), inner=500)
+    losses = random.uniform(0, 0.8, (2, 1000))
+    vectors = model.vectors({"z1": losses[0], "z2": losses[1], "load_factor": 3.0})
+    many = median_seconds(lambda: model.static_outputs(vectors)) / len(vectors)
+    modes = median_seconds(lambda: model.modes(state), inner=50)
+    integrator = ModalIntegrator(model, model.nominal, *model.damping)
+    at = integrator.released(0.02, (0.0, 0.0), TIP_FORCE)
+    step = median_seconds(lambda: integrator.outputs(integrator.advance(at, 0.01, (3.0, 0.0))), inner=200)
     full_time = float(np.median(full_times))
     return [
         Measurement(

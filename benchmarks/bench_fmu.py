@@ -15,7 +15,7 @@ from fe.reduction.model_cache import reduced_model
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 BINDING = Path(__file__).parents[1] / "scenarios" / "bindings" / "uav_wing.toml"
 # Many short batches: on a busy machine an interruption spoils one of them and not the median.
@@ -34,7 +34,11 @@ def run() -> list[Measurement]:
         isolated = _asset(path, binding, isolated=True)
         opening = median_seconds(lambda: _open_and_close(path, binding), repeats=5)
     damage = itertools.cycle(range(LEVELS))
-    alone = _microseconds(lambda: model.static_response(1.0, (0.001 * next(damage), 0.2), 3.0))
+    alone = _microseconds(
+        lambda: model.static_response(
+            young_modulus_factor=1.0, stiffness_loss=(0.001 * next(damage), 0.2), load_factor=3.0
+        )
+    )
     lists = "fmpy, lists, no checks"
     return [
         Measurement("FMU step in process", in_process, "us", 60.0, lists, plain),

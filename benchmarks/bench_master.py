@@ -18,7 +18,7 @@ from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 BINDING = Path(__file__).parents[1] / "scenarios" / "bindings" / "uav_wing.toml"
 STEPS = 10_000

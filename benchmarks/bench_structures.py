@@ -71,7 +71,7 @@ from scipy.sparse.linalg import splu
 from skfem import MeshTet
 
 from fe.full.statics import Factorisation
-from fe.reduction.structure_basis import reduce_structure
+from fe.reduction.reduced_basis import reduce_structure
 from fe.structure.elements import KINDS
 from fe.structure.operators import load_and_assemble
 from fe.verification.structure_input import StructureDeck

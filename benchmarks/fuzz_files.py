@@ -152,8 +152,7 @@ def _ssp(folder: Path) -> None:
 
 
 def _reduced(folder: Path) -> None:
-    from fe.reduction.model_cache import reduced_model
-    from fe.reduction.patch_cache import build_patch_arrays
+    from fe.reduction.model_cache import build_patch_arrays, reduced_model
 
     design = load_design().changed(mesh={"refinement": 0.25})
     build_patch_arrays(design).save(folder / "patched.npz")

@@ -24,14 +24,13 @@ from threadpoolctl import threadpool_limits
 
 from fe.full.operators import AffineOperators, assemble
 from fe.full.statics import solve_static
-from fe.reduction.reduced_basis import reduce_model
-from fe.reduction.structure_basis import reduce_structure
+from fe.reduction.reduced_basis import reduce_structure
 from fe.reduction.structure_errors import MeasuredErrors, measured_errors
+from fe.reduction.wing_basis import reduce_model
 from fe.runtime.reduced import ReducedModel
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import WingDesign, load_design
-from fmu_asset.packing.wing_fmu import build_fmu
-from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from scenarios import structure_files
 from scenarios.structures.make_meshes import hexahedra
 
@@ -189,7 +188,7 @@ def _wing_errors(operators: AffineOperators, model: ReducedModel, states: int) -
     for _ in range(states):
         e, *losses = rng.uniform(*model.validity_box[: 1 + len(model.regions)].T).tolist()
         wanted = solve_static(operators, e, tuple(losses), 3.0).strain
-        found = model.static_response(e, tuple(losses), 3.0)
+        found = model.static_response(young_modulus_factor=e, stiffness_loss=tuple(losses), load_factor=3.0)
         missed, size = float(np.abs(found.strain - wanted).max()), float(np.abs(wanted).max())
         strain, bound = max(strain, missed / size), max(bound, found.strain_error_bound / size)
         broken += missed > found.strain_error_bound
@@ -207,7 +206,7 @@ def measured(name: str, regions: int, states: int, folder: Path) -> dict[str, fl
     else:
         full = load_and_assemble({"plate": plate, "tube": tube, "bracket": bracket}[name](folder, regions))
         reduction = reduce_structure(full, name)
-        build_structure_fmu(reduction.model, folder / f"{name}.fmu")
+        build_fmu(reduction.model, folder / f"{name}.fmu")
     found = {
         "regions": regions,
         "unknowns": full.unknowns,

@@ -25,12 +25,12 @@ from discrepancy.model_choice import load_model
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
-from fe.reduction.structure_cache import reduced_structure
+from fe.reduction.model_cache import reduced_structure
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
-from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.structures.rig import rig_text
 from scenarios import structure_files
 
@@ -110,7 +110,7 @@ def structure_file(folder: Path) -> Path:
 def rig(folder: Path) -> Path:
     """Pack the bracket and write its model file; return the model file."""
     file = structure_file(folder)
-    build_structure_fmu(reduced_structure(file), folder / "bracket.fmu", kind="compiled")
+    build_fmu(reduced_structure(file), folder / "bracket.fmu", kind="compiled")
     path = folder / "rig.toml"
     path.write_text(rig_text(load_structure(file), "bracket.fmu"), encoding="utf-8")
     return path

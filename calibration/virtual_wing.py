@@ -148,16 +148,15 @@ class _FreeVibration(NamedTuple):
 
 def _free_vibration(wing: VirtualWing) -> _FreeVibration:
     truth, model = wing.truth, wing.model
-    factor, loss = truth.young_modulus_factor, truth.stiffness_loss
-    modes = model.modes(factor, loss, truth.servo_mass, truth.pitot_mass)
-    static = model.static_response(factor, loss, 0.0, 1.0)
+    vector = model.vector(truth.values, truth.stiffness_loss)
+    modes, static = model.modes(vector), model.static_response(vector, load=np.array((0.0, 1.0)))
     omega = 2.0 * math.pi * modes.frequency
-    displacement = modes.tip_participation / omega**2 / static.tip_displacement
+    displacement = modes.participation[1] / omega**2 / static.displacement[0]
     frequency = modes.frequency.copy()
-    for mode, error in zip(modes.flapwise, wing.frequency_error, strict=True):
+    for mode, error in zip(modes.followed, wing.frequency_error, strict=True):
         frequency[mode] *= 1.0 + error
     zeta = rayleigh_damping_ratio(truth.damping_alpha, truth.damping_beta, modes.frequency)
-    return _FreeVibration(2.0 * math.pi * frequency, zeta, modes.strain[wing.gauge - 1] * displacement)
+    return _FreeVibration(2.0 * math.pi * frequency, zeta, modes.output[wing.gauge - 1] * displacement)
 
 
 def _free_decay(omega: float, zeta: float, time: FloatArray) -> FloatArray:

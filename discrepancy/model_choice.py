@@ -26,18 +26,18 @@ from discrepancy.sources.from_run import (
     run_model,
 )
 from fe.reduction.built_once import cache_folder
-from fe.reduction.stages import Progress
-from fe.reduction.structure_cache import reduced_structure
+from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import load_structure
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from fmu_asset.archive.design_record import packed_design_hash
 from fmu_asset.errors import FmuError
 from fmu_asset.folders import plain_folder, remove_folder
-from fmu_asset.structures.build import structure_fmu_bytes
+from fmu_asset.packing.structure_fmu import fmu_bytes
 from fmu_asset.structures.rig import rig_text
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes
+from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
 from reporting.toml_file import parse_toml, read_toml
 from scenarios import structure_files
@@ -254,7 +254,7 @@ def _structure(path: Path, progress: Progress | None) -> ModelChoice:
     """Return a structure by its FMU, which is kept beside the reduced models."""
     try:
         reduced = reduced_structure(path, progress=progress)
-        content, content_hash = structure_fmu_bytes(reduced)
+        content, content_hash = fmu_bytes(reduced)
         name = f"structure_{content_hash[:32]}.fmu"
         text = rig_text(load_structure(path), name)
         folder = _folder_with(name, content)

@@ -24,9 +24,9 @@ from tests.kept import FE, ROOT, kept, remove_old
 
 if TYPE_CHECKING:
     from calibration.wing.result import CalibrationResult
-    from fe.reduction.structure_basis import StructureReduction
+    from fe.reduction.reduced_basis import Reduction
     from fe.runtime.patch_arrays import PatchArrays
-    from fe.runtime.structure_model import StructureModel
+    from fe.runtime.reduced import ReducedModel
     from fe.structure.operators import Structure
 
 LEVELS = (0, 20, 40, 60, 80)
@@ -254,7 +254,7 @@ def make_calibration() -> Callable[..., CalibrationResult]:
 @pytest.fixture(scope="session")
 def coarse_patch_arrays() -> PatchArrays:
     """The shipped wing for patches, on a coarse mesh."""
-    from fe.reduction.patch_cache import build_patch_arrays
+    from fe.reduction.model_cache import build_patch_arrays
     from fe.wing.design import load_design
 
     design = load_design().changed(mesh={"refinement": 0.25})
@@ -369,9 +369,9 @@ def beam(beam_file: Path) -> Structure:
 
 
 @pytest.fixture(scope="session")
-def beam_reduction(beam: Structure) -> StructureReduction:
+def beam_reduction(beam: Structure) -> Reduction:
     """Its reduction."""
-    from fe.reduction.structure_basis import reduce_structure
+    from fe.reduction.reduced_basis import reduce_structure
 
     return reduce_structure(beam, "beam")
 
@@ -396,8 +396,8 @@ def coarse_plate(plate_file: Path) -> Structure:
 
 
 @pytest.fixture(scope="session")
-def plate_model(coarse_plate: Structure) -> StructureModel:
+def plate_model(coarse_plate: Structure) -> ReducedModel:
     """Its reduced model."""
-    from fe.reduction.structure_cache import reduced
+    from fe.reduction.model_cache import reduced
 
     return kept("coarse-plate", lambda: reduced(coarse_plate), FE, coarse_plate.design_hash)

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from fe.reduction.built_once import built_once, cache_folder
 from fe.runtime.archive import write_bytes_atomically
 from fe.runtime.reduced import ReducedModel
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 ROOT = Path(__file__).parents[1]
 FOLDER = cache_folder() / "tests"  # now: tests change where the cache is

@@ -19,7 +19,7 @@ import pytest
 from calibration.wing.result import CalibrationResult
 from calibration.wing.result_file import save_calibration
 from discrepancy.sources.examples import write_example
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from tests import command_line
 
 ROOT = Path(__file__).parents[1]

@@ -19,13 +19,12 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from fe.full.modes import eigenmodes
     from fe.full.operators import assemble
     from fe.full.statics import solve_static
-    from fe.reduction.model_cache import reduced_model
-    from fe.reduction.structure_cache import reduced_structure
+    from fe.reduction.model_cache import reduced_model, reduced_structure
     from fe.structure.operators import load_and_assemble as assemble_structure
     from fe.structure.solution import natural_frequencies, static_responses
     from fe.wing.design import load_design
     from fmu_asset.door.session import FmiAsset
-    from fmu_asset.packing.wing_fmu import build_fmu
+    from fmu_asset.packing.structure_fmu import build_fmu
     from scenarios import structure_files
     from twin_master.environment import ScenarioEnvironment
     from twin_master.fleet.flight import fly_fleet
@@ -103,7 +102,7 @@ _HOMES = {
     "apply_verdict": "discrepancy.application",
     "assemble": "fe.full.operators",
     "assemble_structure": "fe.structure.operators:load_and_assemble",
-    "build_fmu": "fmu_asset.packing.wing_fmu",
+    "build_fmu": "fmu_asset.packing.structure_fmu",
     "calibrate": "calibration.wing.three_steps:calibrate_wing",
     "eigenmodes": "fe.full.modes",
     "filter_sequence": "twin_master.network.inference",
@@ -123,7 +122,7 @@ _HOMES = {
     "read_campaign": "discrepancy.campaign.reading",
     "read_verdict": "discrepancy.files.verdict:read_verdict_folder",
     "reduced_model": "fe.reduction.model_cache",
-    "reduced_structure": "fe.reduction.structure_cache",
+    "reduced_structure": "fe.reduction.model_cache",
     "report_figures": "twin_master.report.page",
     "resume": "twin_master.workflow:resume_run",
     "solve_static": "fe.full.statics",

@@ -99,7 +99,7 @@ def _build_wing(
     from fe.wing.design import load_design
     from fmu_asset.compiled.compiler import find_compiler, find_cross_compiler
     from fmu_asset.packing.patch_file import load_patch
-    from fmu_asset.packing.wing_fmu import check_kind, check_version
+    from fmu_asset.packing.structure_fmu import check_kind, check_version
     from fmu_asset.packing.wing_packing import pack_wing
 
     kind, fmi, interface, windows = form

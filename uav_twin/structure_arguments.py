@@ -8,7 +8,7 @@ import typer
 from reporting import terminal
 
 if TYPE_CHECKING:
-    from fe.runtime.structure_model import StructureModel
+    from fe.runtime.reduced import ReducedModel
     from fe.structure.operators import Structure
 
 File = Annotated[
@@ -43,9 +43,9 @@ def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool
         return load_and_assemble(located(file), _bytes(memory_limit), mass_as_stiffness=mass_as_stiffness)
 
 
-def reduced(file: Path, memory_limit: float | None) -> "StructureModel":
+def reduced(file: Path, memory_limit: float | None) -> "ReducedModel":
     """Return the reduced model, from the cache where it is there."""
-    from fe.reduction.structure_cache import reduced_structure
+    from fe.reduction.model_cache import reduced_structure
 
     return reduced_structure(located(file), progress=terminal.progress(), memory_limit=_bytes(memory_limit))
 

@@ -38,9 +38,8 @@ def fmu(
     from fe.structure.design import load_structure
     from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.packing.contents import checked_target
-    from fmu_asset.packing.wing_fmu import check_version
-    from fmu_asset.structures.binding import names_of_model, structure_binding_text
-    from fmu_asset.structures.build import build_structure_fmu
+    from fmu_asset.packing.structure_fmu import build_fmu, check_version
+    from fmu_asset.structures.binding import structure_binding_text
     from fmu_asset.structures.rig import rig_text
     from reporting.files import atomic_write_text
 
@@ -50,16 +49,15 @@ def fmu(
         raise typer.BadParameter("--binding and --rig are for FMI 2.0; `uav-twin fmu bind` drafts a binding.")
     target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
     _check_targets(located(file), target, {"binding": binding, "rig": rig}, replace=replace)
-    text = None
-    if rig is not None:
-        text = rig_text(load_structure(located(file)), relpath(target, rig.parent))
+    design = load_structure(located(file))
+    text = None if rig is None else rig_text(design, relpath(target, rig.parent))
     if kind == "compiled":
         find_compiler()  # before the structure is reduced, which can take minutes
     model = reduced(file, memory_limit)
-    info = build_structure_fmu(model, target, kind=kind, fmi=version, replace=replace)
+    info = build_fmu(model, target, kind=kind, fmi=version, replace=replace)
     terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
     if binding is not None:
-        atomic_write_text(binding, structure_binding_text(names_of_model(model)))
+        atomic_write_text(binding, structure_binding_text(design))
         terminal.say(f"{binding}: its binding")
     if rig is not None and text is not None:
         atomic_write_text(rig, text)

@@ -12,7 +12,7 @@ from uav_twin.structure_arguments import File, MemoryLimit, assembled, reduced
 
 if TYPE_CHECKING:
     from fe.reduction.structure_errors import MeasuredErrors
-    from fe.runtime.structure_model import StructureModel
+    from fe.runtime.reduced import ReducedModel
 
 
 def reduce(
@@ -57,7 +57,7 @@ def reduce(
         console.print(console_table(("of", heading), list(_errors(errors)), console.width))
 
 
-def _ranges(model: "StructureModel") -> Iterator[tuple[str, ...]]:
+def _ranges(model: "ReducedModel") -> Iterator[tuple[str, ...]]:
     kinds = dict.fromkeys(model.parameters, "parameter") | dict.fromkeys(model.regions, "stiffness loss")
     kinds |= dict.fromkeys(model.masses, "mass [kg]")
     units = model.control_units.split()

@@ -68,14 +68,13 @@ def wing_record(design: "WingDesign", model: "ReducedModel") -> dict[str, Any]:
     from fe.runtime.state import DigitalState
 
     state = DigitalState()
-    masses = (state.servo_mass, state.pitot_mass)
-    modes = model.modes(state.young_modulus_factor, state.stiffness_loss, *masses)
+    modes = model.modes(state.values, state.stiffness_loss)
     structure = structural_mass(design)
     return {
         "design": design.name,
         "design_hash": design.hash,
         "structural_mass": structure,
-        "mass": structure + 2 * masses[0] + masses[1],
+        "mass": structure + 2 * state.servo_mass + state.pitot_mass,
         "tip_stiffness": float(model.tip_stiffness(state.young_modulus_factor)),
         "modes": [
             {"number": index + 1, "frequency": float(frequency), "shape": mode_name(modes, index)}
@@ -87,7 +86,7 @@ def wing_record(design: "WingDesign", model: "ReducedModel") -> dict[str, Any]:
 def mode_name(modes: "Modes", index: int) -> str:
     """Return the name of a mode that is followed by its shape, or nothing."""
     names = ("first flapwise bending", "second flapwise bending")
-    return dict(zip(modes.flapwise, names, strict=True)).get(index, "")
+    return dict(zip(modes.followed, names, strict=True)).get(index, "")
 
 
 def structural_mass(design: "WingDesign") -> float:
@@ -114,20 +113,8 @@ def write_fields(design: "WingDesign", path: Path) -> tuple[Path, Path]:
     state = DigitalState()
     fields = wing_fields(design, progress=terminal.progress())
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_wing_vtu(
-        path,
-        fields,
-        young_modulus_factor=state.young_modulus_factor,
-        stiffness_loss=state.stiffness_loss,
-        load_factor=3.0,
-    )
+    vector = fields.model.vector(state.values, state.stiffness_loss, load_factor=3.0)
+    write_wing_vtu(path, fields, vector)
     modes = path.with_name(f"{path.stem}-modes{path.suffix}")
-    write_modes_vtu(
-        modes,
-        fields,
-        young_modulus_factor=state.young_modulus_factor,
-        stiffness_loss=state.stiffness_loss,
-        servo_mass=state.servo_mass,
-        pitot_mass=state.pitot_mass,
-    )
+    write_modes_vtu(modes, fields, vector)
     return path, modes

@@ -134,8 +134,8 @@ def calibrate_dynamics(
         )
 
     def frequencies(factor: float, servo: float, pitot: float) -> tuple[float, float]:
-        modes = model.modes(factor, (), servo, pitot)
-        first, second = modes.flapwise
+        modes = model.modes(young_modulus_factor=factor, servo_mass=servo, pitot_mass=pitot)
+        first, second = modes.followed
         return float(modes.frequency[first]), float(modes.frequency[second])
 
     masses = MassRange(servo=model.validity["servo_mass"], pitot=model.validity["pitot_mass"])

@@ -137,5 +137,5 @@ def _frequencies(model: ReducedModel, point: NDArray[np.float64]) -> NDArray[np.
         min(max(value, low), high)  # a node may leave the range by a rounding error
         for value, (low, high) in zip(point.tolist(), (model.validity[name] for name in _NAMES), strict=True)
     )
-    modes = model.modes(factor, (), servo, pitot)
-    return modes.frequency[list(modes.flapwise)]
+    modes = model.modes(young_modulus_factor=factor, servo_mass=servo, pitot_mass=pitot)
+    return modes.frequency[list(modes.followed)]

@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from fe.reduction.built_once import built_once, cache_folder, kept
+from fe.reduction.built_once import built_once, cache_folder
 from fe.runtime.archive import write_bytes_atomically
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.reduced import ReducedModel
@@ -43,7 +43,7 @@ def _record(model: bytes | None, seed: int) -> Mapping[str, Any]:
     code = collect_provenance(packages=("fe", "calibration"), distributions=("numpy", "scipy")).as_dict()
     key = hash_record([None if model is None else hash_bytes(model), seed, code])
     path = cache_folder() / f"static-{key[:32]}.json"
-    return kept(lambda: _read(path)) or built_once(
+    return built_once(
         path,
         load=lambda: _read(path),
         build=lambda: _calibrate(model, seed),

@@ -76,18 +76,6 @@ def write_calibration_folder(
 
 def _write_fields(calibration: WingCalibration, fields: WingFields, folder: Path) -> None:
     state = calibration.result.mean_state()
-    write_wing_vtu(
-        folder / WING_FIELDS,
-        fields,
-        young_modulus_factor=state.young_modulus_factor,
-        stiffness_loss=state.stiffness_loss,
-        load_factor=LOAD_FACTOR,
-    )
-    write_modes_vtu(
-        folder / MODE_FIELDS,
-        fields,
-        young_modulus_factor=state.young_modulus_factor,
-        stiffness_loss=state.stiffness_loss,
-        servo_mass=state.servo_mass,
-        pitot_mass=state.pitot_mass,
-    )
+    vector = fields.model.vector(state.values, state.stiffness_loss, load_factor=LOAD_FACTOR)
+    write_wing_vtu(folder / WING_FIELDS, fields, vector)
+    write_modes_vtu(folder / MODE_FIELDS, fields, vector)

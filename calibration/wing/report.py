@@ -32,10 +32,8 @@ def report_figures(calibration: WingCalibration, fields: WingFields) -> dict[str
     paper = np.column_stack([calibration.paper.young_modulus_factor, calibration.paper.samples])
     scale = np.array([SHOWN[entry.name].scale for entry in STATE])
     state = calibration.result.mean_state()
-    modes = calibration.model.modes(
-        state.young_modulus_factor, state.stiffness_loss, state.servo_mass, state.pitot_mass
-    )
-    flapwise = dict(zip(modes.flapwise, ("first flapwise", "second flapwise"), strict=True))
+    modes = calibration.model.modes(state.values, state.stiffness_loss)
+    flapwise = dict(zip(modes.followed, ("first flapwise", "second flapwise"), strict=True))
     titles = [
         f"mode {index + 1}, {frequency:.2f} Hz" + (f", {flapwise[index]}" if index in flapwise else "")
         for index, frequency in enumerate(modes.frequency[:6])

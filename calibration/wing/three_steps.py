@@ -221,8 +221,8 @@ def quantities_of(model: ReducedModel, samples: Float) -> Float:
                 f"{low:g} to {high:g}; check the measurements."
             )
     for row, (factor, servo, pitot, alpha, beta) in enumerate(samples.tolist()):
-        modes = model.modes(factor, (), servo, pitot)
-        frequency = modes.frequency[list(modes.flapwise)]
+        modes = model.modes(young_modulus_factor=factor, servo_mass=servo, pitot_mass=pitot)
+        frequency = modes.frequency[list(modes.followed)]
         found[row, 0] = model.tip_stiffness(factor)
         found[row, 1:3] = frequency
         found[row, 3:5] = rayleigh_damping_ratio(alpha, beta, frequency)

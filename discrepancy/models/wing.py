@@ -26,8 +26,7 @@ from discrepancy.models.memory import Memory
 from discrepancy.models.ported import NO_PATCH, PortedSystem
 from discrepancy.models.second_order_motion import Motion
 from discrepancy.models.wing_structure import MovingWing, Outputs, Stiffness, WingStructure
-from fe.reduction.patch_cache import patch_arrays
-from fe.reduction.stages import Progress
+from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError, InvalidPatchError, SolutionError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
 from fe.runtime.patch import (
@@ -46,8 +45,9 @@ from fe.runtime.patch import (
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import LOAD_PLACE, PORTS, PatchedWing
 from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
-from fe.runtime.reduced_arrays import parameter_names
+from fe.runtime.state import wing_names
 from fe.wing.design import load_design
+from reporting.progress import Progress
 
 FloatArray = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ class WingModel:
         self.wing = PatchedWing(arrays)
         self._name = name
         prior = prior or SHIPPED_PRIOR
-        box = dict(zip(parameter_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
+        box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         limits = {key: (low, high) for key, (low, high) in box.items()} | DAMPING_LIMITS
         self._parameters = tuple(
             ModelParameter(item.name, *prior[item.name], item.unit, *limits[item.name]) for item in STATE

@@ -39,7 +39,7 @@ def kept(load: Callable[[], _Kept]) -> _Kept | None:
 def built_once(
     path: Path, load: Callable[[], _Kept], build: Callable[[], _Kept], keep: Callable[[_Kept], None]
 ) -> _Kept:
-    """Build and keep something; of several builders one builds, and the others wait for it and load it.
+    """Return what is kept, or build and keep it; of several builders one builds, and the others wait for it.
 
     Parameters
     ----------
@@ -57,6 +57,9 @@ def built_once(
     ReductionError
         If another process has been building it for an hour.
     """
+    found = kept(load)
+    if found is not None:
+        return found
     with _locked(path.with_suffix(".lock"), path):
         try:
             return load()  # another process may have been faster

@@ -5,9 +5,8 @@ The method and what it reaches are in `docs/reduced_model.md`.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from math import ceil
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +15,7 @@ from pymor.core.exceptions import ExtensionError
 from pymor.core.logger import set_log_levels
 from scipy import sparse
 
-from fe.full.affine import AffineSum, affine_sum
+from fe.full.affine import AffineSum
 from fe.full.subspace import (
     BlockDiagonal,
     FunctionalBasis,
@@ -24,13 +23,13 @@ from fe.full.subspace import (
     OrthonormalBasis,
     conjugate_gradients,
 )
-from fe.runtime.reduced_arrays import AffineArrays
+from fe.runtime.reduced import ReducedModel
 
-from .dual_solutions import DualData, DualProblem, beside
+from .dual_solutions import DualData, DualProblem
+from .settings import TOGETHER
 
 FloatArray = npt.NDArray[np.float64]
 State = tuple[float, ...]
-_Model = TypeVar("_Model", bound=AffineArrays)
 
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
@@ -70,7 +69,7 @@ class AffineProblem:
 
 
 @dataclass(frozen=True)
-class Judgement(Generic[_Model]):
+class Judgement:
     """How a reduced model is judged at a state: its solutions (N,) to each load alone, and its largest bound.
 
     Attributes
@@ -81,8 +80,8 @@ class Judgement(Generic[_Model]):
         Certified bound relative to the largest output, of the load where that is largest.
     """
 
-    solutions: Callable[[_Model, State], list[FloatArray]]
-    bound: Callable[[_Model, State], float]
+    solutions: Callable[[ReducedModel, State], list[FloatArray]]
+    bound: Callable[[ReducedModel, State], float]
 
 
 class StaticReduction:
@@ -102,11 +101,8 @@ class StaticReduction:
         Largest distance of each coefficient from its reference.
     advance : callable
         Told one more part, and of what.
-    least : (groups, L) ndarray, optional
-        Outputs of a group under a load that are smaller are judged by this; zero by default.
-    batch : int
-        How many full solutions the search takes at once. One repeats the shipped wing to the bit; several
-        take hardly longer than one, since the factors are applied to all of them together.
+    least : (groups, L) ndarray
+        Outputs of a group under a load that are smaller are judged by this.
     """
 
     def __init__(
@@ -117,19 +113,16 @@ class StaticReduction:
         duals: Callable[[DualProblem], DualData],
         farthest: FloatArray,
         advance: Callable[[int, str], object],
-        least: FloatArray | None = None,
-        batch: int = 1,
+        least: FloatArray,
     ) -> None:
-        self.batch = batch
         terms = problem.stiffness_terms
-        self.stiffness = partial(affine_sum, terms=terms) if batch == 1 else AffineSum(terms).matrix
-        self.least = np.zeros((len(problem.groups), problem.loads.shape[1])) if least is None else least
+        self.stiffness = AffineSum(terms).matrix
+        self.least = least
         self.problem, self.norm, self.reference, self.advance = problem, norm, reference, advance
         self.farthest = farthest
         n = len(problem.loads)
         self.basis = OrthonormalBasis(n, norm, drop=1e-7)
         self.in_basis = np.empty((len(terms), 0, 0))  # stiffness terms in the basis
-        self.images = [np.empty((n, 0)) for _ in terms]  # times its vectors, if the batch is one
         self.rounding = 0.0
         self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
         self.residual_load = self.residual_basis.extend(problem.loads)
@@ -139,9 +132,8 @@ class StaticReduction:
         self.snapshots: list[State] = []
 
     def _matrices(self, thetas: list[FloatArray]) -> Any:
-        """Return the stiffness at coefficients (T,), or those of several, each for its own columns."""
-        matrices = [self.stiffness(theta) for theta in thetas]
-        return matrices[0] if len(matrices) == 1 else BlockDiagonal(matrices)
+        """Return the stiffnesses at several coefficients (T,), each for its own columns."""
+        return BlockDiagonal([self.stiffness(theta) for theta in thetas])
 
     def add_snapshots(self, states: list[State]) -> None:
         """Solve the full model for all loads at several states and extend the bases."""
@@ -151,8 +143,8 @@ class StaticReduction:
         solution = conjugate_gradients(
             self._matrices(thetas),
             self.norm,
-            beside([loads] * len(states)),
-            beside([self._galerkin(theta) for theta in thetas]),
+            np.concatenate([loads] * len(states), axis=1),
+            np.concatenate([self._galerkin(theta) for theta in thetas], axis=1),
             tolerance=tolerance,
         )
         before = self.basis.size
@@ -169,13 +161,9 @@ class StaticReduction:
         """Take the stiffness terms times the last basis vectors, (n, k) each, into what is kept of all."""
         before, known = self.in_basis.shape[-1], self.residual_basis.vectors.shape[1]
         basis = self.basis.vectors
-        if self.batch == 1:  # sums round as they always did
-            self.images = [np.concatenate(pair, axis=1) for pair in zip(self.images, images, strict=True)]
-            self.in_basis = np.stack([basis.T @ image for image in self.images])
-        else:
-            new = np.stack([basis.T @ image for image in images])
-            older = np.swapaxes(new[:, :before], 1, 2)
-            self.in_basis = np.concatenate((np.concatenate((self.in_basis, older), axis=1), new), axis=2)
+        new = np.stack([basis.T @ image for image in images])
+        older = np.swapaxes(new[:, :before], 1, 2)
+        self.in_basis = np.concatenate((np.concatenate((self.in_basis, older), axis=1), new), axis=2)
         found = self.residual_basis.extend(np.concatenate(images, axis=1))
         # what was there lies in the basis that was there
         self.residual_load = _with_rows(self.residual_load, len(found))
@@ -191,10 +179,7 @@ class StaticReduction:
         if not self.basis.size:
             return np.zeros_like(self.problem.loads)
         basis = self.basis.vectors
-        if self.batch == 1:
-            stiffness = basis.T @ sum(t * k for t, k in zip(theta, self.images, strict=True))
-        else:
-            stiffness = np.tensordot(theta, self.in_basis, 1)
+        stiffness = np.tensordot(theta, self.in_basis, 1)
         return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.problem.loads))
 
     def _rounding(self, theta: FloatArray, wanted: FloatArray) -> float:
@@ -209,7 +194,7 @@ class StaticReduction:
         )
 
     def arrays(self) -> dict[str, Any]:
-        """Return the static fields of `AffineArrays`, and `cross_mass` with the static basis alone."""
+        """Return the static fields of `ReducedArrays`, and `cross_mass` with the static basis alone."""
         problem, basis = self.problem, self.basis.vectors
         return {
             "static_stiffness": 0.5 * (self.in_basis + self.in_basis.transpose(0, 2, 1)),
@@ -242,8 +227,8 @@ class StaticReduction:
 
 def greedy(
     static: StaticReduction,
-    model: Callable[[], _Model],
-    judgement: Judgement[_Model],
+    model: Callable[[], ReducedModel],
+    judgement: Judgement,
     states: list[State],
     *,
     tolerance: float,
@@ -290,7 +275,7 @@ def greedy(
             worst = int(bounds.argmax())
             return float(bounds[worst]), mus[worst]
 
-        def _bounds(self, present: _Model, mus: list[Any]) -> FloatArray:
+        def _bounds(self, present: ReducedModel, mus: list[Any]) -> FloatArray:
             """Return the bounds; of many states, where they were largest, and zeros, until they are small."""
             bounds, first = np.zeros(len(mus)), 0
             if self.rounds == 1:
@@ -307,14 +292,14 @@ def greedy(
 
         def extend(self, mu: State) -> None:
             """Add the full solutions at the worst state, and at others of large bounds away from it."""
-            count = min(static.batch, most_snapshots - len(static.snapshots))
-            alone = count == 1 or not static.basis.size
-            chosen = [mu] if alone else _spread(self.asked, self.bounds, count, SEARCH_MARGIN * tolerance)
+            count = min(TOGETHER, most_snapshots - len(static.snapshots))
+            first = not static.basis.size
+            chosen = [mu] if first else _spread(self.asked, self.bounds, count, SEARCH_MARGIN * tolerance)
             static.add_snapshots(chosen)
             self.rounds += 1
             static.advance(len(chosen), f"full solution {len(static.snapshots)}")
 
-    surrogate, most_rounds = Surrogate(), 1 + ceil((most_snapshots - 1) / static.batch)
+    surrogate, most_rounds = Surrogate(), 1 + ceil((most_snapshots - 1) / TOGETHER)
     result = weak_greedy(surrogate, states, atol=SEARCH_MARGIN * tolerance, max_extensions=most_rounds)
     bounds = [float(value) for value in result["max_errs"][1:]]
     if len(bounds) < surrogate.rounds or bounds[-1] > SEARCH_MARGIN * tolerance:  # not all were looked at

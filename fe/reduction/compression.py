@@ -1,33 +1,30 @@
 """Offline: fewer static basis vectors for the same certified bound."""
 
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.reduced_arrays import AffineArrays
 
 from .certified_basis import Judgement, State
 
-_Model = TypeVar("_Model", bound=AffineArrays)
 FloatArray = npt.NDArray[np.float64]
 
 
-def compressed(model: _Model, directions: FloatArray) -> _Model:
+def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
     """Return the model on fewer static basis vectors, its residuals on as few as they then need.
 
     Parameters
     ----------
-    model : AffineArrays
+    model : ReducedModel
         A model with N static basis vectors.
     directions : (N, K) ndarray
         Orthonormal combinations of them.
 
     Returns
     -------
-    AffineArrays
+    ReducedModel
         The Galerkin model on the combinations; its bound is as certified as before.
     """
     stiffness = directions.T @ model.static_stiffness @ directions
@@ -50,13 +47,13 @@ def compressed(model: _Model, directions: FloatArray) -> _Model:
 
 
 def fewest_directions(
-    model: _Model, judgement: Judgement[_Model], states: list[State], tolerance: float
+    model: ReducedModel, judgement: Judgement, states: list[State], tolerance: float
 ) -> FloatArray:
     """Return the fewest singular directions of the reduced solutions that keep the bound below a tolerance.
 
     Parameters
     ----------
-    model : AffineArrays
+    model : ReducedModel
         The model that the greedy search made.
     judgement : Judgement
         Its solutions and its bound.
@@ -84,22 +81,3 @@ def fewest_directions(
         else:
             low = middle + 1
     return np.asarray(directions[:, :low])
-
-
-def relative_bound(model: ReducedModel, parameters: State) -> float:
-    """Return the larger relative bound of a wing's strains under either load; of its largest strain."""
-    e, *losses = parameters
-    worst = 0.0
-    for load in ((1.0, 0.0), (0.0, 1.0)):
-        response = model.static_response(e, tuple(losses), *load)
-        worst = max(worst, response.strain_error_bound / float(np.abs(response.strain).max()))
-    return worst
-
-
-def _solutions(model: ReducedModel, parameters: State) -> list[FloatArray]:
-    e, *losses = parameters
-    return [model.static_response(e, tuple(losses), *load).coordinates for load in ((1.0, 0.0), (0.0, 1.0))]
-
-
-WING_JUDGEMENT = Judgement(_solutions, relative_bound)
-"""Of a wing: its strains under lift alone and under tip force alone."""

@@ -30,7 +30,7 @@ MOST_COLUMNS = 48
 
 @dataclass(frozen=True)
 class DualData:
-    """Approximate dual solutions: whitened products with X (A or M, n, O), the rest as in `AffineArrays`."""
+    """Approximate dual solutions: whitened products with X (A or M, n, O), the rest as in `ReducedArrays`."""
 
     products: FloatArray
     factors: FloatArray
@@ -152,19 +152,13 @@ class DualProblem:
         start = self.norm.riesz(self.outputs)
         for first in range(0, len(states), at_once):
             chosen = states[first : first + at_once]
-            matrices = [self.stiffness(theta) for theta in chosen]
             duals = conjugate_gradients(
-                matrices[0] if len(matrices) == 1 else BlockDiagonal(matrices),
+                BlockDiagonal([self.stiffness(theta) for theta in chosen]),
                 self.norm,
-                beside([self.outputs] * len(chosen)),
-                beside([start] * len(chosen)),
+                np.concatenate([self.outputs] * len(chosen), axis=1),
+                np.concatenate([start] * len(chosen), axis=1),
                 tolerance=tolerance,
             )
             for dual in np.split(duals, len(chosen), axis=1):
                 yield dual
                 self.advance(1, "dual solutions")
-
-
-def beside(blocks: list[FloatArray]) -> FloatArray:
-    """Return blocks (n, k) beside each other; one alone as it is: its layout decides how sums round."""
-    return blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1)

@@ -4,10 +4,9 @@ No equation of the full model is solved here: the reduced solution is spread ove
 basis, which takes milliseconds.
 """
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +14,8 @@ import numpy.typing as npt
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import Losses
+from fe.structure.elements import HEXAHEDRA_20
+from fe.structure.field import centre_strains, write_vtu
 
 if TYPE_CHECKING:
     from fe.full.operators import AffineOperators
@@ -25,15 +25,7 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-# Places of the nodes of a 20-node hexahedron in VTK's order: corners below, corners above, edges below,
-# edges above, upright edges.
-_VTK_CORNERS = np.array(
-    [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=np.float64
-)
-_VTK_EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
-_VTK_NODES = np.concatenate(
-    (_VTK_CORNERS, [0.5 * (_VTK_CORNERS[a] + _VTK_CORNERS[b]) for a, b in _VTK_EDGES])
-)
+_CELLS = HEXAHEDRA_20.file_type
 
 
 def _order(wanted: FloatArray, given: FloatArray) -> list[int]:
@@ -42,7 +34,7 @@ def _order(wanted: FloatArray, given: FloatArray) -> list[int]:
 
 
 # Node k of a cell seen in a mirror is node _MIRRORED[k] of the cell.
-_MIRRORED = _order(_VTK_NODES * [1.0, 1.0, -1.0] + [0.0, 0.0, 1.0], _VTK_NODES)
+_MIRRORED = _order(HEXAHEDRA_20.places * [1.0, 1.0, -1.0] + [0.0, 0.0, 1.0], HEXAHEDRA_20.places)
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,8 +51,6 @@ class FieldBasis(KeptArrays):
         0 skin, 1 to K the damage regions, K + 1 webs, K + 2 ribs.
     static_displacement : (P, 3, N) ndarray
         Static basis vectors [m per unit coordinate].
-    static_strain : (C, 6, N) ndarray
-        Their strains at the centres of the cells: xx, yy, zz, yz, xz, xy; shear as engineering strain.
     modal_displacement : (P, 3, Nm) ndarray
         Modal basis vectors.
     """
@@ -72,7 +62,6 @@ class FieldBasis(KeptArrays):
     cells: IntArray
     region: IntArray
     static_displacement: FloatArray
-    static_strain: FloatArray
     modal_displacement: FloatArray
 
     def __post_init__(self) -> None:
@@ -90,7 +79,6 @@ class FieldBasis(KeptArrays):
             "cells": (*cells, 20),
             "region": cells,
             "static_displacement": (*points, 3, *static),
-            "static_strain": (*cells, 6, *static),
             "modal_displacement": (*points, 3, *modal),
         }
 
@@ -132,13 +120,12 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
     """
     from skfem import ElementHexS2
 
-    from fe.full.assembly import global_gradients, strain_matrix
+    from fe.full.assembly import global_gradients
 
     discretisation = operators.discretisation
-    cells = discretisation.cell_nodes[:, _order(_VTK_NODES, ElementHexS2().doflocs)]
-    gradients, determinant = global_gradients(discretisation.corners, np.full((1, 3), 0.5))
+    cells = discretisation.cell_nodes[:, _order(HEXAHEDRA_20.places, ElementHexS2().doflocs)]
+    _, determinant = global_gradients(discretisation.corners, np.full((1, 3), 0.5))
     cells = np.where(determinant < 0.0, cells[:, _MIRRORED], cells)
-    strain = strain_matrix(gradients[:, 0])
 
     def spread(vectors: FloatArray) -> FloatArray:
         return np.asarray(operators.expansion @ vectors)
@@ -151,21 +138,12 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
         cells=cells.astype(np.int64),
         region=operators.wing_mesh.region.astype(np.int64),
         static_displacement=static.reshape(-1, 3, static.shape[1]),
-        static_strain=strain @ static[discretisation.cell_dofs],
         modal_displacement=modal.reshape(-1, 3, modal.shape[1]),
     )
 
 
-def write_wing_vtu(
-    path: str | Path,
-    wing: WingFields,
-    *,
-    young_modulus_factor: float,
-    stiffness_loss: Losses,
-    load_factor: float,
-    tip_force: float = 0.0,
-) -> None:
-    """Write displacement, strain and damage of the wing under one load as a VTU file.
+def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> None:
+    """Write displacement, strain and damage of the wing at rest as a VTU file.
 
     Point data: `displacement` [m]. Cell data, at the centres of the cells: `strain` (xx, yy, zz, yz, xz, xy),
     `spanwise_strain` (yy, positive where compressed, as the gauges), `region` (as in `FieldBasis`),
@@ -177,12 +155,8 @@ def write_wing_vtu(
         The file; an existing one is replaced.
     wing : WingFields
         The wing, from `fe.reduction.model_cache.wing_fields`.
-    young_modulus_factor, stiffness_loss
-        As of `fe.runtime.state.DigitalState`.
-    load_factor : float
-        Load factor [1].
-    tip_force : float
-        Tip force [N].
+    vector : (V,) ndarray
+        Values of all that can be chosen, from `ReducedModel.vector`.
 
     Raises
     ------
@@ -191,72 +165,30 @@ def write_wing_vtu(
     OSError
         If the file cannot be written.
     """
-    coordinates = wing.model.static_response(
-        young_modulus_factor, stiffness_loss, load_factor, tip_force
-    ).coordinates
-    basis = wing.basis
-    strain = basis.static_strain @ coordinates
-    loss = np.zeros(len(basis.region))
-    for number, value in enumerate(wing.model.losses(stiffness_loss), start=1):
-        loss[basis.region == number] = value
-    _write(
-        Path(path),
-        basis,
-        {"displacement": basis.static_displacement @ coordinates},
-        {
-            "strain": strain,
-            "spanwise_strain": -strain[:, 1],
-            "region": basis.region,
-            "stiffness_loss": loss,
-        },
-    )
+    coordinates, basis = wing.model.static_response(vector).coordinates, wing.basis
+    displacement, loss = basis.static_displacement @ coordinates, np.zeros(len(basis.region))
+    strain = centre_strains(HEXAHEDRA_20, basis.points, basis.cells, displacement)
+    for number, name in enumerate(wing.model.regions, start=1):
+        loss[basis.region == number] = vector[wing.model.chosen.index(name)]
+    cells = {
+        "strain": strain,
+        "spanwise_strain": -strain[:, 1],
+        "region": basis.region,
+        "stiffness_loss": loss,
+    }
+    write_vtu(path, basis.points, (_CELLS, basis.cells), {"displacement": displacement}, cells)
 
 
-def write_modes_vtu(
-    path: str | Path,
-    wing: WingFields,
-    *,
-    young_modulus_factor: float,
-    stiffness_loss: Losses,
-    servo_mass: float,
-    pitot_mass: float,
-) -> None:
+def write_modes_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> None:
     """Write the mode shapes of the wing as a VTU file.
 
     Point data: `mode_1_5.632Hz` and so on, mass-normalised displacements [kg^-1/2]. Cell data: `region`.
-
-    Parameters and errors are those of `write_wing_vtu`; the masses [kg] are as of
-    `fe.runtime.state.DigitalState`.
+    Parameters and errors are those of `write_wing_vtu`.
     """
-    modes = wing.model.modes(young_modulus_factor, stiffness_loss, servo_mass, pitot_mass)
-    shapes = wing.basis.modal_displacement @ modes.shape
-    _write(
-        Path(path),
-        wing.basis,
-        {
-            f"mode_{number + 1}_{frequency:.3f}Hz": np.ascontiguousarray(shapes[:, :, number])
-            for number, frequency in enumerate(modes.frequency)
-        },
-        {"region": wing.basis.region},
-    )
-
-
-def _write(
-    path: Path, basis: FieldBasis, point_data: dict[str, FloatArray], cell_data: dict[str, npt.NDArray[Any]]
-) -> None:
-    """Write a VTU file, whole or not at all."""
-    import meshio
-
-    mesh = meshio.Mesh(
-        basis.points,
-        [("hexahedron20", basis.cells)],
-        point_data=point_data,
-        cell_data={name: [values] for name, values in cell_data.items()},
-    )
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            temporary = Path(folder) / "wing.vtu"
-            meshio.write(temporary, mesh, file_format="vtu")
-            temporary.replace(path)
-    except OSError as error:  # with the name that was asked for, not that of the temporary file
-        raise OSError(error.errno, error.strerror, str(path)) from error
+    modes, basis = wing.model.modes(vector), wing.basis
+    shapes = basis.modal_displacement @ modes.shape
+    named = {
+        f"mode_{number + 1}_{frequency:.3f}Hz": np.ascontiguousarray(shapes[:, :, number])
+        for number, frequency in enumerate(modes.frequency)
+    }
+    write_vtu(path, basis.points, (_CELLS, basis.cells), named, {"region": basis.region})

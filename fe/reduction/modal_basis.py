@@ -6,8 +6,6 @@ in it; then the modes of many states, computed in the working basis, are compres
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -15,11 +13,11 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg import eigh
 
-from fe.full.affine import AffineSum, AffineSystem, affine_sum
+from fe.full.affine import AffineSum, affine_sum
 from fe.full.subspace import Norm, OrthonormalBasis
 from fe.runtime.errors import ReductionError
 
-from .settings import MOST_GRID_REGIONS, ModalSettings
+from .settings import MOST_GRID_REGIONS, TOGETHER, ModalSettings
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,17 +25,6 @@ ModalState = tuple[FloatArray, FloatArray]
 """Coefficients of the stiffness terms (T,) and of the mass terms (1 + P,)."""
 
 START_ITERATIONS = 4
-
-
-@dataclass(frozen=True)
-class ModalData:
-    """Modal part of a reduced model: `basis` (n, Nm) and the dense arrays of `ReducedModel`."""
-
-    basis: FloatArray
-    stiffness: FloatArray
-    mass: FloatArray
-    flapwise_reference: FloatArray
-    mode_count: int
 
 
 class MatrixTerms(Protocol):
@@ -55,12 +42,9 @@ class MatrixTerms(Protocol):
 class _WorkingBasis:
     """Basis orthonormal in the reference norm, with the projected terms."""
 
-    def __init__(self, system: MatrixTerms, norm: Norm, together: int) -> None:
+    def __init__(self, system: MatrixTerms, norm: Norm) -> None:
         self.system, self.norm = system, norm
-        self.sums = tuple(
-            partial(affine_sum, terms=terms) if together == 1 else AffineSum(terms).matrix
-            for terms in (system.stiffness_terms, system.mass_terms)
-        )
+        self.sums = tuple(AffineSum(terms).matrix for terms in (system.stiffness_terms, system.mass_terms))
         self.basis = OrthonormalBasis(system.stiffness_terms[0].shape[0], norm, drop=1e-6)
         self.stiffness = np.empty((len(system.stiffness_terms), 0, 0))
         self.mass = np.empty((len(system.mass_terms), 0, 0))
@@ -107,103 +91,6 @@ def loss_corners(regions: int) -> list[tuple[int, ...]]:
     return [(0,) * regions, *alone, *others, (1,) * regions]
 
 
-def sampled_states(box: FloatArray) -> list[ModalState]:
-    """Return the states at which the working basis is refined: `loss_corners`, with e and masses mixed in.
-
-    Each entry holds the coefficients of the stiffness terms (K + 2,) and of the mass terms (3,).
-    """
-    e, losses, (servo, pitot) = box[0], box[1:-4], box[-2:]
-    states = []
-    for number, ends in enumerate(loss_corners(len(losses))):
-        remaining = [1.0 - loss[end] for loss, end in zip(losses, ends, strict=True)]
-        for flip in (0, 1):
-            corner = (number + flip) % 2
-            states.append(
-                (
-                    np.array((e[(sum(ends) + flip) % 2], *remaining, 1.0)),
-                    np.array((1.0, servo[corner], pitot[(corner + number // 2 + flip) % 2])),
-                )
-            )
-    middle = np.array((e.mean(), *(1.0 - loss.mean() for loss in losses), 1.0))
-    states.append((middle, np.array((1.0, servo.mean(), pitot.mean()))))
-    return states
-
-
-def compression_states(box: FloatArray) -> list[ModalState]:
-    """Return the states whose modes are compressed together: a grid over the whole box.
-
-    With more than `MOST_GRID_REGIONS` the losses are `loss_corners`, the same halfway.
-    """
-    e, losses, (servo, pitot) = box[0], box[1:-4], box[-2:]
-    levels = [(loss[0], loss.mean(), loss[1]) for loss in losses]
-    if len(losses) <= MOST_GRID_REGIONS:
-        choices = list(itertools.product((0, 1, 2), repeat=len(losses)))
-    else:
-        corners = loss_corners(len(losses))
-        choices = sorted({tuple(end * level for end in ends) for ends in corners for level in (1, 2)})
-    return [
-        (
-            np.array((a, *(1.0 - level[i] for level, i in zip(levels, chosen, strict=True)), 1.0)),
-            np.array((1.0, s, p)),
-        )
-        for a in e
-        for chosen in choices
-        for s in servo
-        for p in (pitot[0], pitot.mean(), pitot[1])
-    ]
-
-
-def reduce_modes(
-    system: AffineSystem,
-    norm: Norm,
-    reference: FloatArray,
-    box: FloatArray,
-    nominal_masses: tuple[float, float],
-    settings: ModalSettings,
-    advance: Callable[[], object],
-    together: int = 1,
-) -> ModalData:
-    """Make the modal basis.
-
-    Parameters
-    ----------
-    system : AffineSystem
-        The full model.
-    norm : Norm
-        Energy norm at `reference`.
-    reference : (K + 1,) ndarray
-        (e, 1 - z1, ...) of the norm.
-    box : (K + 5, 2) ndarray
-        Validity box, `fe.runtime.reduced_arrays.parameter_names`.
-    nominal_masses : tuple of float
-        Servo and pitot mass at which the flapwise modes are named, at e = 1 and no loss [kg].
-    settings : ModalSettings
-        Accuracy.
-    advance : callable
-        Called after each sampled state.
-    together : int
-        As of `modal_basis`.
-
-    Raises
-    ------
-    ReductionError
-        If the modes of a sampled state do not converge, or there are too few unknowns for the modes.
-    """
-    basis, stiffness, mass = modal_basis(
-        system,
-        norm,
-        np.array((1.0, *np.mean(box[-2:], axis=1))),
-        sampled_states(box),
-        compression_states(box),
-        settings,
-        advance,
-        together,
-    )
-    data = ModalData(basis, stiffness, mass, np.empty((2, 0)), settings.mode_count)
-    shapes = _flapwise(data, system, nominal_masses)
-    return ModalData(data.basis, stiffness, mass, shapes, settings.mode_count)
-
-
 def modal_basis(
     system: MatrixTerms,
     norm: Norm,
@@ -212,7 +99,6 @@ def modal_basis(
     compression: list[ModalState],
     settings: ModalSettings,
     advance: Callable[[], object],
-    together: int = 1,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Make a basis for the first modes of any structure.
 
@@ -226,10 +112,10 @@ def modal_basis(
         Coefficients of the mass terms with which the search begins.
     sampled, compression : list of ModalState
         Where the working basis is refined, and whose modes are compressed together.
-    settings, advance
-        As of `reduce_modes`, as are the errors.
-    together : int
-        How many states are refined at once; one repeats the shipped wing to the bit.
+    settings : ModalSettings
+        Accuracy.
+    advance : callable
+        Called after each sampled state.
 
     Returns
     -------
@@ -237,6 +123,11 @@ def modal_basis(
         The basis.
     stiffness, mass : (T, Nm, Nm), (1 + P, Nm, Nm) ndarray
         The terms in it.
+
+    Raises
+    ------
+    ReductionError
+        If the modes of a sampled state do not converge, or there are too few unknowns for the modes.
     """
     unknowns = system.stiffness_terms[0].shape[0]
     count = settings.mode_count + 2  # two more, because modes change places
@@ -244,15 +135,15 @@ def modal_basis(
         raise ReductionError(
             f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
         )
-    working = _WorkingBasis(system, norm, together)
+    working = _WorkingBasis(system, norm)
     matrix = affine_sum(middle, system.mass_terms)
     # inverse iteration on a block; what it leaves is refined below
     vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
     for _ in range(START_ITERATIONS):
         vectors = np.linalg.qr(norm.riesz(np.asarray(matrix @ vectors)))[0]
     working.extend(vectors)
-    for first in range(0, len(sampled), together):
-        _refine(working, sampled[first : first + together], count, settings, advance)
+    for first in range(0, len(sampled), TOGETHER):
+        _refine(working, sampled[first : first + TOGETHER], count, settings, advance)
     basis = _compress(working, compression, count, settings)
     stiffness, mass = (
         # What rounding made of the symmetry of large entries is averaged out.
@@ -329,20 +220,3 @@ def _compress(
         else:
             low = middle + 1
     return np.asarray(directions[:, :low])
-
-
-def _flapwise(data: ModalData, system: AffineSystem, nominal_masses: tuple[float, float]) -> FloatArray:
-    """Return the shapes (2, Nm) of the first and second flapwise bending of the healthy wing.
-
-    They are the two modes that contribute most to the compliance under the tip force.
-    """
-    square, shapes = eigenmodes(
-        data.stiffness,
-        data.mass,
-        np.ones(len(data.stiffness)),
-        np.array((1.0, *nominal_masses)),
-        data.mode_count,
-    )
-    contribution = (system.load_tip @ data.basis @ shapes) ** 2 / square
-    chosen = np.sort(np.argsort(contribution)[-2:])
-    return np.asarray(shapes[:, chosen].T)

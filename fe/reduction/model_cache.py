@@ -1,36 +1,44 @@
-"""Reduced models kept between runs: an unchanged design is built once, a changed one is built anew."""
+"""Reduced models kept between runs: an unchanged design is built once, a changed one is built anew.
+
+A build works in one thread, because sums over several threads depend on their number: a design gives the same
+bytes on a machine whatever its cores do.
+"""
 
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from fe.runtime.archive import write_bytes_atomically
 from fe.runtime.errors import ReducedModelFileError
+from fe.runtime.kept_arrays import KeptArrays
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
+from reporting.progress import SilentProgress
 
 from .built_once import built_once, cache_folder, kept
 from .fields import FieldBasis, WingFields, field_basis
 
 if TYPE_CHECKING:
     from fe.full.operators import AffineOperators
+    from fe.structure.operators import Structure
     from fe.wing.design import WingDesign
+    from reporting.progress import Progress
 
     from .patch_basis import PatchSettings
-    from .settings import ReductionSettings
-    from .stages import Progress
+    from .settings import ReductionSettings, StructureSettings
 
-MODELLING_ROOMS = ("runtime", "wing", "full", "reduction")
+MODELLING_ROOMS = ("runtime", "wing", "full", "structure", "reduction")
 """The rooms that decide what a reduced model holds; a change in any of their files makes a new entry."""
 
+_Kept = TypeVar("_Kept", bound=KeptArrays)
 
-def modelling_hash(rooms: tuple[str, ...] = MODELLING_ROOMS) -> str:
-    """Return the SHA-256 of the modelling code of some rooms, hexadecimal."""
+
+def modelling_hash() -> str:
+    """Return the SHA-256 of the modelling code, hexadecimal."""
     digest = hashlib.sha256()
     package = Path(__file__).parents[1]
-    for room in rooms:
+    for room in MODELLING_ROOMS:
         for path in sorted((package / room).rglob("*.py")):
             content = path.read_bytes()
             digest.update(f"{path.relative_to(package).as_posix()} {len(content)}\n".encode())
@@ -38,23 +46,29 @@ def modelling_hash(rooms: tuple[str, ...] = MODELLING_ROOMS) -> str:
     return digest.hexdigest()
 
 
-def cache_key(design: "WingDesign", settings: "ReductionSettings | PatchSettings | None" = None) -> str:
-    """Return the name of a cache entry: a hash of design, reduction settings and modelling code."""
-    content = f"{design.hash} {settings!r} {modelling_hash()}"
-    return hashlib.sha256(content.encode()).hexdigest()[:32]
+def entry(kind: str, design_hash: str, settings: object) -> Path:
+    """Return the file of a cache entry: named by a hash of design, settings and modelling code."""
+    content = f"{design_hash} {settings!r} {modelling_hash()}"
+    return cache_folder() / f"{kind}-{hashlib.sha256(content.encode()).hexdigest()[:32]}.npz"
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """The two files of one cache entry."""
+def _loaded(kind: type[_Kept], path: Path, design_hash: str) -> _Kept:
+    arrays = kind.load(path)
+    if arrays.design_hash != design_hash:
+        raise ReducedModelFileError(f"{path} holds {kind.what} of another design; delete it.")
+    return arrays
 
-    model: Path
-    fields: Path
+
+# ---------------------------------------------------------------- wings
 
 
-def _entry(design: "WingDesign", settings: "ReductionSettings | None") -> _Entry:
-    key = cache_key(design, settings)
-    return _Entry(cache_folder() / f"wing-{key}.npz", cache_folder() / f"wing-{key}-fields.npz")
+def given_or_shipped(design: "WingDesign | None") -> "WingDesign":
+    """Return a design, the shipped one if none is given."""
+    if design is not None:
+        return design
+    from fe.wing.design import load_design
+
+    return load_design()
 
 
 def reduced_model(
@@ -62,7 +76,7 @@ def reduced_model(
     progress: "Progress | None" = None,
     settings: "ReductionSettings | None" = None,
 ) -> ReducedModel:
-    """Return the reduced model of a design, from the cache if it is there.
+    """Return the reduced model of a wing, from the cache if it is there.
 
     Parameters
     ----------
@@ -79,8 +93,9 @@ def reduced_model(
         If the design cannot be modelled or reduced.
     """
     wing = given_or_shipped(design)
-    entry = _entry(wing, settings)
-    return kept(lambda: _checked_model(entry.model, wing)) or _build(wing, progress, settings).model
+    path = entry("wing", wing.hash, settings)
+    found = kept(lambda: _loaded(ReducedModel, path, wing.hash))
+    return found or _kept_fields(wing, path, progress, settings).model
 
 
 def wing_fields(
@@ -88,49 +103,31 @@ def wing_fields(
     progress: "Progress | None" = None,
     settings: "ReductionSettings | None" = None,
 ) -> WingFields:
-    """Return the reduced model of a design with its field basis, from the cache if both are there.
+    """Return the reduced model of a wing with its field basis, from the cache if both are there.
 
     Parameters and errors as of `reduced_model`.
     """
     wing = given_or_shipped(design)
-    entry = _entry(wing, settings)
-    return kept(lambda: _checked_fields(entry, wing)) or _build(wing, progress, settings)
+    path = entry("wing", wing.hash, settings)
+    return _kept_fields(wing, path, progress, settings)
 
 
-def given_or_shipped(design: "WingDesign | None") -> "WingDesign":
-    """Return a design, the shipped one if none is given."""
-    if design is not None:
-        return design
-    from fe.wing.design import load_design
-
-    return load_design()
-
-
-def _checked_model(path: Path, design: "WingDesign") -> ReducedModel:
-    model = ReducedModel.load(path)
-    if model.design_hash != design.hash:
-        raise ReducedModelFileError(f"{path} holds the model of another design; delete it.")
-    return model
-
-
-def _checked_fields(entry: _Entry, design: "WingDesign") -> WingFields:
-    model = _checked_model(entry.model, design)
-    return WingFields(model, FieldBasis.from_bytes(entry.fields.read_bytes(), str(entry.fields)))
-
-
-def _build(
-    design: "WingDesign", progress: "Progress | None", settings: "ReductionSettings | None"
+def _kept_fields(
+    design: "WingDesign", path: Path, progress: "Progress | None", settings: "ReductionSettings | None"
 ) -> WingFields:
-    entry = _entry(design, settings)
+    fields = path.with_name(f"{path.stem}-fields.npz")
+
+    def load() -> WingFields:
+        model = _loaded(ReducedModel, path, design.hash)
+        return WingFields(model, _loaded(FieldBasis, fields, design.hash))
 
     def keep(wing: WingFields) -> None:
-        # the model last: where it is, its fields are
-        write_bytes_atomically(entry.fields, wing.basis.to_bytes())
-        write_bytes_atomically(entry.model, wing.model.to_bytes())
+        wing.basis.save(fields)
+        wing.model.save(path)
 
     return built_once(
-        entry.model,
-        load=lambda: _checked_fields(entry, design),
+        path,
+        load=load,
         build=lambda: build(design, progress, settings),
         keep=keep,
     )
@@ -139,14 +136,8 @@ def _build(
 def build(
     design: "WingDesign", progress: "Progress | None" = None, settings: "ReductionSettings | None" = None
 ) -> WingFields:
-    """Build the reduced model and the field basis of a design, without the cache.
-
-    It works in one thread, because sums over several threads depend on their number: a design gives the
-    same bytes on a machine whatever its cores do.
-
-    Parameters and errors as of `reduced_model`.
-    """
-    from .reduced_basis import reduce_model
+    """Build the reduced model and the field basis of a wing, without the cache; see `reduced_model`."""
+    from .wing_basis import reduce_model
 
     with assembled(design, progress) as operators:
         reduction = reduce_model(operators, settings, progress)
@@ -160,9 +151,123 @@ def assembled(design: "WingDesign", progress: "Progress | None") -> "Iterator[Af
 
     from fe.full.operators import assemble
 
-    from .stages import stage_of
-
     with threadpool_limits(1):
-        with stage_of(progress, "Meshing and assembling the wing"):
+        with (progress or SilentProgress()).stage("Meshing and assembling the wing"):
             operators = assemble(design)
         yield operators
+
+
+def patch_arrays(
+    design: "WingDesign | None" = None,
+    progress: "Progress | None" = None,
+    settings: "PatchSettings | None" = None,
+) -> PatchArrays:
+    """Return the wing for patches of a design, from the cache if it is there.
+
+    Parameters and errors are those of `reduced_model`; the settings say how far changes may go and how well
+    they are held.
+    """
+    wing = given_or_shipped(design)
+    path = entry("patches", wing.hash, settings)
+    return built_once(
+        path,
+        load=lambda: _loaded(PatchArrays, path, wing.hash),
+        build=lambda: build_patch_arrays(wing, progress, settings),
+        keep=lambda arrays: arrays.save(path),
+    )
+
+
+def build_patch_arrays(
+    design: "WingDesign", progress: "Progress | None" = None, settings: "PatchSettings | None" = None
+) -> PatchArrays:
+    """Build the wing for patches of a design, without the cache; see `patch_arrays`."""
+    from .patch_basis import reduce_patches
+
+    with assembled(design, progress) as operators:
+        return reduce_patches(operators, settings, progress)
+
+
+# ---------------------------------------------------------------- structures from a mesh
+
+
+def reduced_structure(
+    file: Path | str,
+    settings: "StructureSettings | None" = None,
+    progress: "Progress | None" = None,
+    *,
+    memory_limit: float | None = None,
+) -> ReducedModel:
+    """Return the reduced model of a structure file, from the cache if it is there.
+
+    Parameters
+    ----------
+    file : Path or str
+        The structure file, beside its mesh.
+    settings : StructureSettings, optional
+        How well it is to hold; by default as its file says.
+    progress : Progress, optional
+        Where a build reports.
+    memory_limit : float, optional
+        As of `fe.structure.operators.load_and_assemble`.
+
+    Raises
+    ------
+    FiniteElementError
+        If the structure cannot be read, modelled or reduced.
+    """
+    file = Path(file)
+    settings, design_hash, path = _place(file, settings)
+
+    def build_structure() -> ReducedModel:
+        from fe.structure.operators import load_and_assemble
+
+        with (progress or SilentProgress()).stage("Reading the mesh and assembling"):
+            structure = load_and_assemble(file, memory_limit)
+        return reduced(structure, settings, progress)
+
+    return built_once(
+        path,
+        load=lambda: _loaded(ReducedModel, path, design_hash),
+        build=build_structure,
+        keep=lambda model: model.save(path),
+    )
+
+
+def check_structure(file: Path | str) -> None:
+    """Read a structure file with its mesh and assemble both, unless their reduced model is kept.
+
+    Raises
+    ------
+    FiniteElementError
+        If the structure cannot be read or modelled.
+    """
+    from fe.structure.operators import load_and_assemble
+
+    if not _place(Path(file))[2].is_file():
+        load_and_assemble(file)
+
+
+def _place(file: Path, settings: "StructureSettings | None" = None) -> tuple["StructureSettings", str, Path]:
+    """Return how a structure is reduced, its hash with that of its mesh, and where its model is kept."""
+    from fe.structure.design import load_structure, structure_hash
+
+    from .settings import StructureSettings
+
+    design = load_structure(file)
+    settings = settings or StructureSettings.of(design)
+    design_hash = structure_hash(design, file.parent / design.mesh)
+    return settings, design_hash, entry("structure", design_hash, settings)
+
+
+def reduced(
+    structure: "Structure", settings: "StructureSettings | None" = None, progress: "Progress | None" = None
+) -> ReducedModel:
+    """Reduce an assembled structure in one thread, without the cache; see `reduced_structure`."""
+    from threadpoolctl import threadpool_limits
+
+    from .reduced_basis import reduce_structure
+    from .settings import StructureSettings
+
+    settings = settings or StructureSettings.of(structure.design)
+    with threadpool_limits(1):
+        return reduce_structure(structure, structure.design.name, settings, progress).model

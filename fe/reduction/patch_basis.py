@@ -18,9 +18,9 @@ from fe.full.operators import AffineOperators
 from fe.full.patch_operators import PatchOperators, assemble_patch_operators
 from fe.full.subspace import Norm
 from fe.runtime.patch_arrays import PatchArrays
+from reporting.progress import Progress, SilentProgress
 
 from .settings import ReductionSettings
-from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -87,8 +87,8 @@ def reduce_patches(
     SolutionError
         If the full model cannot be solved.
     """
-    settings = settings or PatchSettings()
-    with stage_of(progress, "Solving the wing for changes"):
+    settings, progress = settings or PatchSettings(), progress or SilentProgress()
+    with progress.stage("Solving the wing for changes"):
         full = assemble_patch_operators(operators, settings.strip_count)
         healthy = Norm(operators.stiffness())
         damaged = Norm(operators.stiffness(1.0, (DAMAGED_ANCHOR,) * len(operators.regions)))
@@ -97,7 +97,7 @@ def reduce_patches(
             axis=1,
         )
         basis = _orthonormal(snapshots, healthy.stiffness)
-    with stage_of(progress, "Reducing the patched wing"):
+    with progress.stage("Reducing the patched wing"):
         working = project(full, basis, settings)
         return projected(working, _directions(working, settings), settings)
 
@@ -199,7 +199,7 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
     return PatchArrays(
         design_hash=operators.design_hash,
         region_names=" ".join(operators.regions),
-        validity_box=settings.ranges.validity_box(len(operators.regions)),
+        validity_box=np.array(list(settings.ranges.named_ranges(operators.regions).values())),
         largest_loss=settings.largest_loss,
         largest_compliance=settings.compliance_share * compliance / place**2,
         largest_mass=settings.largest_mass,

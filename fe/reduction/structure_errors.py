@@ -6,7 +6,7 @@ import numpy as np
 
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure
 
 
@@ -37,7 +37,7 @@ class MeasuredErrors:
 
 
 def measured_errors(
-    structure: AffineStructure, model: StructureModel, states: int, seed: int = 2021
+    structure: AffineStructure, model: ReducedModel, states: int, seed: int = 2021
 ) -> MeasuredErrors:
     """Compare a reduced model with the full one, each control at its nominal value, or one where that is 0.
 
@@ -45,7 +45,7 @@ def measured_errors(
     ----------
     structure : AffineStructure
         The full model.
-    model : StructureModel
+    model : ReducedModel
         Its reduced model.
     states : int
         Random states, uniform in the ranges; each costs a factorisation.
@@ -68,19 +68,7 @@ def measured_errors(
         vector[first_control:] = np.where(
             nominal == 0.0, np.clip(1.0, *model.validity_box[first_control:].T), nominal
         )
-        values = dict(zip(model.chosen, vector.tolist(), strict=True))
-        parameters, losses, masses = (
-            {name: values[name] for name in names}
-            for names in (model.parameters, model.regions, model.masses)
-        )
-        stiffness = structure.stiffness(parameters, losses)
-        load = sum(
-            (
-                structure.load(name, None if control is None else values[control], masses)
-                for name, control in structure.loads.items()
-            ),
-            np.zeros(structure.unknowns),
-        )
+        stiffness, mass, load = structure.at(dict(zip(model.chosen, vector.tolist(), strict=True)))
         full = Factorisation(stiffness).solve(load)
         found = model.static_response(vector)
         for what, rows, came, error in (
@@ -100,7 +88,7 @@ def measured_errors(
                     broken.add(number)
                 worst["bound"] = max(worst["bound"], error / size)
         if number in (0, states - 1):
-            squares, _ = lowest_eigenpairs(stiffness, structure.mass(masses), model.mode_count)
+            squares, _ = lowest_eigenpairs(stiffness, mass, model.mode_count)
             ratio = model.modes(vector).frequency * 2.0 * np.pi / np.sqrt(squares)
             worst["frequency"] = max(worst["frequency"], float(np.abs(ratio - 1.0).max()))
     return MeasuredErrors(

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from numpy import einsum
 from numpy.linalg import solve
 
-from .reduced_arrays import AffineArrays
+from .reduced_arrays import ReducedArrays
 
 FloatArray = npt.NDArray[np.float64]
 multiply_outer = np.multiply.outer
@@ -73,7 +73,7 @@ class OnlineArrays:
 
     Parameters
     ----------
-    arrays : AffineArrays
+    arrays : ReducedArrays
         Arrays of the reduced model.
 
     Attributes
@@ -91,7 +91,7 @@ class OnlineArrays:
         "stiffness",
     )  # fmt: skip
 
-    def __init__(self, arrays: AffineArrays) -> None:
+    def __init__(self, arrays: ReducedArrays) -> None:
         stiffness = arrays.static_stiffness
         self.square = stiffness.shape[1:]
         self.stiffness = np.ascontiguousarray(stiffness.reshape(len(stiffness), -1))

@@ -4,14 +4,16 @@ NumPy and relative imports only: this file is copied into the FMU.
 """
 
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
+from sys import float_info
 from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from .errors import ReducedModelFileError
-from .reduced_arrays import RegionArrays, parameter_names
+from .reduced_arrays import RegionArrays
+from .state import wing_names
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -34,7 +36,7 @@ class PatchArrays(RegionArrays):
     Attributes
     ----------
     validity_box : (K + 5, 2) ndarray
-        Least and largest value of each of `fe.runtime.reduced_arrays.parameter_names`, SI units.
+        Least and largest value of each of `fe.runtime.state.wing_names`, SI units.
     largest_loss, largest_compliance, largest_mass : float
         Stiffness loss of a strip [1], root compliance [rad/(N m)] and point mass [kg] up to which the basis
         was made; the accuracy falls slowly beyond.
@@ -123,22 +125,17 @@ class PatchArrays(RegionArrays):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in SCALARS:
+        for name, low, high in (
+            *((name, float_info.min, inf) for name in SCALARS),
+            ("gauge_length", 0.0, inf),
+            ("straight_chord_line", 0.0, 1.0),
+        ):
             value = getattr(self, name)
-            if not (isfinite(value) and value > 0.0):
+            if not (isfinite(value) and low <= value <= high):
                 raise ReducedModelFileError(
-                    f"The {name} of a wing for patches must be positive, but is {value!r}; build it anew."
+                    f"The {name} of a wing for patches must lie between {low:.2g} and {high:g}, but is "
+                    f"{value!r}; build it anew."
                 )
-        if not (isfinite(self.gauge_length) and self.gauge_length >= 0.0):
-            raise ReducedModelFileError(
-                f"The gauge_length of a wing for patches must not be negative, but is "
-                f"{self.gauge_length!r}; build it anew."
-            )
-        if not 0.0 <= self.straight_chord_line <= 1.0:
-            raise ReducedModelFileError(
-                f"The straight_chord_line of a wing for patches must be a fraction, but is "
-                f"{self.straight_chord_line!r}; build it anew."
-            )
         strips = len(self.strip_lines) - 1
         if len(self.strip_of) and not (
             self.strip_of.min() >= 0
@@ -156,7 +153,7 @@ class PatchArrays(RegionArrays):
     def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
         n, p, t = self.stiffness.shape[-1], len(self.stations), len(self.strip_of)
         return {
-            "validity_box": (len(parameter_names(self.regions)), 2),
+            "validity_box": (len(wing_names(self.regions)), 2),
             "stiffness": (len(self.regions) + 2, n, n),
             "mass": (3, n, n),
             "strip_lines": (len(self.strip_lines),),

@@ -20,7 +20,6 @@ from .patch import LOADS, LoadGain, ModelPatch, PointMass
 from .patched_structure import Modes, PatchedStructure
 from .patched_wing import LOAD_PLACE, ON_MODES, PatchedWing
 from .reduced import ReducedModel
-from .state import Losses
 from .transient import ModalIntegrator, TransientState
 
 FloatArray = npt.NDArray[np.float64]
@@ -55,8 +54,10 @@ class PatchedSteps:
         The wing without a patch.
     wing : PatchedWing
         The same wing in the basis for patches.
-    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass, damping_alpha, damping_beta
-        As of `fe.runtime.transient.ModalIntegrator`.
+    vector : (V,) ndarray
+        Values of all that can be chosen of the model; those of the controls do not matter.
+    damping : tuple of float
+        Rayleigh's alpha [1/s] and beta [s].
     patch : ModelPatch
         Primitives of sensors are passed over.
     temperature : float
@@ -74,19 +75,16 @@ class PatchedSteps:
         self,
         model: ReducedModel,
         wing: PatchedWing,
+        vector: FloatArray,
         *,
-        young_modulus_factor: float,
-        stiffness_loss: Losses,
-        servo_mass: float,
-        pitot_mass: float,
-        damping_alpha: float,
-        damping_beta: float,
+        damping: tuple[float, float],
         patch: ModelPatch,
         temperature: float = 0.0,
     ) -> None:
-        self._model, self._wing = model, wing
-        self._state = (young_modulus_factor, stiffness_loss, servo_mass, pitot_mass)
-        self._rayleigh = damping_alpha, damping_beta
+        self._model, self._wing, self._vector = model, wing, vector
+        e, *losses, servo_mass, pitot_mass = vector[:-2].tolist()
+        self._state = (e, tuple(losses), servo_mass, pitot_mass)
+        self._rayleigh = damping
         self._loads = patch.of(*LOADS)
         self._laws: Laws = laws_of(wing.internal_forces(patch), wing.port_rows)
         self._patched = wing.structure(*self._state, patch, temperature)
@@ -131,10 +129,11 @@ class PatchedSteps:
 
     def _plain_outputs(self, load_factor: float, tip_force: float) -> FloatArray:
         """Strains, tip displacement and load point displacement (G + 2,) of the reduced model."""
-        e, stiffness_loss, *_ = self._state
-        static = self._model.static_response(e, stiffness_loss, load_factor, tip_force)
+        vector = self._vector.copy()
+        vector[-2:] = load_factor, tip_force
+        static = self._model.static_response(vector)
         point = self._model.static_load[1] @ static.coordinates
-        return np.concatenate((static.strain, (static.tip_displacement, point)))
+        return np.concatenate((static.strain, static.displacement, (point,)))
 
     # ------------------------------------------------------------ at rest
 
@@ -180,11 +179,11 @@ class PatchedSteps:
 
     @cached_property
     def _modes(self) -> Modes:
-        return self._patched.moving_modes(self._held_rows, MODE_COUNT)
+        return self._patched.modes(MODE_COUNT, self._held_rows)
 
     @cached_property
     def _plain_modes(self) -> Modes:
-        return self._plain.moving_modes(self._held_rows, MODE_COUNT)
+        return self._plain.modes(MODE_COUNT, self._held_rows)
 
     @cached_property
     def _system(self) -> ModalSystem:
@@ -406,7 +405,7 @@ class PatchedSteps:
         """
         modes = self._plain_modes
         count = len(modes.frequency)
-        deviation = (state.displacement - before.at_rest(*state.load.tolist()).displacement)[:count]
+        deviation = (state.displacement - before.at_rest(state.load).displacement)[:count]
         place = modes.shapes @ deviation + self._plain_answers @ state.load
         velocity = modes.shapes @ state.velocity[:count]
         return self._carried(place, velocity, state.load, self._laws.memory())
@@ -414,7 +413,7 @@ class PatchedSteps:
     def give_back(self, state: Sequence[float], after: ModalIntegrator) -> TransientState:
         """Return a state in the modes of the wing without patch, as `take_over_unpatched` takes it."""
         now, modes = self._unpacked(state), self._plain_modes
-        rest = after.at_rest(*now.loads.tolist())
+        rest = after.at_rest(now.loads)
         displacement, velocity = rest.displacement.copy(), rest.velocity.copy()
         count = min(len(displacement), len(modes.frequency))
         aside = self._place(now) - self._plain_answers @ now.loads

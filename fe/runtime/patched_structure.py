@@ -88,35 +88,13 @@ class PatchedStructure:
         """Return the displacements K^-1 f of loads (n,) or (n, k)."""
         return np.asarray(self._inverse @ loads)
 
-    def modes(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return the first undamped modes, Kapteyn et al. 2021, eq. (16).
+    def modes(self, count: int, held: FloatArray | None = None) -> Modes:
+        """Return the first undamped modes, Kapteyn et al. 2021, eq. (16); the tip moves up in each of them.
 
-        Parameters
-        ----------
-        count : int
-            How many.
-
-        Returns
-        -------
-        angular_frequency : (count,) ndarray
-            Rising [rad/s].
-        shapes : (n, count) ndarray
-            Mass-normalised.
+        The basis that they are found in holds the static shapes of the rows `held` (s, n) as well.
         """
-        basis = motion_basis(self.static, self.mass, self._arrays.start_shapes)
-        # M x = K x / w^2: the low modes are the largest eigenvalues, which keep all their digits
-        to_standard = np.linalg.inv(np.linalg.cholesky(basis.T @ self.stiffness @ basis))
-        inverse_square, vectors = np.linalg.eigh(to_standard @ (basis.T @ self.mass @ basis) @ to_standard.T)
-        inverse_square = inverse_square[::-1][:count]
-        shapes = to_standard.T @ vectors[:, ::-1][:, :count] / np.sqrt(inverse_square)
-        return 1.0 / np.sqrt(inverse_square), np.asarray(basis @ shapes)
-
-    def moving_modes(self, held: FloatArray, count: int) -> Modes:
-        """Return the first modes in a basis that holds the static shapes of the rows `held` (s, n) as well.
-
-        The tip moves up in each of them.
-        """
-        basis = motion_basis(self.static, self.mass, self._arrays.start_shapes, self.static(held.T))
+        solutions = None if held is None else self.static(held.T)
+        basis = motion_basis(self.static, self.mass, self._arrays.start_shapes, solutions)
         # M x = K x / w^2: the low modes are the largest eigenvalues, which keep all their digits
         to_standard = np.linalg.inv(np.linalg.cholesky(_symmetric(basis.T @ self.stiffness @ basis)))
         mass = _symmetric(basis.T @ self.mass @ basis)

@@ -65,7 +65,7 @@ class PatchedWing:
     Parameters
     ----------
     arrays : PatchArrays
-        From `fe.reduction.patch_cache.patch_arrays`, or read from a file.
+        From `fe.reduction.model_cache.patch_arrays`, or read from a file.
     """
 
     def __init__(self, arrays: PatchArrays) -> None:

@@ -1,12 +1,12 @@
-"""The reduced model of the wing: everything that is evaluated online, with NumPy alone.
+"""The reduced model of a structure, as a wing is one: everything that is evaluated online, with NumPy alone.
 
-NumPy and relative imports only: this file is copied into the FMU. The offline part, which makes the arrays,
-is `fe.reduction.reduced_basis`; the equations are in `docs/reduced_model.md`.
+NumPy and relative imports only: this file is copied into the FMU. The equations are in
+`docs/reduced_model.md`, the offline part is `fe.reduction.reduced_basis`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isfinite, sqrt
+from math import sqrt
 
 import numpy as np
 import numpy.typing as npt
@@ -14,231 +14,304 @@ from numpy.linalg import solve
 
 from .errors import OutsideModelError
 from .online import OnlineArrays
-from .reduced_arrays import ReducedArrays, parameter_names
-from .responses import Modes, StaticResponse
-from .state import Losses
-
-__all__ = ["Modes", "ReducedModel", "StaticResponse"]
+from .reduced_arrays import ReducedArrays
 
 FloatArray = npt.NDArray[np.float64]
+Values = Mapping[str, float] | FloatArray
+"""What is chosen: by name, or all of it (V,) in the order of `ReducedArrays.chosen`."""
+
+
+def dense_sum(coefficients: FloatArray, terms: FloatArray) -> FloatArray:
+    """Return the sum of coefficients (T,) times dense terms (T, n, m)."""
+    return np.asarray((coefficients @ terms.reshape(len(terms), -1)).reshape(terms.shape[1:]))
+
+
+@dataclass(frozen=True, slots=True)
+class StaticResponse:
+    """Static response of a structure.
+
+    Attributes
+    ----------
+    strain : (G,) ndarray
+        Gauge strains, dimensionless; of a wing positive where the upper skin is compressed.
+    displacement : (D,) ndarray
+        Displacement outputs [m]; of a wing that of the tip, upwards.
+    strain_error_bound, displacement_error_bound : float
+        Certified: no gauge, and no displacement output, of the full model differs by more than this.
+    coordinates : (N,) ndarray
+        Coefficients of the static basis vectors, from which a field can be reconstructed.
+    """
+
+    strain: FloatArray
+    displacement: FloatArray
+    strain_error_bound: float
+    displacement_error_bound: float
+    coordinates: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Modes:
+    """First undamped eigenmodes of a structure, in ascending frequency, Kapteyn et al. 2021, eq. (16).
+
+    Attributes
+    ----------
+    frequency : (M,) ndarray
+        Natural frequencies [Hz].
+    shape : (Nm, M) ndarray
+        Coefficients of the modal basis vectors; mass-normalised, the last output of a mode is positive.
+    output : (O, M) ndarray
+        Gauges, displacements and accelerations (as displacements) per unit of modal coordinate.
+    participation : (L, M) ndarray
+        Modal force of each load [N kg^-1/2].
+    mass : (Nm, Nm) ndarray
+        The mass in the modal basis [kg].
+    followed : tuple of int
+        The mode that is most like each of the shapes that are followed; of a wing those of the first and
+        second flapwise bending, found by their shape, never by their rank.
+    followed_mac : tuple of float
+        Modal assurance criterion (mass-weighted) of these modes against the shapes.
+    """
+
+    frequency: FloatArray
+    shape: FloatArray
+    output: FloatArray
+    participation: FloatArray
+    mass: FloatArray
+    followed: tuple[int, ...]
+    followed_mac: tuple[float, ...]
 
 
 @dataclass(frozen=True, repr=False)
 class ReducedModel(ReducedArrays):
-    """Reduced wing: `ReducedArrays`, evaluated.
+    """Reduced structure: `ReducedArrays`, evaluated.
 
-    `fe.reduction.model_cache.reduced_model` makes one, `load` and `from_bytes` read one. Fields: those of
-    `ReducedArrays`.
+    `fe.reduction.model_cache` makes one, `load` and `from_bytes` read one. Values are given by the names of
+    `chosen`, as a mapping or as keywords, the losses also together as `stiffness_loss`; what is left out is
+    nominal, and healthy.
     """
 
     _online: OnlineArrays = field(init=False, repr=False, compare=False)
     _limits: tuple[tuple[float, float], ...] = field(init=False, repr=False, compare=False)
+    _pairs: tuple[tuple[tuple[int, int], ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # of e, of the losses, of load factor and tip force
-        limits = tuple((float(low), float(high)) for low, high in self.validity_box[:-2])
-        object.__setattr__(self, "_limits", limits)
+        limits = tuple((float(low), float(high)) for low, high in self.validity_box)
+        # places of a term's two factors among (1, what is chosen, what the losses leave)
+        parameters, regions, masses = len(self.parameters), len(self.regions), len(self.masses)
+        (scale, region), (control, mass) = self.stiffness_factors.T, self.load_factors.T
+        stiffness = np.stack((scale, np.where(region > 0, len(self.chosen) + region, 0)), axis=1)
+        load = np.stack(
+            (
+                np.where(control > 0, parameters + regions + masses + control, 0),
+                np.where(mass > 0, parameters + regions + mass, 0),
+            ),
+            axis=1,
+        )
+        pairs = tuple(tuple(map(tuple, places.tolist())) for places in (stiffness, load))
         object.__setattr__(self, "_online", OnlineArrays(self))
+        object.__setattr__(self, "_limits", limits)
+        object.__setattr__(self, "_pairs", pairs)
 
     def __repr__(self) -> str:
         return (
-            f"ReducedModel(design_hash={self.design_hash!r}, gauges={self.gauge_count}, "
-            f"regions={self.regions}, static_basis={len(self.static_load.T)}, "
+            f"ReducedModel(name={self.name!r}, design_hash={self.design_hash!r}, regions={self.regions}, "
+            f"controls={self.controls}, gauges={len(self.gauges)}, static_basis={len(self.static_load.T)}, "
             f"modal_basis={len(self.modal_load.T)}, modes={self.mode_count})"
         )
 
     @property
     def gauge_count(self) -> int:
         """Number of strain gauges G."""
-        return int(self.static_output.shape[0]) - 1
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the rows of `validity_box`."""
-        return parameter_names(self.regions)
+        return len(self.gauges)
 
     @property
     def validity(self) -> Mapping[str, tuple[float, float]]:
-        """Least and largest value for which the model was made, by parameter name (SI units)."""
-        return {
-            name: (float(low), float(high))
-            for name, (low, high) in zip(self.parameter_names, self.validity_box, strict=True)
-        }
+        """Least and largest value for which the model was made, by name (SI units)."""
+        return dict(zip(self.chosen, self._limits, strict=True))
 
-    def check_validity(self, **values: float) -> None:
-        """Check that each value lies in the validity box; also refuses NaN and infinity.
+    def vector(
+        self,
+        values: Values | None = None,
+        stiffness_loss: Mapping[str, float] | Iterable[float] = (),
+        **named: float,
+    ) -> FloatArray:
+        """Return all that can be chosen, (V,), of the values that are given; the others are nominal.
 
         Parameters
         ----------
-        **values : float
-            Values by the names of `parameter_names`.
+        values : mapping of str to float, or (V,) ndarray, optional
+            By name; an array is returned as it is.
+        stiffness_loss : mapping or iterable of float
+            Losses of the damage regions together, as of `fe.runtime.state.losses_of`.
+        **named : float
+            More values by name.
 
         Raises
         ------
         OutsideModelError
-            If a value lies outside; the sentence names it and its range.
+            If a name is unknown.
+        InvalidStateError
+            If the losses are not those of the regions.
         """
-        validity = self.validity
-        for name, value in values.items():
-            low, high = validity[name]
-            if not (isfinite(value) and low <= value <= high):
+        if isinstance(values, np.ndarray):
+            return values
+        found, first = self.nominal.copy(), len(self.parameters)
+        found[first : first + len(self.regions)] = self.losses(stiffness_loss)
+        for name, value in {**(values or {}), **named}.items():
+            found[self._place(name)] = value
+        return found
+
+    def vectors(self, columns: Mapping[str, npt.ArrayLike]) -> FloatArray:
+        """Return all that can be chosen, (B, V), of columns (B,) or numbers by name; the others are nominal.
+
+        Raises
+        ------
+        OutsideModelError
+            If a name is unknown.
+        """
+        arrays = np.broadcast_arrays(np.zeros(1), *(np.asarray(column) for column in columns.values()))
+        found = np.tile(self.nominal, (len(arrays[0]), 1))
+        for name, array in zip(columns, arrays[1:], strict=True):
+            found[:, self._place(name)] = array
+        return found
+
+    def _place(self, name: str) -> int:
+        if name not in self.chosen:
+            raise OutsideModelError(
+                f"The structure {self.name} has nothing named {name!r} to be chosen; it has "
+                f"{', '.join(self.chosen)}."
+            )
+        return self.chosen.index(name)
+
+    def check_validity(self, values: Sequence[float]) -> None:
+        """Check that each of the values (V,) lies in the validity box; also refuses NaN and infinity.
+
+        Raises
+        ------
+        OutsideModelError
+            If one lies outside; the sentence names it and its range.
+        """
+        for name, value, (low, high) in zip(self.chosen, values, self._limits, strict=True):
+            if not low <= value <= high:
                 raise OutsideModelError(
-                    f"{name} must lie between {low:g} and {high:g}, the range of the reduced model, but is "
-                    f"{value!r}; give a value inside, or build a model with a wider range."
+                    f"{name} must lie between {low:g} and {high:g}, the range of the reduced model of "
+                    f"{self.name}, but is {float(value)!r}; give a value inside, or reduce it for a wider "
+                    "range."
                 )
+
+    def _coefficients(self, vectors: FloatArray, number: int) -> FloatArray:
+        if vectors.ndim == 1:
+            return self._of_one(vectors.tolist(), number)
+        first = len(self.parameters)
+        unit = np.ones((*vectors.shape[:-1], 1))
+        left = 1.0 - vectors[..., first : first + len(self.regions)]
+        known = np.concatenate((unit, vectors, left), axis=-1)
+        return np.asarray(known[..., np.array(self._pairs[number]).reshape(-1, 2)].prod(axis=-1))
+
+    def _of_one(self, values: list[float], number: int) -> FloatArray:
+        # plain floats: arrays of so few numbers cost more than all sums over them
+        first = len(self.parameters)
+        known = [1.0, *values, *[1.0 - value for value in values[first : first + len(self.regions)]]]
+        return np.array([known[one] * known[other] for one, other in self._pairs[number]])
+
+    def stiffness_coefficients(self, vectors: FloatArray) -> FloatArray:
+        """Return the coefficients (..., T) of the stiffness terms at values (..., V)."""
+        return self._coefficients(vectors, 0)
+
+    def load_coefficients(self, vectors: FloatArray) -> FloatArray:
+        """Return the coefficients (..., L) of the loads at values (..., V)."""
+        return self._coefficients(vectors, 1)
+
+    def mass_coefficients(self, vector: FloatArray) -> FloatArray:
+        """Return the coefficients (1 + P,) of the mass terms at values (V,)."""
+        start = len(self.parameters) + len(self.regions)
+        return np.concatenate(([1.0], vector[start : start + len(self.masses)]))
 
     def static_response(
         self,
-        young_modulus_factor: float,
-        stiffness_loss: Losses,
-        load_factor: float,
-        tip_force: float = 0.0,
+        values: Values | None = None,
+        stiffness_loss: Mapping[str, float] | Iterable[float] = (),
+        *,
+        load: FloatArray | None = None,
+        **named: float,
     ) -> StaticResponse:
-        """Return the static response with its certified error bound, Kapteyn et al. 2021, eqs. (13), (15).
+        """Return the static response with its certified error bounds, Kapteyn et al. 2021, eqs. (13), (15).
 
         Parameters
         ----------
-        young_modulus_factor, stiffness_loss
-            As of `fe.runtime.state.DigitalState`.
-        load_factor : float
-            Load factor of the manoeuvre [1].
-        tip_force : float
-            Force 5 cm from the tip [N], upwards positive.
+        values, stiffness_loss, **named
+            As of `vector`.
+        load : (L,) ndarray, optional
+            Coefficients of the loads in the place of those of the controls.
 
         Raises
         ------
         OutsideModelError
-            If a value lies outside the validity box or is not finite.
+            If a value is unknown, lies outside the validity box or is not finite.
         """
-        e = young_modulus_factor
-        online = self._online
-        loss = stiffness_loss if len(stiffness_loss) == len(online.splits) else self.losses(stiffness_loss)
-        given = (e, *loss, load_factor, tip_force)
-        for value, (low, high) in zip(given, self._limits, strict=True):
-            if not low <= value <= high:
-                self.check_validity(**dict(zip(self.parameter_names, given, strict=False)))
-        values = np.array((e, *(1.0 - value for value in loss), 1.0, load_factor, tip_force))
-        coordinates, output, bound = online.solution(values[:-2], values[-2:], loss)
-        strain = output[:-1]
-        tip_displacement = float(output[-1])
-        rounding = self.rounding_allowance
+        vector = self.vector(values, stiffness_loss, **named)
+        chosen = vector.tolist()
+        self.check_validity(chosen)
+        first, gauges = len(self.parameters), len(self.gauges)
+        loss = tuple(chosen[first : first + len(self.regions)])
+        acting = self._of_one(chosen, 1) if load is None else load
+        found, rounding = (
+            self._online.solution(self._of_one(chosen, 0), acting, loss),
+            self.rounding_allowance,
+        )
+        strain, displacement = found.output[:gauges], found.output[gauges:]
+        bound = found.bound.tolist()
         return StaticResponse(
-            strain=strain,
-            tip_displacement=tip_displacement,
-            strain_error_bound=float(bound[:-1].max()) + rounding * sqrt(strain @ strain),
-            tip_displacement_error_bound=float(bound[-1]) + rounding * abs(tip_displacement),
-            coordinates=coordinates,
+            strain,
+            displacement,
+            max(bound[:gauges], default=0.0) + rounding * sqrt(strain @ strain),
+            max(bound[gauges:], default=0.0) + rounding * sqrt(displacement @ displacement),
+            found.coordinates,
         )
 
-    def static_strains(
-        self,
-        young_modulus_factor: npt.ArrayLike,
-        stiffness_loss: npt.ArrayLike,
-        load_factor: npt.ArrayLike,
-        tip_force: npt.ArrayLike = 0.0,
-    ) -> FloatArray:
-        """Return the gauge strains of many states at once, Kapteyn et al. 2021, eqs. (13), (15).
-
-        Parameters
-        ----------
-        young_modulus_factor : (B,) array_like
-            e of each state [1]; scalars are broadcast, here and below.
-        stiffness_loss : (B, K) array_like
-            Losses of each state in the order of `regions`, fractions.
-        load_factor : (B,) array_like
-            Load factor of each state [1].
-        tip_force : (B,) array_like
-            Tip force of each state [N].
-
-        Returns
-        -------
-        (B, G) ndarray
-            Strains, dimensionless.
-
-        Raises
-        ------
-        OutsideModelError
-            If a value lies outside the validity box or is not finite.
-        ValueError
-            If the shapes do not fit.
-        """
-        loss = np.atleast_2d(np.asarray(stiffness_loss, dtype=np.float64))
-        regions = len(self.regions)
-        if loss.ndim != 2 or loss.shape[1] != regions:
-            raise ValueError(
-                f"stiffness_loss must have the shape (B, {regions}), but has {np.shape(stiffness_loss)}."
-            )
-        columns: tuple[FloatArray, ...] = np.broadcast_arrays(
-            np.asarray(young_modulus_factor, dtype=np.float64),
-            *loss.T,
-            np.asarray(load_factor, dtype=np.float64),
-            np.asarray(tip_force, dtype=np.float64),
-        )
-        for name, (low, high), column in zip(self.parameter_names, self.validity_box, columns, strict=False):
-            bad = np.flatnonzero(~((column >= low) & (column <= high)))
-            if bad.size:
-                self.check_validity(**{name: float(column[bad[0]])})
-        e, *lost, n, f = columns
-        theta = np.stack((e, *(1.0 - z for z in lost), np.ones_like(e)), axis=1)
-        stiffness = (theta @ self._online.stiffness).reshape(-1, *self._online.square)
-        load = np.stack((n, f), axis=1) @ self.static_load
-        coordinates = solve(stiffness, load[:, :, np.newaxis])[:, :, 0]
-        return np.asarray(coordinates @ self.static_output[:-1].T)
-
-    def tip_stiffness(self, young_modulus_factor: float, stiffness_loss: Losses = ()) -> float:
-        """Return the tip stiffness: the tip force over the displacement of its point of application.
-
-        Kapteyn et al. 2021, eq. (14), where it is a straight line in e.
-
-        Parameters
-        ----------
-        young_modulus_factor, stiffness_loss
-            As of `fe.runtime.state.DigitalState`.
-
-        Returns
-        -------
-        float
-            Stiffness [N/m].
+    def static_outputs(self, vectors: FloatArray) -> FloatArray:
+        """Return gauges and displacements (B, O') at many values (B, V) at once.
 
         Raises
         ------
         OutsideModelError
             If a value lies outside the validity box or is not finite.
         """
-        coordinates = self.static_response(young_modulus_factor, stiffness_loss, 0.0, 1.0).coordinates
-        return float(1.0 / (self.static_load[1] @ coordinates))
+        low, high = self.validity_box.T
+        bad = np.flatnonzero(~((vectors >= low) & (vectors <= high)).all(axis=1))
+        if bad.size:
+            self.check_validity(vectors[bad[0]].tolist())
+        stiffness = self.stiffness_coefficients(vectors) @ self._online.stiffness
+        load = self.load_coefficients(vectors) @ self.static_load
+        coordinates = solve(stiffness.reshape(-1, *self._online.square), load[:, :, np.newaxis])[:, :, 0]
+        return np.asarray(coordinates @ self.static_output.T)
+
+    def tip_stiffness(
+        self, young_modulus_factor: float, stiffness_loss: Mapping[str, float] | Iterable[float] = ()
+    ) -> float:
+        """Return the tip stiffness of a wing [N/m]: the tip force over the displacement of its point.
+
+        Kapteyn et al. 2021, eq. (14), where it is a straight line in e. Errors as of `static_response`.
+        """
+        vector = self.vector(stiffness_loss=stiffness_loss, young_modulus_factor=young_modulus_factor)
+        tip = np.array((0.0, 1.0))
+        return float(1.0 / (self.static_load[1] @ self.static_response(vector, load=tip).coordinates))
 
     def modes(
         self,
-        young_modulus_factor: float,
-        stiffness_loss: Losses,
-        servo_mass: float,
-        pitot_mass: float,
+        values: Values | None = None,
+        stiffness_loss: Mapping[str, float] | Iterable[float] = (),
+        **named: float,
     ) -> Modes:
         """Return the first undamped modes, Kapteyn et al. 2021, eq. (16).
 
-        Parameters
-        ----------
-        young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
-            As of `fe.runtime.state.DigitalState`.
-
-        Raises
-        ------
-        OutsideModelError
-            If a value lies outside the validity box or is not finite.
+        Parameters and errors are those of `static_response`.
         """
-        loss = self.losses(stiffness_loss)
-        self.check_validity(
-            young_modulus_factor=young_modulus_factor,
-            **dict(zip(self.regions, loss, strict=True)),
-            servo_mass=servo_mass,
-            pitot_mass=pitot_mass,
-        )
-        size = self.modal_stiffness.shape[1:]
-        theta = np.array((young_modulus_factor, *(1.0 - z for z in loss), 1.0))
-        stiffness = (theta @ self.modal_stiffness.reshape(len(theta), -1)).reshape(size)
-        mass = self._modal_mass(servo_mass, pitot_mass)
+        vector = self.vector(values, stiffness_loss, **named)
+        self.check_validity(vector.tolist())
+        stiffness = dense_sum(self.stiffness_coefficients(vector), self.modal_stiffness)
+        mass = dense_sum(self.mass_coefficients(vector), self.modal_mass)
         # M x = K x / omega^2: the stiffness is well conditioned in this basis, the mass is not, and the low
         # modes are the largest eigenvalues, which keep all their digits.
         to_standard = np.linalg.inv(np.linalg.cholesky(stiffness))
@@ -246,46 +319,15 @@ class ReducedModel(ReducedArrays):
         inverse_square = inverse_square[::-1][: self.mode_count]
         shape = to_standard.T @ vectors[:, ::-1][:, : self.mode_count] / np.sqrt(inverse_square)
         shape = shape * np.where(self.modal_output[-1] @ shape < 0.0, -1.0, 1.0)
-        output = self.modal_output @ shape
-        force = self.modal_load @ shape
-        reference = self.flapwise_reference @ mass
-        assurance = (reference @ shape) ** 2 / np.sum(reference * self.flapwise_reference, axis=1)[
-            :, np.newaxis
-        ]
-        first, second = (int(i) for i in assurance.argmax(axis=1))
+        reference = self.followed_shapes @ mass
+        size = np.sum(reference * self.followed_shapes, axis=1)[:, np.newaxis]
+        assurance = (reference @ shape) ** 2 / size
         return Modes(
             frequency=1.0 / (2.0 * np.pi * np.sqrt(inverse_square)),
             shape=shape,
-            tip_displacement=output[-1],
-            strain=output[:-1],
-            lift_participation=force[0],
-            tip_participation=force[1],
-            flapwise=(first, second),
-            flapwise_mac=(float(assurance[0, first]), float(assurance[1, second])),
+            output=self.modal_output @ shape,
+            participation=self.modal_load @ shape,
+            mass=mass,
+            followed=tuple(assurance.argmax(axis=1).tolist()),
+            followed_mac=tuple(assurance.max(axis=1, initial=0.0).tolist()),
         )
-
-    def _modal_mass(self, servo_mass: float, pitot_mass: float) -> FloatArray:
-        mass = self.modal_mass[0] + servo_mass * self.modal_mass[1] + pitot_mass * self.modal_mass[2]
-        return np.asarray(mass, dtype=np.float64)
-
-    def modal_projection(
-        self, modes: Modes, servo_mass: float, pitot_mass: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return what takes reduced displacements to modal coordinates, q = shape^T M u.
-
-        Parameters
-        ----------
-        modes : Modes
-            The modes to project on.
-        servo_mass, pitot_mass : float
-            The masses that belong to them [kg].
-
-        Returns
-        -------
-        from_modal : (M, Nm) ndarray
-            For displacements given in the modal basis.
-        from_static : (M, N) ndarray
-            For displacements given in the static basis.
-        """
-        cross = self.cross_mass[0] + servo_mass * self.cross_mass[1] + pitot_mass * self.cross_mass[2]
-        return modes.shape.T @ self._modal_mass(servo_mass, pitot_mass), modes.shape.T @ cross

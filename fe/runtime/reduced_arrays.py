@@ -1,12 +1,13 @@
-"""The arrays of a reduced model: what they are, their shapes, checked, and the file that keeps them.
+"""The arrays of a reduced structure: what they are, their shapes, checked, and the file that keeps them.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from math import isfinite
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +22,6 @@ MOST_ANCHORS = 16
 """Largest number of approximate dual solutions of a reduced model."""
 
 
-def parameter_names(regions: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of the rows of `ReducedModel.validity_box`, in their order."""
-    return ("young_modulus_factor", *regions, "load_factor", "tip_force", "servo_mass", "pitot_mass")
-
-
 @dataclass(frozen=True, repr=False)
 class RegionArrays(KeptArrays):
     """Arrays of a structure with K damage regions, 1 to 8.
@@ -38,7 +34,7 @@ class RegionArrays(KeptArrays):
 
     region_names: str
 
-    @property
+    @cached_property
     def regions(self) -> tuple[str, ...]:
         """Names of the K damage regions."""
         return tuple(self.region_names.split())
@@ -56,26 +52,39 @@ class RegionArrays(KeptArrays):
         super().__post_init__()
 
 
-class AffineSizes(NamedTuple):
-    """Numbers of stiffness terms, loads, free masses, chosen quantities, outputs of the modes alone."""
-
-    stiffness_terms: int
-    loads: int
-    masses: int
-    chosen: int
-    dynamic_outputs: int = 0
-
-
 @dataclass(frozen=True, repr=False)
-class AffineArrays(RegionArrays):
-    """Affine dense matrices, outputs, modal data and error bound of a reduced structure.
+class ReducedArrays(RegionArrays):
+    """Affine dense matrices, outputs, modal data, error bound and ranges of a reduced structure, with names.
+
+    What can be chosen are the parameters, the losses of the damage regions, the free masses [kg] and the
+    controls, in this order; `chosen` names them. Outputs are the gauges [1], the displacements [m] and, of
+    the modes alone, the accelerations [m/s^2].
 
     T stiffness terms, of which the last is always times one, 1 + P mass terms (the structure, then 1 kg of
-    each mass that can be chosen), L loads and O outputs, of which the first O' are static; what multiplies
-    them is told by the subclasses.
+    each free mass), L loads and O outputs, of which the first O' are static.
 
     Attributes
     ----------
+    name : str
+        Of the structure.
+    parameter_names, mass_names, control_names : str
+        Parted by spaces; each may be empty.
+    control_units : str
+        Unit of each control, parted by spaces.
+    gauge_names, displacement_names, acceleration_names : str
+        Names of the outputs, parted by spaces; each may be empty.
+    nominal : (V,) ndarray
+        Nominal value of all that can be chosen; zero for the losses.
+    damping : (2,) ndarray
+        Rayleigh's alpha [1/s] and beta [s].
+    stiffness_factors : (T, 2) ndarray of int64
+        Parameter and damage region that each stiffness term is times, counted from one; zero for none.
+    load_factors : (L, 2) ndarray of int64
+        The control and the free mass that each load is times, counted from one; zero for none.
+    mode_count : int
+        Number of modes M that `modes` returns.
+    followed_shapes : (F, Nm) ndarray
+        Shapes in the modal basis by which modes are followed, of a wing its first two flapwise bendings.
     validity_box : (V, 2) ndarray
         Least and largest value of each quantity that can be chosen, SI units.
     static_stiffness : (T, N, N) ndarray
@@ -122,8 +131,28 @@ class AffineArrays(RegionArrays):
         Mass terms between the modal and the static basis.
     """
 
-    kinds: ClassVar[Mapping[str, type[Any]]] = {"dual_counts": np.int64}
+    what = "a reduced model"
+    layout = ("format", 4)
+    kinds: ClassVar[Mapping[str, type[Any]]] = {
+        "dual_counts": np.int64,
+        "stiffness_factors": np.int64,
+        "load_factors": np.int64,
+    }
 
+    name: str
+    parameter_names: str
+    mass_names: str
+    control_names: str
+    control_units: str
+    gauge_names: str
+    displacement_names: str
+    acceleration_names: str
+    nominal: FloatArray
+    damping: FloatArray
+    stiffness_factors: npt.NDArray[np.int64]
+    load_factors: npt.NDArray[np.int64]
+    mode_count: int
+    followed_shapes: FloatArray
     validity_box: FloatArray
     static_stiffness: FloatArray
     static_load: FloatArray
@@ -157,10 +186,10 @@ class AffineArrays(RegionArrays):
                 f"along each loss, but has {counts.tolist()}; build it anew."
             )
         super().__post_init__()
-        if not 1 <= self._modes <= self.modal_stiffness.shape[1]:
+        if not 1 <= self.mode_count <= self.modal_stiffness.shape[1]:
             raise ReducedModelFileError(
                 f"A reduced model with {self.modal_stiffness.shape[1]} modal basis vectors cannot have "
-                f"{self._modes} modes; build the model anew."
+                f"{self.mode_count} modes; build the model anew."
             )
         for name in ("residual_allowance", "rounding_allowance"):
             value = getattr(self, name)
@@ -168,30 +197,75 @@ class AffineArrays(RegionArrays):
                 raise ReducedModelFileError(
                     f"The {name} of a reduced model must not be negative, but is {value!r}; build it anew."
                 )
+        for name, known in (
+            ("stiffness_factors", (len(self.parameters), len(self.regions))),
+            ("load_factors", (len(self.controls), len(self.masses))),
+        ):
+            array = getattr(self, name)
+            if array.min(initial=0) < 0 or np.any(array > known):
+                raise ReducedModelFileError(
+                    f"The array {name} of {self.what} names what is not there; build it anew."
+                )
+        if self.stiffness_factors[-1].any() or len(self.control_units.split()) != len(self.controls):
+            raise ReducedModelFileError(
+                f"The terms or units of {self.what} are not those of its names; build it anew."
+            )
 
-    @property
-    def _modes(self) -> int:
-        """Number of modes."""
-        raise NotImplementedError
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self.parameter_names.split())
 
-    def _sizes(self) -> AffineSizes:
-        """Return how many there are of what the arrays do not tell."""
-        raise NotImplementedError
+    @cached_property
+    def masses(self) -> tuple[str, ...]:
+        """Names of the free masses."""
+        return tuple(self.mass_names.split())
+
+    @cached_property
+    def controls(self) -> tuple[str, ...]:
+        """Names of the controls."""
+        return tuple(self.control_names.split())
+
+    @cached_property
+    def gauges(self) -> tuple[str, ...]:
+        """Names of the gauges."""
+        return tuple(self.gauge_names.split())
+
+    @cached_property
+    def displacements(self) -> tuple[str, ...]:
+        """Names of the displacement outputs."""
+        return tuple(self.displacement_names.split())
+
+    @cached_property
+    def accelerations(self) -> tuple[str, ...]:
+        """Names of the acceleration outputs."""
+        return tuple(self.acceleration_names.split())
+
+    @cached_property
+    def chosen(self) -> tuple[str, ...]:
+        """Names of all that can be chosen: the rows of `validity_box`."""
+        return (*self.parameters, *self.regions, *self.masses, *self.controls)
+
+    @cached_property
+    def static_count(self) -> int:
+        """Number O' of gauges and displacements."""
+        return len(self.gauges) + len(self.displacements)
 
     def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
-        n, outputs, r = (
-            self.static_stiffness.shape[-1],
-            self.static_output.shape[0],
-            self.residual_load.shape[0],
-        )
-        k, m = len(self.regions), self.modal_stiffness.shape[-1]
-        sizes, anchors = self._sizes(), int(self.dual_counts.prod())
-        terms, loads, masses = sizes.stiffness_terms, sizes.loads, sizes.masses
+        n, m, r = self.static_stiffness.shape[-1], self.modal_stiffness.shape[-1], self.residual_load.shape[0]
+        k, chosen, outputs = len(self.regions), len(self.chosen), self.static_count
+        terms, loads, masses = len(self.stiffness_factors), len(self.load_factors), len(self.masses)
+        anchors = int(self.dual_counts.prod())
         functions, factor = self.dual_output.shape[-1], (terms, terms)
         if functions:
             factor = (self.dual_residual.shape[-2], 1 + terms * functions)
         return {
-            "validity_box": (sizes.chosen, 2),
+            "nominal": (chosen,),
+            "damping": (2,),
+            "stiffness_factors": (terms, 2),
+            "load_factors": (loads, 2),
+            "followed_shapes": (len(self.followed_shapes), m),
+            "validity_box": (chosen, 2),
             "static_stiffness": (terms, n, n),
             "static_load": (loads, n),
             "static_output": (outputs, n),
@@ -207,45 +281,6 @@ class AffineArrays(RegionArrays):
             "modal_stiffness": (terms, m, m),
             "modal_mass": (1 + masses, m, m),
             "modal_load": (loads, m),
-            "modal_output": (outputs + sizes.dynamic_outputs, m),
+            "modal_output": (outputs + len(self.accelerations), m),
             "cross_mass": (1 + masses, m, n),
         }
-
-
-@dataclass(frozen=True, repr=False)
-class ReducedArrays(AffineArrays):
-    """Affine dense matrices, outputs, modal data, error bound and validity of a reduced wing.
-
-    Terms of the stiffness, T = K + 2 for K damage regions, in this order: skin (times e), the damage regions
-    (each times 1 - z of its own), everything else (times 1). Terms of the mass: structure, servos (times
-    servo mass), pitot (times pitot mass). Loads: lift at load factor 1, tip force of 1 N. Output rows: the G
-    gauges [1], then the tip displacement [m]. Other attributes: those of `AffineArrays`.
-
-    Attributes
-    ----------
-    validity_box : (K + 5, 2) ndarray
-        Least and largest value of each of `parameter_names`, SI units.
-    bound_reference : (K + 1,) ndarray
-        The values of (e, 1 - z1, ...) whose stiffness is the norm of the error bound.
-    flapwise_reference : (2, Nm) ndarray
-        Shapes that define the first and second flapwise bending, in the modal basis.
-    mode_count : int
-        Number of modes M that `modes` returns.
-    """
-
-    what = "a reduced model"
-    layout = ("format", 3)
-
-    flapwise_reference: FloatArray
-    mode_count: int
-
-    @property
-    def _modes(self) -> int:
-        return self.mode_count
-
-    def _sizes(self) -> AffineSizes:
-        k = len(self.regions)
-        return AffineSizes(k + 2, loads=2, masses=2, chosen=len(parameter_names(self.regions)))
-
-    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
-        return super()._expected_shapes() | {"flapwise_reference": (2, self.modal_stiffness.shape[-1])}

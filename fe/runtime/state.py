@@ -21,6 +21,18 @@ def region_names(count: int) -> tuple[str, ...]:
     return tuple(f"z{number}" for number in range(1, count + 1))
 
 
+WING = "uav_wing"
+"""Name of the reduced model of a wing."""
+
+LIFT, TIP_FORCE = 0, 1
+"""Numbers of the loads of a wing."""
+
+
+def wing_names(regions: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of all that can be chosen of a wing, in the order of `ReducedArrays.chosen`."""
+    return ("young_modulus_factor", *regions, "servo_mass", "pitot_mass", "load_factor", "tip_force")
+
+
 def losses_of(stiffness_loss: Mapping[str, float] | Iterable[float], regions: tuple[str, ...]) -> Losses:
     """Return one stiffness loss for each region, in their order.
 
@@ -124,6 +136,15 @@ class DigitalState:
     damping_alpha: float = 1.0735
     damping_beta: float = 7.3124e-4
     stiffness_loss: Losses = ()
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Factor and masses by the names of `wing_names`."""
+        return {
+            "young_modulus_factor": self.young_modulus_factor,
+            "servo_mass": self.servo_mass,
+            "pitot_mass": self.pitot_mass,
+        }
 
     def __post_init__(self) -> None:
         _require_positive("young_modulus_factor", self.young_modulus_factor)

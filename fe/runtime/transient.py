@@ -17,16 +17,14 @@ import numpy.typing as npt
 
 from .damping import rayleigh_damping_ratio
 from .errors import InvalidStateError
-from .reduced import ReducedModel
-from .responses import Modes, StaticResponse
-from .state import Losses
+from .reduced import ReducedModel, dense_sum
 
 FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class TransientState:
-    """All that the wing remembers between two steps.
+    """All that a structure remembers between two steps.
 
     Attributes
     ----------
@@ -34,8 +32,8 @@ class TransientState:
         Modal coordinates q [m kg^1/2].
     velocity : (M,) ndarray
         Their rates [m kg^1/2 / s].
-    load : (2,) ndarray
-        Load factor [1] and tip force [N] at this moment.
+    load : (L,) ndarray
+        Coefficients of the loads at this moment; of a wing the load factor [1] and the tip force [N].
     """
 
     displacement: FloatArray
@@ -43,34 +41,25 @@ class TransientState:
     load: FloatArray
 
     def to_list(self) -> list[float]:
-        """Return the state as 2 M + 2 plain floats; `from_list` gives it back to the last bit."""
+        """Return the state as 2 M + L plain floats; `from_list` gives it back to the last bit."""
         return [*self.displacement.tolist(), *self.velocity.tolist(), *self.load.tolist()]
 
     @classmethod
-    def from_list(cls, values: Sequence[float]) -> "TransientState":
-        """Return the state that `to_list` wrote, 2 M + 2 numbers.
+    def from_list(cls, values: Sequence[float], mode_count: int) -> "TransientState":
+        """Return the state of M modes that `to_list` wrote.
 
         Raises
         ------
         InvalidStateError
-            If the count is odd or below four, or a value is not finite.
+            If there are too few values, or one is not finite.
         """
-        if len(values) < 4 or len(values) % 2 or not all(isfinite(value) for value in values):
+        if len(values) < 2 * mode_count or not all(isfinite(value) for value in values):
             raise InvalidStateError(
-                f"A transient state needs 2 M + 2 finite numbers (M modes), but {len(values)} numbers came, "
-                f"{sum(isfinite(value) for value in values)} of them finite."
+                f"A transient state of {mode_count} modes needs at least {2 * mode_count} finite numbers, "
+                f"but {len(values)} came, {sum(isfinite(value) for value in values)} of them finite."
             )
         array = np.array(values, dtype=np.float64)
-        count = (len(values) - 2) // 2
-        return cls(array[:count], array[count:-2], array[-2:])
-
-
-class TransientResponse(NamedTuple):
-    """Outputs at one moment: `strain` (G,) dimensionless, `tip_displacement` [m], `tip_velocity` [m/s]."""
-
-    strain: FloatArray
-    tip_displacement: float
-    tip_velocity: float
+        return cls(array[:mode_count], array[mode_count : 2 * mode_count], array[2 * mode_count :])
 
 
 class Propagator(NamedTuple):
@@ -124,7 +113,7 @@ def free_propagator(angular_frequency: FloatArray, damping_ratio: FloatArray, du
 
 
 class ModalIntegrator:
-    """Transient response of the wing at one state of health and mass.
+    """Transient response of a structure at one state of health, parameters and masses.
 
     The integrator itself never changes; what changes is the `TransientState` that its methods take and give.
     When health changes, make another integrator and let it take over the state (`take_over`).
@@ -132,9 +121,11 @@ class ModalIntegrator:
     Parameters
     ----------
     model : ReducedModel
-        The wing.
-    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass, damping_alpha, damping_beta
-        As of `fe.runtime.state.DigitalState`.
+        The structure.
+    vector : (V,) ndarray
+        Values of all that can be chosen; those of the controls do not matter.
+    damping_alpha, damping_beta : float
+        Rayleigh damping [1/s], [s].
 
     Attributes
     ----------
@@ -146,82 +137,66 @@ class ModalIntegrator:
     Raises
     ------
     OutsideModelError
-        If a parameter lies outside the model's validity box.
+        If a value lies outside the model's validity box.
     InvalidStateError
         If a Rayleigh coefficient is negative or not finite.
     """
 
     def __init__(
-        self,
-        model: ReducedModel,
-        *,
-        young_modulus_factor: float,
-        stiffness_loss: Losses,
-        servo_mass: float,
-        pitot_mass: float,
-        damping_alpha: float,
-        damping_beta: float,
+        self, model: ReducedModel, vector: FloatArray, damping_alpha: float, damping_beta: float
     ) -> None:
         for name, value in (("damping_alpha", damping_alpha), ("damping_beta", damping_beta)):
             if not (isfinite(value) and value >= 0.0):
                 raise InvalidStateError(f"{name} must be zero or a positive finite number, but is {value!r}.")
         self.model = model
-        self.masses = (servo_mass, pitot_mass)
-        self.modes: Modes = model.modes(young_modulus_factor, stiffness_loss, servo_mass, pitot_mass)
+        self.modes = model.modes(vector)
         self.damping_ratio = rayleigh_damping_ratio(damping_alpha, damping_beta, self.modes.frequency)
         self._omega = 2.0 * np.pi * self.modes.frequency
-        lift = model.static_response(young_modulus_factor, stiffness_loss, 1.0, 0.0)
-        tip = model.static_response(young_modulus_factor, stiffness_loss, 0.0, 1.0)
-        self._static: tuple[StaticResponse, StaticResponse] = (lift, tip)
-        self._static_coordinates = np.stack((lift.coordinates, tip.coordinates), axis=1)
-        # outputs per unit load: (G + 1, 2)
+        static = [model.static_response(vector, load=load) for load in np.eye(len(model.load_factors))]
+        self._static_coordinates = np.stack([found.coordinates for found in static], axis=1)
+        # outputs per unit load: (O', L)
         self._static_output = np.stack(
-            (np.append(lift.strain, lift.tip_displacement), np.append(tip.strain, tip.tip_displacement)),
-            axis=1,
+            [np.append(found.strain, found.displacement) for found in static], axis=1
         )
-        self._participation = np.stack((self.modes.lift_participation, self.modes.tip_participation), axis=1)
+        self._participation = self.modes.participation.T
         self._modal_static = self._participation / self._omega[:, np.newaxis] ** 2
-        self._modal_output = np.vstack((self.modes.strain, self.modes.tip_displacement))
+        self._modal_output = self.modes.output[: model.static_count]
+        self._acceleration_output = self.modes.output[model.static_count :]
         # what the modes that are not kept contribute, at once, per unit load
         self._correction = self._static_output - self._modal_output @ self._modal_static
-        participation = self.modes.tip_participation  # also how far each mode moves the load point
-        self._load_point_correction = (
-            model.static_load[1] @ self._static_coordinates - participation @ self._modal_static
-        )
         self._cached: tuple[float, Propagator] | None = None
+        self._from_modal = self.modes.shape.T @ self.modes.mass
+        masses = model.mass_coefficients(vector)
+        self._from_static = self.modes.shape.T @ dense_sum(masses, model.cross_mass)
 
-    def static_response(self, load_factor: float, tip_force: float = 0.0) -> TransientResponse:
-        """Return the response, without velocity, after resting under a load factor [1] and tip force [N]."""
-        output = self._static_output @ np.array((load_factor, tip_force))
-        return TransientResponse(output[:-1], float(output[-1]), 0.0)
+    def at_rest(self, load: npt.ArrayLike) -> TransientState:
+        """Return the state of equilibrium under loads (L,)."""
+        acting = np.array(load, dtype=np.float64)
+        return TransientState(self._modal_static @ acting, np.zeros_like(self._omega), acting)
 
-    def at_rest(self, load_factor: float, tip_force: float = 0.0) -> TransientState:
-        """Return the state of equilibrium under a load factor [1] and tip force [N]."""
-        load = np.array((load_factor, tip_force), dtype=np.float64)
-        return TransientState(self._modal_static @ load, np.zeros_like(self._omega), load)
-
-    def released(
-        self, initial_tip_displacement: float, load_factor: float = 0.0, tip_force: float = 0.0
-    ) -> TransientState:
-        """Return the state just after a tip that was held aside by a tip force is let go.
+    def released(self, aside: float, load: npt.ArrayLike, point: int) -> TransientState:
+        """Return the state just after a structure that was held aside is let go.
 
         Parameters
         ----------
-        initial_tip_displacement : float
-            How far the holding force had moved the tip from its equilibrium under the other loads [m].
-        load_factor, tip_force : float
-            The loads that stay [1], [N].
+        aside : float
+            How far the holding force had moved the last static output, of a wing its tip, from its
+            equilibrium under the other loads [m].
+        load : (L,) array_like
+            The loads that stay.
+        point : int
+            Number of the load that held it.
         """
-        rest = self.at_rest(load_factor, tip_force)
-        holding_force = initial_tip_displacement / self._static[1].tip_displacement
+        rest = self.at_rest(load)
+        holding_force = aside / self._static_output[-1, point]
         return TransientState(
-            rest.displacement + self._modal_static[:, 1] * holding_force, rest.velocity, rest.load
+            rest.displacement + self._modal_static[:, point] * holding_force, rest.velocity, rest.load
         )
 
     def advance(self, state: TransientState, duration: float, load: npt.ArrayLike) -> TransientState:
-        """Return the state after a load that is held; exact.
+        """Return the state after loads that are held; exact for the kept modes.
 
-        If the load differs from that of `state`, it jumps at once, and the wing overshoots.
+        If the loads differ from those of `state`, they jump at once, and the structure overshoots.
 
         Parameters
         ----------
@@ -229,13 +204,13 @@ class ModalIntegrator:
             The state before.
         duration : float
             Time [s], positive.
-        load : (2,) array_like
-            Load factor [1] and tip force [N].
+        load : (L,) array_like
+            Coefficients of the loads.
 
         Raises
         ------
         InvalidStateError
-            If the duration is not positive or the load is not finite.
+            If the duration is not positive or a load is not finite.
         """
         acting = np.array(load, dtype=np.float64)
         if not (isfinite(duration) and duration > 0.0 and np.isfinite(acting).all()):
@@ -252,22 +227,35 @@ class ModalIntegrator:
             propagator.displacement_displacement * aside
             + propagator.displacement_velocity * velocity
             + static,
-            # plus zero: a wing at rest has the velocity 0, not -0
+            # plus zero: a structure at rest has the velocity 0, not -0
             propagator.velocity_displacement * aside + propagator.velocity_velocity * velocity + 0.0,
             acting,
         )
 
-    def response(self, state: TransientState) -> TransientResponse:
-        """Return the outputs at a state; the modes that are not kept follow its load at once."""
-        output = self._modal_output @ state.displacement + self._correction @ state.load
-        return TransientResponse(
-            output[:-1], float(output[-1]), float(self.modes.tip_displacement @ state.velocity)
-        )
+    def outputs(self, state: TransientState) -> FloatArray:
+        """Return gauges, displacements and accelerations (O,) at a state.
 
-    def load_point_displacement(self, state: TransientState) -> float:
-        """Return the upward displacement of the point where the tip force acts, 5 cm from the tip [m]."""
-        kept = self.modes.tip_participation @ state.displacement
-        return float(kept + self._load_point_correction @ state.load)
+        The modes that are not kept follow the loads at once; an acceleration is that of the kept modes, since
+        the others follow loads that are held without inertia.
+        """
+        settled = self._modal_output @ state.displacement + self._correction @ state.load
+        if not len(self._acceleration_output):
+            return np.asarray(settled)
+        omega = self._omega
+        acceleration = (
+            self._participation @ state.load
+            - 2.0 * self.damping_ratio * omega * state.velocity
+            - omega**2 * state.displacement
+        )
+        return np.concatenate((settled, self._acceleration_output @ acceleration))
+
+    def point_displacement(self, state: TransientState, point: int) -> float:
+        """Return the displacement along the load of a number at its point [m]."""
+        participation = self._participation[:, point]  # also how far each mode moves the point
+        correction = (
+            self.model.static_load[point] @ self._static_coordinates - participation @ self._modal_static
+        )
+        return float(participation @ state.displacement + correction @ state.load)
 
     def energy(self, state: TransientState) -> float:
         """Return kinetic plus strain energy of the kept modes about the equilibrium under the load [J].
@@ -286,11 +274,10 @@ class ModalIntegrator:
 
         `state` is in the modes of `before`, the integrator of the same model that it belongs to.
         """
-        from_modal, from_static = self.model.modal_projection(self.modes, *self.masses)
         deviation = state.displacement - before._modal_static @ state.load
         static = before._static_coordinates @ state.load
         return TransientState(
-            from_modal @ (before.modes.shape @ deviation) + from_static @ static,
-            from_modal @ (before.modes.shape @ state.velocity),
+            self._from_modal @ (before.modes.shape @ deviation) + self._from_static @ static,
+            self._from_modal @ (before.modes.shape @ state.velocity),
             state.load,
         )

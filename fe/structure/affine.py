@@ -155,6 +155,23 @@ class AffineStructure:
                 total = total + factor * (1.0 if term.mass is None else kilograms[term.mass]) * term.vector
         return total
 
+    def at(self, values: Values) -> tuple[sparse.csr_array, sparse.csr_array, FloatArray]:
+        """Stiffness [N/m], mass [kg] and the sum of all loads [N] at values by name.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Parameters, losses, free masses and controls; what is left out is nominal, and healthy.
+        """
+        parameters, losses, masses = (
+            {name: values[name] for name in names if name in values}
+            for names in (self.parameters, self.regions, self.masses)
+        )
+        load = np.zeros(self.unknowns)
+        for name, control in self.loads.items():
+            load = load + self.load(name, None if control is None else values.get(control), masses)
+        return self.stiffness(parameters, losses), self.mass(masses), load
+
     def full_displacement(self, free: FloatArray) -> FloatArray:
         """Displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""
         return np.asarray(self.expansion @ free).reshape(-1, 3)

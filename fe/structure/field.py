@@ -1,36 +1,42 @@
-"""The field of a structure as a VTU file for ParaView."""
+"""Fields as VTU files for ParaView."""
 
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fe.full.statics import Factorisation
 
-from .elements import meshio_with_wedges
+from .elements import ElementKind, meshio_with_wedges
 from .operators import Structure
 
 FloatArray = NDArray[np.float64]
 
 
-def centre_strains(structure: Structure, displacement: FloatArray) -> FloatArray:
+def centre_strains(
+    kind: ElementKind, points: FloatArray, cells: NDArray[np.int64], displacement: FloatArray
+) -> FloatArray:
     """Strains (nc, 6) xx, yy, zz, yz, xz, xy, shear as engineering strain, at the centres of the cells.
 
     Parameters
     ----------
-    structure : Structure
-        The structure.
+    kind : ElementKind
+        Of the cells.
+    points : (nodes, 3) m
+        The nodes.
+    cells : (nc, k)
+        Nodes of the cells.
     displacement : (nodes, 3) m
         Of all nodes.
     """
-    mesh = structure.mesh
-    centre = mesh.kind.places[: len(mesh.kind.corners)].mean(axis=0)
-    _, slopes = mesh.kind.shape_functions(centre[None])
-    jacobian = np.einsum("nai,aj->nij", mesh.nodes, slopes[0])
+    centre = kind.places[: len(kind.corners)].mean(axis=0)
+    _, slopes = kind.shape_functions(centre[None])
+    jacobian = np.einsum("nai,aj->nij", points[cells], slopes[0])
     along = np.einsum("ak,nki->nai", slopes[0], np.linalg.inv(jacobian))
-    gradient = np.einsum("nai,naj->nij", displacement[mesh.cells], along)
+    gradient = np.einsum("nai,naj->nij", displacement[cells], along)
     strain = gradient + gradient.transpose(0, 2, 1)
     diagonal = 0.5 * np.einsum("nii->ni", strain)
     return np.column_stack((diagonal, strain[:, 1, 2], strain[:, 0, 2], strain[:, 0, 1]))
@@ -61,34 +67,40 @@ def write_structure_vtu(
         If the file cannot be written.
     """
     given = dict(values or {})
-    parameters, losses, masses = (
-        {name: given[name] for name in names if name in given}
-        for names in (structure.parameters, structure.regions, structure.masses)
-    )
-    load = np.zeros(structure.unknowns)
-    for name, control in structure.loads.items():
-        load = load + structure.load(name, None if control is None else given.get(control), masses)
-    free = Factorisation(structure.stiffness(parameters, losses)).solve(load)
+    stiffness, _, load = structure.at(given)
+    free = Factorisation(stiffness).solve(load)
     displacement = structure.full_displacement(free)
-    loss = np.zeros(len(structure.mesh.cells))
+    mesh, loss = structure.mesh, np.zeros(len(structure.mesh.cells))
     for number, name in enumerate(structure.regions):
-        loss[structure.region_of == number] = losses.get(name, 0.0)
-    meshio = meshio_with_wedges()
-    mesh = meshio.Mesh(
-        structure.mesh.points,
-        [(structure.mesh.kind.file_type, structure.mesh.cells)],
-        point_data={"displacement": displacement},
-        cell_data={
-            "strain": [centre_strains(structure, displacement)],
-            "material": [structure.material_of + 1],
-            "region": [structure.region_of + 1],
-            "stiffness_loss": [loss],
+        loss[structure.region_of == number] = given.get(name, 0.0)
+    write_vtu(
+        path,
+        mesh.points,
+        (mesh.kind.file_type, mesh.cells),
+        {"displacement": displacement},
+        {
+            "strain": centre_strains(mesh.kind, mesh.points, mesh.cells, displacement),
+            "material": structure.material_of + 1,
+            "region": structure.region_of + 1,
+            "stiffness_loss": loss,
         },
     )
-    path = Path(path)
+
+
+def write_vtu(
+    path: Path | str,
+    points: FloatArray,
+    cells: tuple[str, NDArray[np.int64]],
+    point_data: dict[str, FloatArray],
+    cell_data: dict[str, NDArray[Any]],
+) -> None:
+    """Write a VTU file, whole or not at all; `cells` are their kind in meshio and their nodes."""
+    meshio, path = meshio_with_wedges(), Path(path)
+    values = {name: [value] for name, value in cell_data.items()}
+    mesh = meshio.Mesh(points, [cells], point_data=point_data, cell_data=values)
     try:
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            temporary = Path(folder) / "structure.vtu"
+            temporary = Path(folder) / "field.vtu"
             meshio.write(temporary, mesh, file_format="vtu")
             temporary.replace(path)
     except OSError as error:  # with the name that was asked for, not that of the temporary file

@@ -11,7 +11,7 @@ from fe.full.modes import eigenmodes
 from fe.full.operators import AffineOperators
 from fe.full.statics import Factorisation, static_outputs
 from fe.runtime.errors import CalculixError
-from fe.runtime.state import DigitalState, Losses
+from fe.runtime.state import TIP_FORCE, DigitalState, Losses
 
 from .calculix_input import INTEGRATION_POINTS, CalculixModel
 from .calculix_job import read_frequencies, read_tables, run_calculix
@@ -237,23 +237,17 @@ def ring_down_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    from fe.reduction.reduced_basis import reduce_model
+    from fe.reduction.wing_basis import reduce_model
     from fe.runtime.transient import ModalIntegrator
 
-    integrator = ModalIntegrator(
-        reduce_model(operators).model,
-        young_modulus_factor=state.young_modulus_factor,
-        stiffness_loss=state.stiffness_loss,
-        servo_mass=state.servo_mass,
-        pitot_mass=state.pitot_mass,
-        damping_alpha=state.damping_alpha,
-        damping_beta=state.damping_beta,
-    )
+    model = reduce_model(operators).model
+    vector = model.vector(state.values, state.stiffness_loss)
+    integrator = ModalIntegrator(model, vector, state.damping_alpha, state.damping_beta)
     period = 1.0 / float(integrator.modes.frequency[0])
     increment, steps = period / steps_per_period, round(periods * steps_per_period)
-    initial = integrator.static_response(0.0, TEST_FORCE).tip_displacement
-    current = integrator.released(initial)
-    same_rule = integrator.modes.tip_displacement @ _trapezoidal(
+    initial = integrator.outputs(integrator.at_rest((0.0, TEST_FORCE)))[-1]
+    current = integrator.released(initial, (0.0, 0.0), TIP_FORCE)
+    same_rule = integrator.modes.output[-1] @ _trapezoidal(
         current.displacement,
         2.0 * np.pi * integrator.modes.frequency,
         integrator.damping_ratio,
@@ -263,7 +257,7 @@ def ring_down_agreement(
     ours = np.empty(steps)
     for step in range(steps):
         current = integrator.advance(current, increment, (0.0, 0.0))
-        ours[step] = integrator.response(current).tip_displacement
+        ours[step] = integrator.outputs(current)[-1]
     text = _model(operators, state).ring_down_steps(operators.load(0.0, TEST_FORCE), increment, steps)
     tables = read_tables(run_calculix(text, folder, "ring_down"))
     theirs = np.array([table.rows[0, 2] for table in tables if table.set_name == "NPROBES"])

@@ -17,19 +17,14 @@ from skfem import ElementHexS2
 from fe.full.assembly import cell_axes, rotate_elasticity
 from fe.full.operators import ROOT_UNKNOWNS, AffineOperators, cell_density, cell_elasticity
 from fe.runtime.state import Losses
+from fe.structure.elements import HEXAHEDRA_20
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_PER_LINE = 4
+_PER_LINE, _NODES_PER_LINE = 4, 12
 _BLOCK = 0.01  # side of the block that stands for a point mass [m]
 
-_CORNERS = np.array(
-    [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=np.float64
-)
-_EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
-C3D20_NODES = np.concatenate((_CORNERS, [0.5 * (_CORNERS[a] + _CORNERS[b]) for a, b in _EDGES]))
-"""Local places (20, 3) in 0..1 of the nodes of a C3D20 element."""
 _LINE = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
 INTEGRATION_POINTS = np.array([(x, y, z) for z in _LINE for y in _LINE for x in _LINE])
 """Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
@@ -107,7 +102,7 @@ class CalculixModel:
 
     def frequency_step(self, count: int) -> str:
         """Input of the lowest undamped modes."""
-        return "\n".join([*self.definition(), "*STEP", "*FREQUENCY", str(count), "*END STEP"]) + "\n"
+        return frequency_text(self.definition(), count)
 
     def ring_down_steps(self, load: FloatArray, increment: float, steps: int) -> str:
         """Input of a static load (n,) and its sudden removal: direct integration by the trapezoidal rule.
@@ -130,17 +125,11 @@ class CalculixModel:
         return "\n".join(lines) + "\n"
 
     def _nodes_and_cells(self) -> Iterator[str]:
-        body = self.operators.discretisation
-        yield "*NODE, NSET=NALL"
-        for number, point in enumerate(body.node_points, start=1):
-            yield f"{number},{number_line(point)}"
-        yield "*ELEMENT, TYPE=C3D20, ELSET=EALL"
-        given = ElementHexS2().doflocs
-        order = [int(np.flatnonzero(np.all(np.equal(given, place), axis=1))[0]) for place in C3D20_NODES]
-        for number, nodes in enumerate(body.cell_nodes[:, order] + 1, start=1):
-            text = [str(node) for node in nodes]
-            yield f"{number},{','.join(text[:12])},"
-            yield ",".join(text[12:])
+        body, given = self.operators.discretisation, ElementHexS2().doflocs
+        order = [
+            int(np.flatnonzero(np.all(np.equal(given, place), axis=1))[0]) for place in HEXAHEDRA_20.places
+        ]
+        yield from cell_lines("C3D20", body.node_points, body.cell_nodes[:, order])
         yield "*ELSET, ELSET=EGAUGES"
         yield from (str(cell + 1) for cell in self.gauge_cells)
 
@@ -203,11 +192,8 @@ class CalculixModel:
         yield f"{reference},0.,0.,0."
         springs = (root.transverse_spring, root.flap_spring, root.yaw_spring)
         for number, spring in enumerate(springs, start=1):
-            yield f"*ELEMENT, TYPE=SPRING1, ELSET=SPRING{number}"
-            yield f"{len(self.operators.wing_mesh.cells) + number},{reference}"
-            yield f"*SPRING, ELSET=SPRING{number}"
-            yield str(number)
-            yield f"{spring:.13E}"
+            element = len(self.operators.wing_mesh.cells) + number
+            yield from spring_lines(f"SPRING{number}", element, [reference], number, spring)
         span = self.operators.wing_mesh.design.planform.semi_span
         on_root: list[int] = np.flatnonzero(np.abs(points[:, 1]) < 1e-9 * span).tolist()
         for node in on_root:
@@ -245,13 +231,7 @@ class CalculixModel:
 
     def _probe_nodes(self) -> Iterator[str]:
         first = self.node_count + 2 + 8 * len(self.operators.wing_mesh.design.point_masses)
-        probes = self.probes
-        nodes = range(first, first + (len(probes) + 2) // 3)
-        yield "*NODE, NSET=NPROBES"
-        for node in nodes:
-            yield f"{node},0.,0.,0."
-        for number, weights in enumerate(probes):
-            yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *self._terms(weights)])
+        yield from probe_lines(first, map(list, map(self._terms, self.probes)))
 
     def _terms(self, free: FloatArray) -> Iterator[tuple[int, int, float]]:
         """Yield (node, direction, value) of the values (n,) of free unknowns that are not zero."""
@@ -273,6 +253,47 @@ class CalculixModel:
 
 ORTHOTROPIC = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (5, 5), (4, 4), (3, 3))
 """Rows and columns of an elasticity in the order of CalculiX's nine orthotropic constants."""
+
+
+def frequency_text(definition: Iterable[str], count: int) -> str:
+    """Return the input of the lowest undamped modes of a model."""
+    return "\n".join([*definition, "*STEP", "*FREQUENCY", str(count), "*END STEP"]) + "\n"
+
+
+def cell_lines(kind: str, points: FloatArray, cells: IntArray) -> Iterator[str]:
+    """Yield nodes (n, 3) [m] and cells (c, k), which count nodes from 0, of a kind of CalculiX."""
+    yield "*NODE, NSET=NALL"
+    for number, point in enumerate(points, start=1):
+        yield f"{number},{number_line(point)}"
+    yield f"*ELEMENT, TYPE={kind}, ELSET=EALL"
+    for number, nodes in enumerate(cells + 1, start=1):
+        text = [str(value) for value in (number, *nodes)]
+        for start in range(0, len(text), _NODES_PER_LINE):
+            rest = "," if start + _NODES_PER_LINE < len(text) else ""
+            yield ",".join(text[start : start + _NODES_PER_LINE]) + rest
+
+
+def spring_lines(
+    name: str, element: int, nodes: Iterable[int], direction: int, stiffness: float
+) -> Iterator[str]:
+    """Yield springs [N/m] of nodes to the ground along a direction, their elements from `element` on."""
+    yield f"*ELEMENT, TYPE=SPRING1, ELSET={name}"
+    for number, node in enumerate(nodes, start=element):
+        yield f"{number},{node}"
+    yield f"*SPRING, ELSET={name}"
+    yield str(direction)
+    yield number_line([stiffness])
+
+
+def probe_lines(first: int, probes: Iterable[list[tuple[int, int, float]]]) -> Iterator[str]:
+    """Yield nodes from `first` on whose displacements are read, each of terms (node, direction, share)."""
+    found = list(probes)
+    if found:
+        yield "*NODE, NSET=NPROBES"
+    for node in range(first, first + (len(found) + 2) // 3):
+        yield f"{node},0.,0.,0."
+    for number, terms in enumerate(found):
+        yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *terms])
 
 
 def number_line(values: Iterable[float]) -> str:
@@ -311,7 +332,7 @@ def mass_block_lines(
         The first of its eight nodes, and its element, as numbers that are free.
     """
     yield "*NODE"
-    for corner, local in enumerate(C3D20_NODES[:8] * _BLOCK):
+    for corner, local in enumerate(HEXAHEDRA_20.places[:8] * _BLOCK):
         yield f"{node + corner},{number_line(place + local)}"
     yield f"*ELEMENT, TYPE=C3D8, ELSET=MASS{number}"
     yield ",".join(str(n) for n in (element, *range(node, node + 8)))

@@ -19,13 +19,21 @@ from fe.structure.elements import WEDGES_6
 from fe.structure.operators import Structure
 from fe.structure.supports import RigidSet
 
-from .calculix_input import ORTHOTROPIC, equation_lines, mass_block_lines, number_line
+from .calculix_input import (
+    ORTHOTROPIC,
+    cell_lines,
+    equation_lines,
+    frequency_text,
+    mass_block_lines,
+    number_line,
+    probe_lines,
+    spring_lines,
+)
 
 FloatArray = NDArray[np.float64]
 
 NOT_COMPARABLE = (WEDGES_6,)
 """Kinds that CalculiX integrates otherwise (C3D6 at two points)."""
-_PER_LINE = 12
 
 
 @dataclass(frozen=True)
@@ -91,28 +99,17 @@ class StructureDeck:
 
     def frequency_step(self, count: int) -> str:
         """Input of the lowest undamped modes."""
-        return "\n".join([*self._definition(), "*STEP", "*FREQUENCY", str(count), "*END STEP"]) + "\n"
+        return frequency_text(self._definition(), count)
 
     def _definition(self) -> Iterator[str]:
         yield "*HEADING"
         yield f"structure {self.structure.design_hash[:12]}"
-        yield from self._nodes_and_cells()
+        mesh = self.structure.mesh
+        yield from cell_lines(mesh.kind.calculix, mesh.points, mesh.cells)
         yield from self._materials()
         yield from self._supports()
         yield from self._masses()
         yield from self._probe_nodes()
-
-    def _nodes_and_cells(self) -> Iterator[str]:
-        mesh = self.structure.mesh
-        yield "*NODE, NSET=NALL"
-        for number, point in enumerate(mesh.points, start=1):
-            yield f"{number},{number_line(point)}"
-        yield f"*ELEMENT, TYPE={mesh.kind.calculix}, ELSET=EALL"
-        for number, nodes in enumerate(mesh.cells + 1, start=1):
-            text = [str(value) for value in (number, *nodes)]
-            for start in range(0, len(text), _PER_LINE):
-                rest = "," if start + _PER_LINE < len(text) else ""
-                yield ",".join(text[start : start + _PER_LINE]) + rest
 
     def _materials(self) -> Iterator[str]:
         structure = self.structure
@@ -141,14 +138,9 @@ class StructureDeck:
         for axis in range(3):
             values = np.where(axes == axis, held.springs, 0.0)
             for group, spring in enumerate(np.unique(values[values > 0.0])):
-                name = f"SPRING{axis}X{group}"
-                yield f"*ELEMENT, TYPE=SPRING1, ELSET={name}"
-                for unknown in np.flatnonzero(values == spring).tolist():
-                    element += 1
-                    yield f"{element},{unknown // 3 + 1}"
-                yield f"*SPRING, ELSET={name}"
-                yield str(axis + 1)
-                yield number_line([spring])
+                nodes = (np.flatnonzero(values == spring) // 3 + 1).tolist()
+                yield from spring_lines(f"SPRING{axis}X{group}", element + 1, nodes, axis + 1, spring)
+                element += len(nodes)
         for number, body in enumerate(held.rigid):
             yield from self._rigid_lines(number, body, element)
             element += int((body.springs > 0.0).sum())
@@ -164,12 +156,9 @@ class StructureDeck:
             yield "{},{}".format(*places[motion])
         for motion in np.flatnonzero(body.springs > 0.0).tolist():
             element += 1
+            node, direction = places[motion]
             name = f"RIGID{number}X{motion}"
-            yield f"*ELEMENT, TYPE=SPRING1, ELSET={name}"
-            yield f"{element},{places[motion][0]}"
-            yield f"*SPRING, ELSET={name}"
-            yield str(places[motion][1])
-            yield number_line([body.springs[motion]])
+            yield from spring_lines(name, element, [node], direction, body.springs[motion])
         for row, shares in enumerate(body.motions.tolist()):
             moved = [(*place, share) for place, share in zip(places, shares, strict=True) if share]
             yield from equation_lines([(int(body.nodes[row // 3]) + 1, row % 3 + 1, -1.0), *moved])
@@ -195,15 +184,8 @@ class StructureDeck:
             node, element = node + 8, element + 1
 
     def _probe_nodes(self) -> Iterator[str]:
-        probes = self.probes
-        if not len(probes):
-            return
         first = self._node_count + 8 * len(self.structure.design.mass) + 1
-        yield "*NODE, NSET=NPROBES"
-        for node in range(first, first + (len(probes) + 2) // 3):
-            yield f"{node},0.,0.,0."
-        for number, weights in enumerate(probes):
-            yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *self._terms(weights)])
+        yield from probe_lines(first, map(list, map(self._terms, self.probes)))
 
     def _load_lines(self, load: Load) -> Iterator[str]:
         structure, mesh = self.structure, self.structure.mesh

@@ -14,8 +14,7 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError
-from fe.runtime.reduced_arrays import parameter_names
-from fe.runtime.state import MOST_REGIONS, Geometry, region_names
+from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
@@ -43,7 +42,7 @@ SHIPPED_DESIGN = Path(__file__).parents[1] / "designs" / "uav_wing.toml"
 """The design of the wing of Kapteyn et al. 2021."""
 
 
-TAKEN_NAMES = frozenset((*parameter_names(()), "skin", "webs", "ribs"))
+TAKEN_NAMES = frozenset((*wing_names(()), "skin", "webs", "ribs"))
 """Names that mean something else where the names of damage regions stand."""
 
 

@@ -2,8 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -21,7 +20,6 @@ from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable, Unit
 
 from . import damage_growth, strain_gauges
 
-_OWN_FILES = ("slave.py", "table.py")
 _STATUS = tuple(enumeration for enumeration in ENUMERATIONS if enumeration.name == "Status")
 _UNITS = (
     Unit("1", (), (("microstrain", 1e6), ("%", 100.0))),
@@ -29,41 +27,22 @@ _UNITS = (
     Unit("1/s", (("s", -1),), (("microstrain/s", 1e6),)),
 )
 
-_IMPORTS = """from functools import partial
+_IMPORTS = """import json
 
 from .companions import {name} as companion
-from .companions.slave import CompanionSlave as _Slave
-from .companions.slave import contents_of
+from .slaves.base import Contents
 
-load_contents = partial(contents_of, companion)
+
+def load_contents(resources):
+    \"\"\"Return what the setting that was packed describes.\"\"\"
+    setting = json.loads((resources / "setting.json").read_text(encoding="utf-8"))
+    return Contents(companion.variable_table(setting), lambda: companion.behaviour(setting))
+
 """
 
 
-@dataclass(frozen=True)
-class Companion:
-    """A kind of FMU that is built here.
-
-    Attributes
-    ----------
-    name : str
-        Also the name of its file in this package.
-    description : str
-        One sentence.
-    variable_table, dependencies : callable
-        Take the setting; return the table, and the direct dependencies of the outputs.
-    """
-
-    name: str
-    description: str
-    variable_table: Callable[[Mapping[str, Any]], tuple[FmuVariable, ...]]
-    dependencies: Callable[[Mapping[str, Any]], dict[str, list[str]]]
-
-
-COMPANIONS = {
-    module.NAME: Companion(module.NAME, module.DESCRIPTION, module.variable_table, module.dependencies)
-    for module in (damage_growth, strain_gauges)
-}
-"""What can be built, by name."""
+COMPANIONS: Mapping[str, Any] = {module.NAME: module for module in (damage_growth, strain_gauges)}
+"""What can be built, by name: a file of this folder with a table, dependencies and a behaviour."""
 
 
 def build_companion(
@@ -120,18 +99,16 @@ def companion_bytes(
     return sealed(_members(companion, table, setting))
 
 
-def _members(
-    companion: Companion, table: tuple[FmuVariable, ...], setting: Mapping[str, Any]
-) -> dict[str, bytes]:
+def _members(companion: Any, table: tuple[FmuVariable, ...], setting: Mapping[str, Any]) -> dict[str, bytes]:
     """Return the files of the archive, with the placeholder wherever the content hash will stand."""
     own = files("fmu_asset.companions")
-    folder = f"resources/{companion.name}_{PLACEHOLDER}_runtime/companions"
+    folder = f"resources/{companion.NAME}_{PLACEHOLDER}_runtime/companions"
     members = python_members(
-        companion.name,
+        companion.NAME,
         "Companion",
-        imports=_IMPORTS.format(name=companion.name),
+        imports=_IMPORTS.format(name=companion.NAME),
         table=table,
-        description=companion.description,
+        description=companion.DESCRIPTION,
         resources={"setting.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode()},
         units=_UNITS,
         enumerations=_STATUS,
@@ -139,6 +116,5 @@ def _members(
         host="It runs in any Python host; the standard library is enough.",
     )
     members[f"{folder}/__init__.py"] = b'"""What the FMU does."""\n'
-    for name in (*_OWN_FILES, f"{companion.name}.py"):
-        members[f"{folder}/{name}"] = (own / name).read_bytes()
+    members[f"{folder}/{companion.NAME}.py"] = (own / f"{companion.NAME}.py").read_bytes()
     return members

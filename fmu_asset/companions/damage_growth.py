@@ -22,9 +22,8 @@ import random
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..slaves.variables import FmuVariable
-from .slave import Behaviour
-from .table import Table
+from ..slaves.base import Behaviour
+from ..slaves.variables import FmuVariable, Table
 
 NAME = "damage_growth"
 DESCRIPTION = "Growth of the stiffness losses of two regions: by script, with the load factor, and by chance."

@@ -16,9 +16,8 @@ import random
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..slaves.variables import FmuVariable
-from .slave import Behaviour
-from .table import Table
+from ..slaves.base import Behaviour
+from ..slaves.variables import FmuVariable, Table
 
 NAME = "strain_gauges"
 DESCRIPTION = "Strain gauges with gain, offset, drift, Gaussian noise and dropout."

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fe.runtime.reduced_arrays import AffineArrays, ReducedArrays
-from fe.runtime.structure_arrays import StructureArrays
+from fe.runtime.reduced_arrays import ReducedArrays
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -20,46 +19,35 @@ NAME_BYTES = 32
 _COUNT = struct.Struct("<II")
 
 
-def data_file_bytes(model: ReducedArrays | StructureArrays) -> bytes:
+_UNUSED = ("nominal", "damping", "validity_box", "followed_shapes")
+"""What the sources take from the variables, or do not need."""
+
+
+def data_file_bytes(model: ReducedArrays) -> bytes:
     """Return the content of the data file of a model; equal models give equal bytes.
 
     Parameters
     ----------
-    model : ReducedArrays or StructureArrays
-        The reduced wing or structure. The arrays of `AffineArrays` are written under their names, and what
-        their terms are times as `StructureArrays` has it; scalars as arrays without dimension. Arrays without
-        values are left out, and so is the validity box, whose ranges are those of the variables.
+    model : ReducedArrays
+        The reduced structure. Its arrays are written under their names, scalars as arrays without dimension,
+        and how many of each kind can be chosen in the place of names; arrays without values are left out.
 
     Returns
     -------
     bytes
         Magic, version, arrays, CRC-32.
     """
-    arrays = {}
-    numbers = [item.name for item in fields(AffineArrays) if item.name != "validity_box"]
-    for name, value in ({name: getattr(model, name) for name in numbers} | _composition(model)).items():
-        if not isinstance(value, str) and np.size(value):
-            arrays[name] = np.asarray(value, dtype=np.float64)
-    return pack_arrays(arrays)
-
-
-def _composition(model: ReducedArrays | StructureArrays) -> dict[str, Any]:
-    """Return how many of each kind can be chosen, what the terms are times, and what the outputs are."""
-    regions = len(model.regions)
-    if isinstance(model, StructureArrays):
-        counts = (len(model.parameters), regions, len(model.masses), len(model.controls))
-        gauges, stiffness, load = len(model.gauges), model.stiffness_factors, model.load_factors
-    else:  # e; servo and pitot mass; load factor and tip force
-        counts, gauges = (1, regions, 2, 2), len(model.static_output) - 1
-        stiffness = np.array([(1, 0), *((0, region) for region in range(1, regions + 1)), (0, 0)])
-        load = np.array([(1, 0), (2, 0)])
-    return {
-        "chosen_counts": counts,
-        "gauge_count": gauges,
-        "mode_count": model.mode_count,
-        "stiffness_factors": stiffness,
-        "load_factors": load,
+    values: dict[str, Any] = {item.name: getattr(model, item.name) for item in fields(ReducedArrays)}
+    values["chosen_counts"] = tuple(
+        len(names) for names in (model.parameters, model.regions, model.masses, model.controls)
+    )
+    values["gauge_count"] = len(model.gauges)
+    arrays = {
+        name: np.asarray(value, dtype=np.float64)
+        for name, value in values.items()
+        if name not in _UNUSED and not isinstance(value, str) and np.size(value)
     }
+    return pack_arrays(arrays)
 
 
 def pack_arrays(arrays: Mapping[str, FloatArray]) -> bytes:

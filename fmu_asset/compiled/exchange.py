@@ -48,12 +48,6 @@ def exchange_table(
                 causality="local",
                 variability="continuous",
                 description=f"Derivative of: {text}" if name.startswith("der(") else text,
-                unit=None,
-                display_unit=None,
-                minimum=None,
-                maximum=None,
-                start=None,
-                enumeration=None,
             )
         )
     return tuple(rows)

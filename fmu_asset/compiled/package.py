@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Literal
 
 from fe.runtime.reduced_arrays import ReducedArrays
-from fe.runtime.structure_arrays import StructureArrays
 from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
 from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface
+from fmu_asset.slaves.table import Roles
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .arrays import arrays_of
@@ -20,7 +20,7 @@ from .compiler import PLATFORM, Platform, compile_library
 from .data_file import data_file_bytes
 from .description3 import build_description, model_description3
 from .exchange import exchange_table
-from .variable_header import Roles, variable_sources
+from .variable_header import variable_sources
 
 DATA_FILE = "resources/reduced_model.bin"
 
@@ -48,26 +48,19 @@ _TIME = FmuVariable(
     variability="continuous",
     description="Time",
     unit="s",
-    display_unit=None,
-    minimum=None,
-    maximum=None,
-    start=None,
-    enumeration=None,
 )
 
 HOST = "It is compiled C and needs nothing but the C library; its sources are inside."
 
 
 def compiled_members(
-    model: ReducedArrays | StructureArrays,
+    model: ReducedArrays,
     table: Sequence[FmuVariable],
     roles: Roles,
     *,
     units: Sequence[Unit] = UNITS,
     model_name: str,
-    identifier: str,
-    guid: str,
-    content_tag: str,
+    placeholder: str,
     description: str,
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
@@ -76,18 +69,18 @@ def compiled_members(
 
     Parameters
     ----------
-    model : ReducedArrays or StructureArrays
-        The reduced wing or structure.
+    model : ReducedArrays
+        The reduced structure.
     table : sequence of FmuVariable
         The variables, in order of their value reference.
     roles : Roles
         Which of them is what.
     units : sequence of Unit
         Units of the table.
-    model_name, identifier : str
-        Model name and model identifier.
-    guid, content_tag : str
-        GUID, and the mark of saved states; placeholders, as long as the content is not known.
+    model_name : str
+        Model name, with which the model identifier begins.
+    placeholder : str
+        Stands for the GUID, the end of the identifier and the mark of saved states.
     description : str
         One sentence for people.
     fmi : {2, 3}
@@ -106,13 +99,13 @@ def compiled_members(
     FmuBuildError
         If fmpy's headers are missing.
     """
-    sources = _sources(fmi)
+    sources, identifier = _sources(fmi), f"{model_name}_{placeholder}"
     if interface == "model-exchange":
         table = exchange_table(table, model.mode_count, arrays=fmi == 3)
     if fmi == 3:
         table = (*table, replace(_TIME, reference=len(table)))
     arrays = arrays_of(table) if fmi == 3 else ()
-    made = variable_sources(table, roles, guid=guid, content_tag=content_tag, arrays=arrays)
+    made = variable_sources(table, roles, guid=placeholder, content_tag=placeholder, arrays=arrays)
     sources |= {name: text.encode() for name, text in made.items()}
     listed = sorted(name for name in sources if name.endswith(".c"))
     sources["CMakeLists.txt"] = _cmake_lists(identifier, listed, fmi)
@@ -121,7 +114,7 @@ def compiled_members(
         model_description_text = model_description3(
             model_name=model_name,
             identifier=identifier,
-            guid=guid,
+            guid=placeholder,
             table=table,
             arrays=arrays,
             units=units,
@@ -132,7 +125,7 @@ def compiled_members(
         model_description_text = model_description(
             model_name=model_name,
             identifier=identifier,
-            guid=guid,
+            guid=placeholder,
             table=table,
             units=units,
             description=description,

@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 from fmu_asset.description import LOG_CATEGORIES
+from fmu_asset.slaves.table import Roles
 from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable
 
 from .arrays import ArrayVariable
@@ -43,32 +43,6 @@ extern const unsigned int structure_time_place;
 
 #endif
 """
-
-
-@dataclass(frozen=True)
-class Roles:
-    """Which variables of a table are what; the outputs of the model come first among the outputs.
-
-    Attributes
-    ----------
-    chosen : tuple of str
-        Names of all that can be chosen, in the order of the model: parameters, losses, masses, controls.
-    outputs : int
-        Number of strains, displacements and accelerations.
-    displacement_bound : str or None
-        The bound of the displacements, where it is an output.
-    point_load : int
-        Index of the load that holds the structure aside before a release, and whose point may be an output.
-    release, load_point : str or None
-        The parameter that says how far it is held aside, and the displacement of that point.
-    """
-
-    chosen: tuple[str, ...]
-    outputs: int
-    displacement_bound: str | None = None
-    point_load: int = 0
-    release: str | None = None
-    load_point: str | None = None
 
 
 def variable_sources(

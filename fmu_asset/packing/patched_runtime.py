@@ -12,28 +12,14 @@ from fe.runtime.patched_steps import PatchedSteps
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.sensor_stream import needs_structure
-from fe.runtime.state import DigitalState
 from fmu_asset.errors import PatchFileError
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of
 from fmu_asset.slaves.patched_behaviour import PatchedBehaviour
+from fmu_asset.slaves.table import structure_table
 
 from .patch_file import Effect
 
-_STATE = DigitalState()
-PLAIN_STATE: dict[str, Any] = {
-    "young_modulus_factor": _STATE.young_modulus_factor,
-    "stiffness_loss": _STATE.stiffness_loss,
-    "servo_mass": _STATE.servo_mass,
-    "pitot_mass": _STATE.pitot_mass,
-    "damping_alpha": _STATE.damping_alpha,
-    "damping_beta": _STATE.damping_beta,
-}
-"""The healthy wing, on which a patch is tried when it is packed."""
-
 ARRAYS_FILE = "resources/patch_arrays.npz"
-
-MODE_COUNT = 6
-"""Number of modes of which frequency and damping ratio are outputs, if the model has as many."""
 
 
 def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
@@ -77,7 +63,7 @@ def patched_members(
         if arrays is None:
             raise PatchFileError(
                 "The patch changes structure or loads, for which the FMU needs the wing in the basis for "
-                "patches: give `arrays`, as `fe.reduction.patch_cache.patch_arrays` returns them."
+                "patches: give `arrays`, as `fe.reduction.model_cache.patch_arrays` returns them."
             )
         _check_arrays(model, arrays, patch)
         if not len(patch.of(LocalStiffnessLoss)):
@@ -98,7 +84,8 @@ def _check_arrays(model: ReducedModel, arrays: PatchArrays, patch: ModelPatch) -
             f"{model.design_hash[:12]}; make both of one design."
         )
     try:
-        steps = PatchedSteps(model, PatchedWing(arrays), **PLAIN_STATE, patch=patch)
+        alpha, beta = model.damping.tolist()
+        steps = PatchedSteps(model, PatchedWing(arrays), model.nominal, damping=(alpha, beta), patch=patch)
         steps.modal_data()
     except FiniteElementError as cause:
         raise PatchFileError(f"The wing cannot carry the patch: {cause}") from cause
@@ -128,8 +115,8 @@ def patched_behaviour(
     steps : callable or None
         Makes the `PatchedSteps`; needed for effects of structure and loads.
     """
-    channels = output_channels(model.gauge_count)
-    return PatchedBehaviour(model, min(MODE_COUNT, model.mode_count), effects, channels, steps)
+    table, roles = structure_table(model, {})
+    return PatchedBehaviour(model, table, roles, effects, output_channels(model.gauge_count), steps)
 
 
 def effect_values(effects: Sequence[Mapping[str, Any]], *, active: bool) -> dict[str, float]:

@@ -25,6 +25,7 @@ _ENTRY = '''"""Joins the slave, its contents and pythonfmu's base class."""
 import ctypes
 
 from .pythonfmu.fmi2slave import Fmi2Slave
+from .slaves.base import Slave as _Slave
 {imports}
 
 __all__ = ["Fmi2Slave", "Slave", "keep_alive"]
@@ -71,7 +72,7 @@ def python_members(
     name, class_name : str
         Of the model, and of the class in the FMU's script, to which the tag is added.
     imports : str
-        Lines that import `_Slave` and `load_contents` into the runtime's package.
+        Lines that import `load_contents` into the runtime's package.
     table, description, units, enumerations, dependencies
         As of `fmu_asset.description.model_description`.
     resources : mapping of str to bytes

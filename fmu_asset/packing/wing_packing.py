@@ -1,22 +1,18 @@
 """The one way from a wing design to its FMU: reduced, tailored to a calibration, with missing effects."""
 
 import os
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from collections.abc import Mapping
+from typing import Protocol, Unpack
 
-from fe.reduction.model_cache import reduced_model
-from fe.reduction.patch_cache import patch_arrays
+from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
-from fmu_asset.compiled.compiler import PLATFORM, Platform
-from fmu_asset.compiled.package import FmiVersion
-from fmu_asset.instances.plan import Interface
 from reporting.progress import Progress, SilentProgress
 
 from .contents import FmuInfo
 from .patch_file import PatchFile
-from .wing_fmu import FmuKind, build_fmu
+from .structure_fmu import FmuOptions, build_fmu
 
 
 class Tailoring(Protocol):
@@ -40,14 +36,9 @@ def pack_wing(
     path: str | os.PathLike[str],
     *,
     tailoring: Tailoring | None = None,
-    kind: FmuKind = "python",
-    patch: PatchFile | None = None,
-    activate: bool = False,
-    fmi: FmiVersion = 2,
-    interface: Interface = "co-simulation",
-    platforms: Sequence[Platform] = (PLATFORM,),
     replace: bool = False,
     progress: Progress | None = None,
+    **options: Unpack[FmuOptions],
 ) -> FmuInfo:
     """Reduce a wing design and pack it as an FMU; equal input gives equal bytes.
 
@@ -59,8 +50,8 @@ def pack_wing(
         Where to write, with the suffix .fmu.
     tailoring : Tailoring, optional
         The calibration: the FMU starts at its means and carries its record.
-    kind, patch, activate, fmi, interface, platforms, replace
-        See `fmu_asset.packing.wing_fmu.build_fmu`.
+    replace, **options
+        See `fmu_asset.packing.structure_fmu.build_fmu`.
     progress : Progress, optional
         Shows what takes long.
 
@@ -69,24 +60,14 @@ def pack_wing(
     FiniteElementError
         The design cannot be modelled.
     FmuBuildError, PatchFileError
-        See `fmu_asset.packing.wing_fmu.build_fmu`.
+        See `fmu_asset.packing.structure_fmu.build_fmu`.
     """
     progress = progress or SilentProgress()
-    return build_fmu(
-        reduced_model(design, progress=progress),
-        path,
-        state=None if tailoring is None else tailoring.state,
-        note="" if tailoring is None else tailoring.note,
-        resources=None if tailoring is None else tailoring.resources,
-        kind=kind,
-        patch=patch,
-        activate=activate,
-        arrays=arrays_for(design, patch, progress),
-        fmi=fmi,
-        interface=interface,
-        platforms=platforms,
-        replace=replace,
-    )
+    model = reduced_model(design, progress=progress)
+    options["arrays"] = arrays_for(design, options.get("patch"), progress)
+    if tailoring is not None:
+        options |= {"state": tailoring.state, "note": tailoring.note, "resources": tailoring.resources}
+    return build_fmu(model, path, replace=replace, **options)
 
 
 def arrays_for(

@@ -1,8 +1,9 @@
-"""What every FMI slave that is packed here does alike: phases, refusals, log and the bytes of a state.
+"""The FMI slave of all FMUs that are packed here: phases, values, refusals, log and the bytes of a state.
 
-This file is copied into the FMUs: standard library and relative imports only. Nothing here raises, because an
-exception that reaches the FMI wrapper of pythonfmu is fatal to the instance: whatever cannot be done is
-logged, named by the output `status`, and leaves the state and the outputs as they were.
+What an FMU does is told by a table of variables and a behaviour. This file is copied into the FMUs: standard
+library and relative imports only. Nothing here raises, because an exception that reaches the FMI wrapper of
+pythonfmu is fatal to the instance: whatever cannot be done is logged, named by the output `status`, and
+leaves the state and the outputs as they were.
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ from __future__ import annotations
 import math
 import struct
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 from .variables import (
     STATUS_BAD_CALL,
@@ -20,6 +21,7 @@ from .variables import (
     STATUS_BAD_STEP,
     STATUS_INTERNAL,
     STATUS_NOT_FINITE,
+    STATUS_OK,
     STATUS_OUTSIDE_RANGE,
     FmuVariable,
 )
@@ -28,6 +30,7 @@ INSTANTIATED, INITIALISING, READY, REFUSED, TERMINATED = range(5)
 """Phases of an instance; REFUSED is an initialisation that was not accepted."""
 
 _DISCARD, _ERROR = 2, 3
+_MAGIC = b"UAVSLAV2"
 _HEADER = struct.Struct("<8s16sI")
 _WHY = {
     INSTANTIATED: "before initialisation",
@@ -35,13 +38,51 @@ _WHY = {
     REFUSED: "after an initialisation that was refused",
     TERMINATED: "after termination",
 }
+_KINDS = {"Real": ("Real",), "Integer": ("Integer", "Enumeration"), "Boolean": ("Boolean",)}
+
+
+class UnacceptableValuesError(ValueError):
+    """The values lie in their ranges, but the asset cannot have them; one sentence with its full stop."""
+
+
+class Behaviour(Protocol):
+    """What an FMU does; a call either completes or raises and leaves everything as it was.
+
+    Outputs are the first of the table, in order; Booleans are 0 or 1. `parameters` are those of the table by
+    name.
+    """
+
+    def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> Sequence[float]:
+        """Begin at a time [s] and return the outputs."""
+
+    def advance(self, time: float, duration: float, inputs: Sequence[float]) -> Sequence[float]:
+        """Advance by one step with the inputs held and return the outputs at its end."""
+
+    def state(self) -> list[float]:
+        """Return all that is remembered, without the parameters."""
+
+    def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
+        """Take back what `state` returned."""
 
 
 class Contents(NamedTuple):
-    """What the FMU's resources hold: the table of variables and how to make a fresh behaviour."""
+    """What the FMU's resources hold.
+
+    Attributes
+    ----------
+    table : tuple of FmuVariable
+        Inputs, parameters and outputs, in this order; one output is `status`. Tunable parameters and further
+        inputs may follow at its end: the behaviour is told of them by `tune(values by name, start time)`.
+    make_behaviour : callable
+        Makes a fresh `Behaviour`.
+    later : tuple of slice
+        Outputs that are computed when somebody reads them, since most masters do not: groups of rows that
+        follow one another, of which the behaviour's `later(number)` returns the values.
+    """
 
     table: tuple[FmuVariable, ...]
     make_behaviour: Callable[[], Any]
+    later: tuple[slice, ...] = ()
 
 
 class LogMessage(NamedTuple):
@@ -52,11 +93,8 @@ class LogMessage(NamedTuple):
     msg: str
 
 
-class BaseSlave:
-    """FMI co-simulation slave without physics; the build joins a subclass of it with pythonfmu's `Fmi2Slave`.
-
-    The table begins with inputs, parameters and outputs, in this order; one output is `status`. A subclass
-    says what initialisation and a step are, how values are set and read, and what a state holds.
+class Slave:
+    """FMI co-simulation slave; the build joins a subclass of it with pythonfmu's `Fmi2Slave`.
 
     Class attributes
     ----------------
@@ -64,13 +102,10 @@ class BaseSlave:
         The content hash of the FMU; a state that was saved by another FMU is refused.
     load_contents : static method
         Takes the folder of resources and returns `Contents`.
-    state_magic : bytes
-        Eight bytes that begin a state of this kind of FMU.
     """
 
     content_tag: ClassVar[str] = ""
     load_contents: ClassVar[staticmethod[[Path], Contents]]
-    state_magic: ClassVar[bytes]
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -86,10 +121,17 @@ class BaseSlave:
         self._high = [math.inf if row.maximum is None else row.maximum for row in self._table]
         self._values = [0.0 if row.start is None else float(row.start) for row in self._table]
         causalities = [row.causality for row in self._table]
-        # A table may end with rows of effects, which can be inputs too.
         self._input_count = next(n for n, causality in enumerate(causalities) if causality != "input")
+        self._inputs = list(range(self._input_count))
         self._first_output = causalities.index("output")
+        self._end = len(causalities) - causalities[::-1].index("output")
+        self._tuned = {row.name: row.reference for row in self._table[self._end :]}
         self._status = next(row.reference for row in self._table if row.name == "status")
+        self._later = contents.later
+        self._pending = [True] * len(self._later)
+        self._stale = True
+        # what was read last, the slice that it is, and the groups of later outputs in it
+        self._read: tuple[list[int], slice | None, list[int]] = ([], None, [])
         self._phase = INSTANTIATED
         self._time = self._start_time = 0.0
 
@@ -122,18 +164,44 @@ class BaseSlave:
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Advance by one communication step, the inputs held; False (fmi2Discard) means nothing changed."""
+        consequence = "the step was refused and the state is as it was"
         try:
-            return self._may_step(current_time, step_size) and self._step(current_time, step_size)
+            if not self._may_step(current_time, step_size):
+                return False
+            if not self._acceptable(self._input_count, consequence):
+                return False
+            inputs = self._values[: self._input_count]
+            outputs = self._behaviour.advance(current_time, step_size, inputs)
+        except UnacceptableValuesError as error:
+            return self._refuse(STATUS_OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
             return self._refuse(STATUS_INTERNAL, f"the step from t = {current_time:g} s failed: {error!r}")
+        self._time = current_time + step_size
+        return self._accept(outputs)
 
     def _initialise(self) -> bool:
-        """Find the initial state; False, after a refusal, if there is none."""
-        raise NotImplementedError
+        consequence = "the initialisation was refused"
+        try:
+            if not self._acceptable(self._first_output, consequence):
+                return False
+            inputs = self._values[: self._input_count]
+            outputs = self._behaviour.start(self._parameters(self._values), self._time, inputs)
+        except UnacceptableValuesError as error:
+            return self._refuse(STATUS_OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
+        except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
+            return self._refuse(STATUS_INTERNAL, f"the initialisation failed: {error!r}")
+        return self._accept(outputs)
 
-    def _step(self, current_time: float, step_size: float) -> bool:
-        """Make a step that begins where the instance stands; False, after a refusal, if it is not made."""
-        raise NotImplementedError
+    def _acceptable(self, last: int, consequence: str) -> bool:
+        """Whether the first rows and those to be tuned lie in their ranges; the latter are handed on."""
+        if not self._in_range(0, last, consequence):
+            return False
+        if self._tuned:
+            if not self._in_range(self._end, len(self._values), consequence):
+                return False
+            values = {name: self._values[reference] for name, reference in self._tuned.items()}
+            self._behaviour.tune(values, self._start_time)
+        return True
 
     def _may_step(self, current_time: float, step_size: float) -> bool:
         if self._phase != READY:
@@ -151,7 +219,91 @@ class BaseSlave:
             )
         return True
 
+    def _parameters(self, values: Sequence[float]) -> dict[str, float]:
+        return {row.name: values[row.reference] for row in self._table if row.causality == "parameter"}
+
+    def _accept(self, outputs: Sequence[float]) -> bool:
+        self._values[self._first_output : self._first_output + len(outputs)] = outputs
+        self._values[self._status] = STATUS_OK
+        self._stale = False
+        self._pending = [True] * len(self._later)
+        return True
+
     # ------------------------------------------------------------------ values
+
+    def set_real(self, vrs: Sequence[int], values: Sequence[float]) -> None:
+        """Set inputs and tunable parameters at any time, others before the end of initialisation."""
+        if vrs == self._inputs:  # all inputs in their order, as most masters send them
+            self._values[: self._input_count] = values
+            self._stale = True
+        else:
+            self._set("Real", vrs, values)
+
+    def set_integer(self, vrs: Sequence[int], values: Sequence[int]) -> None:
+        """Set integers and enumerations, as `set_real`."""
+        self._set("Integer", vrs, values)
+
+    def set_boolean(self, vrs: Sequence[int], values: Sequence[bool]) -> None:
+        """Set Booleans, as `set_real`."""
+        self._set("Boolean", vrs, values)
+
+    def _set(self, kind: str, vrs: Sequence[int], values: Sequence[float]) -> None:
+        for vr, value in zip(vrs, values, strict=True):
+            row = self._table[vr] if 0 <= vr < len(self._table) else None
+            if row is None or row.causality == "output" or row.kind not in _KINDS[kind]:
+                name = "an unknown variable" if row is None else row.name
+                self._refuse(STATUS_BAD_CALL, f"{name} (value reference {vr}) cannot be set as {kind}")
+            elif row.variability == "fixed" and self._phase in (READY, TERMINATED):
+                self._refuse(
+                    STATUS_BAD_CALL,
+                    f"{row.name} is a fixed parameter and can be set only before the first step",
+                )
+            else:
+                self._values[vr] = float(value)
+                self._stale = True
+
+    def get_real(self, vrs: Sequence[int]) -> list[float]:
+        """Return values; some outputs are computed when they are asked for."""
+        references, part, groups = self._read
+        if vrs != references:
+            references = list(vrs)
+            unknown = [vr for vr in references if not 0 <= vr < len(self._values)]
+            if unknown:
+                self._refuse(STATUS_BAD_CALL, f"there is no value reference {unknown[0]}")
+                return [math.nan] * len(references)
+            first, last = (references[0], references[-1]) if references else (0, -1)
+            part = slice(first, last + 1) if references == list(range(first, last + 1)) else None
+            groups = [
+                number
+                for number, rows in enumerate(self._later)
+                if any(rows.start <= vr < rows.stop for vr in references)
+            ]
+            self._read = references, part, groups
+        if self._stale and self._phase == INITIALISING:
+            self._initialise()
+        if groups and self._phase not in (INSTANTIATED, REFUSED):
+            self._complete(groups)
+        return self._values[part] if part else [self._values[vr] for vr in references]
+
+    def _complete(self, groups: Sequence[int]) -> None:
+        """Compute groups of outputs that are asked for and not known yet."""
+        for number in groups:
+            if self._pending[number]:
+                part = self._later[number]
+                try:
+                    self._values[part] = self._behaviour.later(number)
+                    self._pending[number] = False
+                except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
+                    self._refuse(STATUS_INTERNAL, f"values could not be read: {error!r}")
+                    self._values[part] = [math.nan] * (part.stop - part.start)
+
+    def get_integer(self, vrs: Sequence[int]) -> list[int]:
+        """Return integers and enumerations."""
+        return [int(value) if value - value == 0.0 else 0 for value in self.get_real(vrs)]
+
+    def get_boolean(self, vrs: Sequence[int]) -> list[bool]:
+        """Return Booleans."""
+        return [value != 0.0 for value in self.get_real(vrs)]
 
     def set_string(self, vrs: Sequence[int], values: Sequence[str]) -> None:
         """Refuse: there are no String variables."""
@@ -165,17 +317,34 @@ class BaseSlave:
 
     # ------------------------------------------------------------------ state
 
-    def _packed(self, body: Sequence[float]) -> bytes:
-        """Return the numbers of a state as bytes, which name the FMU."""
+    def _get_fmu_state(self) -> bytes:
+        """Return everything that the future depends on, and every value that can be read, as bytes."""
+        flags = (self._stale, *self._pending)
+        head = (float(self._phase), self._time, self._start_time, *map(float, flags))
+        body = [*head, *map(float, self._values), *self._behaviour.state()]
         tag = self.content_tag.encode("ascii")[:16].ljust(16, b"\0")
-        return _HEADER.pack(self.state_magic, tag, len(body)) + struct.pack(f"<{len(body)}d", *body)
+        return _HEADER.pack(_MAGIC, tag, len(body)) + struct.pack(f"<{len(body)}d", *body)
+
+    def _set_fmu_state(self, state: object) -> None:
+        """Restore what `_get_fmu_state` returned; anything else is refused."""
+        count, flags = len(self._values), 4 + len(self._later)
+        try:
+            body = self._unpacked(state)
+            values = body[flags : flags + count]
+            self._behaviour.restore(self._parameters(values), body[flags + count :])
+        except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
+            self._refuse(STATUS_BAD_STATE, f"the FMU state was not restored: {error}")
+            return
+        self._phase, self._time, self._start_time = int(body[0]), body[1], body[2]
+        self._stale, *self._pending = (flag != 0.0 for flag in body[3:flags])
+        self._values[:] = values
 
     def _unpacked(self, state: object) -> tuple[float, ...]:
         """Return the numbers of a state; raises `ValueError` for one of another FMU or a damaged one."""
         if not isinstance(state, bytes) or len(state) < _HEADER.size:
             raise ValueError("it is not a state of this kind of FMU")
         magic, tag, count = _HEADER.unpack_from(state)
-        if magic != self.state_magic or len(state) < _HEADER.size + 8 * count:
+        if magic != _MAGIC or len(state) < _HEADER.size + 8 * count:
             raise ValueError("it is damaged or not a state of this kind of FMU")
         if tag.rstrip(b"\0").decode("ascii", "replace") != self.content_tag:
             raise ValueError("it was saved by an FMU with other content")

@@ -1,202 +1,155 @@
-"""What the wing does in one communication step: the steady turn, or the modes integrated in time.
+"""What a structure does in one communication step: static equilibrium, or its modes integrated in time.
 
-This file is copied into the FMU, where `fe.runtime` is the folder `fe` beside it.
+Copied into the FMU, where `fe.runtime` is the folder `fe` beside it; `structure_behaviour.c` does the same.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from fe.runtime.damping import rayleigh_damping_ratio
-from fe.runtime.reduced import ReducedModel
+from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 
-from .variables import TRANSIENT
+from .table import MODE_COUNT, Roles
+from .variables import TRANSIENT, FmuVariable
+
+FloatArray = npt.NDArray[np.float64]
+
+BOUND, POINT_OR_BOUND, MODES = range(3)
+"""Groups of outputs that are computed when they are read."""
 
 
-class UnacceptableEffectError(ValueError):
-    """The values of missing effects are none that the wing can have; one sentence with its full stop."""
+def later_outputs(table: Sequence[FmuVariable], roles: Roles) -> tuple[slice, ...]:
+    """Return the rows of the groups `BOUND`, `POINT_OR_BOUND` and `MODES`."""
+    reference = {row.name: row.reference for row in table}
+    other = reference[roles.load_point or roles.displacement_bound or ""]
+    bound, first = reference["strain_error_bound"], reference["frequency[1]"]
+    count = 2 * sum(name.startswith("frequency[") for name in reference)
+    return slice(bound, bound + 1), slice(other, other + 1), slice(first, first + count)
 
 
-@dataclass(frozen=True, slots=True)
-class WingParameters:
-    """Parameters of the wing FMU, SI units; `response` as in `variables`."""
+class StructureBehaviour:
+    """A structure in time; a call either completes or raises and leaves everything as it was.
 
-    young_modulus_factor: float
-    damping_alpha: float
-    damping_beta: float
-    servo_mass: float
-    pitot_mass: float
-    initial_tip_displacement: float
-    response: int
-
-
-class Response(NamedTuple):
-    """Outputs at the end of a step: strain (G,) dimensionless, tip displacement [m]."""
-
-    strain: npt.NDArray[np.float64]
-    tip_displacement: float
-
-
-class Moment(NamedTuple):
-    """What a step of an FMU with missing effects depends on beside inputs and duration.
-
-    Attributes
-    ----------
-    time, start : float
-        Time at the end of the step, and at the start of the simulation [s].
-    values : mapping of str to float
-        Variables of the effects by name.
-    """
-
-    time: float
-    start: float
-    values: Mapping[str, float]
-
-
-class WingBehaviour:
-    """The wing in time: what it remembers, and how a step changes it.
-
-    A step either completes or raises and leaves everything as it was. Inputs are load factor, the
-    losses of the damage regions and tip force [N], in this order, and are held over the step.
+    Outputs are gauges, displacements and accelerations.
 
     Parameters
     ----------
     model : ReducedModel
-        The wing.
-    mode_count : int
-        Number of modes whose data `modal_data` returns.
+        The reduced structure.
+    table : sequence of FmuVariable
+        Its variables, the inputs first.
+    roles : Roles
+        Which of them is what.
     """
 
-    def __init__(self, model: ReducedModel, mode_count: int) -> None:
-        self._model = model
-        self._mode_count = mode_count
-        self._parameters: WingParameters | None = None
-        self._inputs: tuple[float, ...] = ()
-        self._integrator: ModalIntegrator | None = None
-        self._transient: TransientState | None = None
-        self._bound: float | None = None
+    def __init__(self, model: ReducedModel, table: Sequence[FmuVariable], roles: Roles) -> None:
+        self._model, self._roles = model, roles
+        inputs = [row.name for row in table if row.causality == "input"]
+        self._sources = [(name, inputs.index(name) if name in inputs else None) for name in roles.chosen]
+        self._resting = [0.0] * len(model.accelerations)
+        self._own = len(model.chosen) - len(model.controls)  # what modes depend on
+        self._parameters: Mapping[str, float] = {}
+        self._vector: FloatArray | None = None
+        self._motion: tuple[ModalIntegrator, TransientState] | None = None
+        self._static: StaticResponse | None = None
 
-    @property
-    def input_count(self) -> int:
-        """Number of inputs."""
-        return len(self._model.regions) + 2
+    def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> Sequence[float]:
+        """Begin in equilibrium under the inputs, or just let go of where a force held the structure aside."""
+        kept, motion = dict(parameters), None
+        vector = self._chosen(kept, inputs)
+        if int(kept["response"]) == TRANSIENT:
+            integrator, load = self._integrator(kept, vector), self._model.load_coefficients(vector)
+            state = integrator.at_rest(load)
+            if self._roles.release is not None:
+                state = integrator.released(kept[self._roles.release], load, self._roles.point_load)
+            motion = integrator, state
+        outputs = self._outputs(vector, motion)
+        self._parameters = kept
+        return outputs
 
-    def start(
-        self, parameters: WingParameters, inputs: Sequence[float], moment: Moment | None = None
-    ) -> Response:
-        """Find the initial state: equilibrium, and for the transient the tip displaced and just let go.
+    def advance(self, time: float, duration: float, inputs: Sequence[float]) -> Sequence[float]:
+        """Advance by one step of `duration` [s] with the inputs held."""
+        before, motion = self._vector, self._motion
+        if before is None:
+            raise RuntimeError("the structure was not initialised")
+        vector = self._chosen(self._parameters, inputs)
+        if motion is not None:
+            integrator, state = motion
+            if vector[: self._own].tobytes() != before[: self._own].tobytes():
+                integrator = self._integrator(self._parameters, vector)
+                state = integrator.take_over(state, motion[0])
+            motion = integrator, integrator.advance(state, duration, self._model.load_coefficients(vector))
+        return self._outputs(vector, motion)
 
-        Parameters and inputs lie within the validity box; nothing here depends on `moment`.
-        """
-        if parameters.response != TRANSIENT:
-            response = self._equilibrium(parameters, inputs)
-            self._integrator, self._transient = None, None
-        else:
-            integrator = self._make_integrator(parameters, inputs)
-            load_factor, *_, tip_force = inputs
-            transient = integrator.released(parameters.initial_tip_displacement, load_factor, tip_force)
-            response = self._read(integrator, transient)
-            self._integrator, self._transient, self._bound = integrator, transient, None
-        self._parameters, self._inputs = parameters, tuple(inputs)
-        return response
-
-    def advance(self, inputs: Sequence[float], duration: float, moment: Moment | None = None) -> Response:
-        """Advance by one step of `duration` [s] with the inputs held, within the validity box, as `start`."""
-        parameters, before = self._parameters, self._integrator
-        if parameters is None:
-            raise RuntimeError("the wing was not initialised")
-        if before is None or self._transient is None:
-            response = self._equilibrium(parameters, inputs)
-        else:
-            integrator, transient = before, self._transient
-            if tuple(inputs[1:-1]) != self._inputs[1:-1]:
-                integrator = self._make_integrator(parameters, inputs)
-                transient = integrator.take_over(transient, before)
-            load = (inputs[0], inputs[-1])
-            transient = integrator.advance(transient, duration, load)
-            response = self._read(integrator, transient)
-            self._integrator, self._transient, self._bound = integrator, transient, None
-        self._inputs = tuple(inputs)
-        return response
-
-    def strain_error_bound(self) -> float:
-        """Return the certified bound of the static strains under the last inputs (dimensionless)."""
-        if self._bound is None:
-            if self._parameters is None:
-                raise RuntimeError("the wing was not initialised")
-            self._equilibrium(self._parameters, self._inputs)
-        return self._bound or 0.0
+    def later(self, group: int) -> list[float]:
+        """Return the outputs of a group: the bound, the other bound or the load point, the modes."""
+        if self._vector is None:
+            raise RuntimeError("the structure was not initialised")
+        if group == MODES:
+            return self.modal_data()
+        if group == POINT_OR_BOUND and self._roles.load_point is not None:
+            return [self.load_point_displacement()]
+        self._static = self._static or self._model.static_response(self._vector)
+        bounds = self._static.strain_error_bound, self._static.displacement_error_bound
+        return [bounds[group]]
 
     def load_point_displacement(self) -> float:
-        """Return the displacement of the point where the tip force acts [m]."""
-        if self._parameters is None:
-            raise RuntimeError("the wing was not initialised")
-        if self._integrator is not None and self._transient is not None:
-            return self._integrator.load_point_displacement(self._transient)
-        load_factor, *losses, tip_force = self._inputs
-        static = self._model.static_response(
-            self._parameters.young_modulus_factor, tuple(losses), load_factor, tip_force
-        )
-        return float(self._model.static_load[1] @ static.coordinates)
+        """Return the displacement of the point where the load acts that holds the structure aside [m]."""
+        point = self._roles.point_load
+        if self._motion is not None:
+            integrator, state = self._motion
+            return integrator.point_displacement(state, point)
+        self._static = self._static or self._model.static_response(self._vector)
+        return float(self._model.static_load[point] @ self._static.coordinates)
 
-    def modal_data(self) -> tuple[list[float], list[float]]:
-        """Return natural frequencies [Hz] and damping ratios [1] under the last inputs."""
-        parameters = self._parameters
-        if parameters is None:
-            raise RuntimeError("the wing was not initialised")
-        if self._integrator is not None:
-            frequency, ratio = self._integrator.modes.frequency, self._integrator.damping_ratio
-        else:
-            losses = self._inputs[1:-1]
-            modes = self._model.modes(
-                parameters.young_modulus_factor, losses, parameters.servo_mass, parameters.pitot_mass
-            )
-            frequency = modes.frequency
-            ratio = rayleigh_damping_ratio(parameters.damping_alpha, parameters.damping_beta, frequency)
-        return frequency[: self._mode_count].tolist(), ratio[: self._mode_count].tolist()
+    def modal_data(self) -> list[float]:
+        """Return natural frequencies [Hz], then damping ratios [1], under the last inputs."""
+        modes = self._model.modes(self._vector) if self._motion is None else self._motion[0].modes
+        frequency = modes.frequency[:MODE_COUNT]
+        ratio = rayleigh_damping_ratio(*self._damping(self._parameters), frequency)
+        return [*frequency.tolist(), *ratio.tolist()]
 
     def state(self) -> list[float]:
-        """Return all that is remembered as plain floats; parameters are kept by the slave."""
-        head = [float(self._parameters is not None), float(self._transient is not None)]
-        inputs = list(self._inputs) or [0.0] * self.input_count
-        return [*head, *inputs, *([] if self._transient is None else self._transient.to_list())]
+        """Return all that is remembered, without the parameters."""
+        vector = [] if self._vector is None else self._vector.tolist()
+        return [*vector, *([] if self._motion is None else self._motion[1].to_list())]
 
-    def restore(self, parameters: WingParameters, values: Sequence[float]) -> None:
+    def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
         """Take back what `state` returned; `parameters` are those of that moment."""
-        started, moving = values[0] != 0.0, values[1] != 0.0
-        inputs = tuple(values[2 : 2 + self.input_count])
-        integrator, transient = None, None
-        if moving:
-            integrator = self._make_integrator(parameters, inputs)
-            transient = TransientState.from_list(values[2 + self.input_count :])
-        self._parameters = parameters if started else None
-        self._inputs = inputs if started else ()
-        self._integrator, self._transient, self._bound = integrator, transient, None
+        count, kept, vector, motion = len(self._model.chosen), dict(parameters), None, None
+        if state:
+            vector = np.array(state[:count])
+        if vector is not None and len(state) > count:
+            found = TransientState.from_list(state[count:], self._model.mode_count)
+            motion = self._integrator(kept, vector), found
+        self._parameters, self._vector, self._motion, self._static = kept, vector, motion, None
 
-    def _equilibrium(self, parameters: WingParameters, inputs: Sequence[float]) -> Response:
-        load_factor, *losses, tip_force = inputs
-        static = self._model.static_response(
-            parameters.young_modulus_factor, tuple(losses), load_factor, tip_force
-        )
-        self._bound = static.strain_error_bound
-        return Response(static.strain, static.tip_displacement)
-
-    def _make_integrator(self, parameters: WingParameters, inputs: Sequence[float]) -> ModalIntegrator:
-        return ModalIntegrator(
-            self._model,
-            young_modulus_factor=parameters.young_modulus_factor,
-            stiffness_loss=tuple(inputs[1:-1]),
-            servo_mass=parameters.servo_mass,
-            pitot_mass=parameters.pitot_mass,
-            damping_alpha=parameters.damping_alpha,
-            damping_beta=parameters.damping_beta,
+    def _chosen(self, parameters: Mapping[str, float], inputs: Sequence[float]) -> FloatArray:
+        return np.array(
+            [parameters[name] if number is None else inputs[number] for name, number in self._sources]
         )
 
     @staticmethod
-    def _read(integrator: ModalIntegrator, transient: TransientState) -> Response:
-        response = integrator.response(transient)
-        return Response(response.strain, response.tip_displacement)
+    def _damping(parameters: Mapping[str, float]) -> tuple[float, float]:
+        return parameters["damping.alpha"], parameters["damping.beta"]
+
+    def _integrator(self, parameters: Mapping[str, float], vector: FloatArray) -> ModalIntegrator:
+        return ModalIntegrator(self._model, vector, *self._damping(parameters))
+
+    def _outputs(
+        self, vector: FloatArray, motion: tuple[ModalIntegrator, TransientState] | None
+    ) -> list[float]:
+        """Take what is chosen and the motion, and return the outputs."""
+        static = None
+        if motion is not None:
+            values: list[float] = motion[0].outputs(motion[1]).tolist()
+        else:
+            static = self._model.static_response(vector)
+            values = static.strain.tolist() + static.displacement.tolist() + self._resting
+        self._vector, self._motion, self._static = vector, motion, static
+        return values

@@ -13,7 +13,7 @@ from typing import Any
 
 from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES
 
-from .variables import FmuVariable, Unit
+from .variables import FmuVariable, Table, Unit
 
 TEMPERATURE = "temperature_difference"
 """Input of FMUs with an effect of temperature: the wing's temperature less the reference temperature [K]."""
@@ -120,64 +120,32 @@ def effect_rows(
     start : mapping of str to float
         Start values by variable name; a switch that is not there is off, a number has its value in the patch.
     """
-    rows: list[FmuVariable] = []
-
-    def add(
-        name: str,
-        description: str,
-        value: float,
-        unit: str | None,
-        box: tuple[float, float] | tuple[None, None] = (None, None),
-    ) -> None:
-        rows.append(
-            FmuVariable(
-                name=name,
-                reference=first + len(rows),
-                kind="Real" if unit else "Integer",
-                causality="parameter",
-                variability="tunable",
-                description=description,
-                unit=unit,
-                display_unit=None,
-                minimum=box[0],
-                maximum=box[1],
-                start=float(start.get(name, value)),
-            )
-        )
-
+    table = Table({}, first)
     for effect in effects:
         kinds = " and ".join(dict.fromkeys(str(item["kind"]) for item in effect["primitives"]))
-        add(
-            switch_of(effect),
+        switch = switch_of(effect)
+        table.add(
+            switch, "parameter",
             f"Whether the effect {effect['id']} ({kinds.replace('_', ' ')}) acts: 0 off, 1 on",
-            0.0,
-            "1",
-            (0.0, 1.0),
-        )
+            unit="1", box=(0.0, 1.0), default=start.get(switch, 0.0), tunable=True,
+        )  # fmt: skip
         for number in numbers_of(effect):
             primitive = effect["primitives"][number.primitive]
             place = primitive.get("port") or primitive.get("channel") or ""
             where = f" at {place}" if place not in ("", "*") else ""
             text = f"{number.key.replace('_', ' ')} of {str(primitive['kind']).replace('_', ' ')}{where}"
-            unit, box = (None, RANGES[number.key]) if number.whole else (number.unit, (None, None))
-            add(number.name, text[:1].upper() + text[1:], number.value, unit, box)
+            table.add(
+                number.name, "parameter", text[:1].upper() + text[1:],
+                kind="Integer" if number.whole else "Real", unit=None if number.whole else number.unit,
+                box=RANGES[number.key] if number.whole else (None, None),
+                default=start.get(number.name, number.value), tunable=True,
+            )  # fmt: skip
     if needs_temperature(effects):
-        rows.append(
-            FmuVariable(
-                name=TEMPERATURE,
-                reference=first + len(rows),
-                kind="Real",
-                causality="input",
-                variability="continuous",
-                description="Temperature of the wing less the reference temperature",
-                unit="K",
-                display_unit=None,
-                minimum=-100.0,
-                maximum=100.0,
-                start=float(start.get(TEMPERATURE, 0.0)),
-            )
-        )
-    return tuple(rows)
+        table.add(
+            TEMPERATURE, "input", "Temperature of the wing less the reference temperature",
+            unit="K", box=(-100.0, 100.0), default=start.get(TEMPERATURE, 0.0),
+        )  # fmt: skip
+    return table.rows()
 
 
 def units_of(rows: Sequence[FmuVariable]) -> tuple[Unit, ...]:

@@ -1,12 +1,11 @@
-"""The one table of the wing FMU's variables.
+"""Rows of a table of variables, which model description, slave and documentation follow; units; enumerations.
 
-The model description, the slave, the documentation and the shipped binding all follow this table.
 Standard library only: the file is copied into the FMU.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -40,7 +39,7 @@ class EnumerationType:
 ENUMERATIONS = (
     EnumerationType(
         "Response",
-        "How the wing answers its loads",
+        "How the structure answers its loads",
         (
             ("quasi_static", QUASI_STATIC, "The steady turn: static equilibrium with the inputs of the step"),
             ("transient", TRANSIENT, "The modes are integrated exactly, inputs held over the step"),
@@ -132,128 +131,66 @@ class FmuVariable:
     enumeration: str | None = None
 
 
-# Linear kinematics: half a metre at the tip of a wing of 1.8 m is already generous.
-TIP_DISPLACEMENT_LIMIT = 0.5
-
-
-def variable_table(
-    *,
-    gauge_count: int,
-    mode_count: int,
-    regions: Sequence[str],
-    validity: Mapping[str, tuple[float, float]],
-    start: Mapping[str, float],
-) -> tuple[FmuVariable, ...]:
-    """Return the table of the wing FMU: inputs, parameters, strains, other outputs, modal outputs.
+class Table:
+    """A table of variables that grows by rows.
 
     Parameters
     ----------
-    gauge_count : int
-        Number of strain gauges.
-    mode_count : int
-        Number of modes of which frequency and damping ratio are given.
-    regions : sequence of str
-        Names of the damage regions, in their order.
-    validity : mapping of str to (float, float)
-        The validity box of the reduced model: young_modulus_factor, the losses of the regions, load_factor,
-        tip_force [N], servo_mass [kg], pitot_mass [kg].
     start : mapping of str to float
-        Start values by variable name; a missing name starts at its default.
-
-    Returns
-    -------
-    tuple of FmuVariable
-        In order of the value reference.
+        Start values by variable name that take the place of the defaults.
+    first : int
+        Value reference of the first row.
     """
-    rows: list[FmuVariable] = []
+
+    def __init__(self, start: Mapping[str, float], first: int = 0) -> None:
+        self._start, self._first = dict(start), first
+        self._rows: list[FmuVariable] = []
 
     def add(
+        self,
         name: str,
         causality: Causality,
         description: str,
         *,
+        kind: Kind = "Real",
         unit: str | None = None,
         display: str | None = None,
         box: tuple[float | None, float | None] = (None, None),
-        default: float | None = None,
+        default: float = 0.0,
         enumeration: str | None = None,
+        tunable: bool = False,
     ) -> None:
+        """Append a row; `box` is the range, `default` the start value of an input or parameter."""
         variability: Variability = "fixed" if causality == "parameter" else "continuous"
-        rows.append(
+        if tunable:
+            variability = "tunable"
+        elif kind != "Real" and causality != "parameter":
+            variability = "discrete"
+        self._rows.append(
             FmuVariable(
                 name=name,
-                reference=len(rows),
-                kind="Real" if enumeration is None else "Enumeration",
+                reference=self._first + len(self._rows),
+                kind=kind,
                 causality=causality,
-                variability="discrete" if enumeration and causality == "output" else variability,
+                variability=variability,
                 description=description,
                 unit=unit,
                 display_unit=display,
                 minimum=box[0],
                 maximum=box[1],
-                start=None if causality == "output" else float(start.get(name, default or 0.0)),
+                start=None if causality == "output" else float(self._start.pop(name, default)),
                 enumeration=enumeration,
             )
         )
 
-    add(
-        "load_factor", "input", "Load factor of the turn, lift over weight",
-        unit="1", box=validity["load_factor"], default=1.0,
-    )  # fmt: skip
-    for number, region in enumerate(regions, start=1):
-        add(
-            f"health.{region}", "input", f"Stiffness that damage region {number} has lost, as a fraction",
-            unit="1", display="%", box=validity[region],
-        )  # fmt: skip
-    add(
-        "tip_force", "input", "Upward force at the load point near the tip",
-        unit="N", box=validity["tip_force"],
-    )  # fmt: skip
-    add(
-        "young_modulus_factor", "parameter", "Factor on Young's modulus of the skin (e)",
-        unit="1", box=validity["young_modulus_factor"], default=1.0,
-    )  # fmt: skip
-    add("damping.alpha", "parameter", "Mass-proportional Rayleigh damping", unit="1/s", box=(0.0, None))
-    add("damping.beta", "parameter", "Stiffness-proportional Rayleigh damping", unit="s", box=(0.0, None))
-    add(
-        "mass.servo", "parameter", "Mass of each of the two servos",
-        unit="kg", display="g", box=validity["servo_mass"],
-    )  # fmt: skip
-    add(
-        "mass.pitot", "parameter", "Mass of the pitot tube at the tip",
-        unit="kg", display="g", box=validity["pitot_mass"],
-    )  # fmt: skip
-    add(
-        "initial_tip_displacement", "parameter",
-        "Transient only: displacement of the tip from its equilibrium, released at the start",
-        unit="m", display="mm", box=(-TIP_DISPLACEMENT_LIMIT, TIP_DISPLACEMENT_LIMIT),
-    )  # fmt: skip
-    add(
-        "response", "parameter", "Quasi-static (1) or transient (2)",
-        box=(QUASI_STATIC, TRANSIENT), default=QUASI_STATIC, enumeration="Response",
-    )  # fmt: skip
-    for gauge in range(1, gauge_count + 1):
-        add(
-            f"strain[{gauge}]", "output", f"Strain at gauge {gauge}, positive under upward lift",
-            unit="1", display="microstrain",
-        )  # fmt: skip
-    add("tip_displacement", "output", "Displacement of the tip, positive upwards", unit="m", display="mm")
-    add(
-        "strain_error_bound", "output",
-        "Certified bound of the error of any static strain against the full finite element model",
-        unit="1", display="microstrain",
-    )  # fmt: skip
-    add("status", "output", "What became of the last call", enumeration="Status")
-    add(
-        "load_point_displacement", "output",
-        "Displacement of the point near the tip where tip_force acts, positive upwards",
-        unit="m", display="mm",
-    )  # fmt: skip
-    for mode in range(1, mode_count + 1):
-        add(f"frequency[{mode}]", "output", f"Natural frequency of mode {mode}", unit="Hz")
-    for mode in range(1, mode_count + 1):
-        add(
-            f"damping_ratio[{mode}]", "output", f"Damping ratio of mode {mode}",
-            unit="1", display="%",
-        )  # fmt: skip
-    return tuple(rows)
+    def rows(self) -> tuple[FmuVariable, ...]:
+        """Return the table.
+
+        Raises
+        ------
+        ValueError
+            If a start value was given for something that is no input or parameter.
+        """
+        if self._start:
+            raise ValueError(f"there is no input or parameter {sorted(self._start)[0]!r}")
+        return tuple(self._rows)

@@ -29,8 +29,8 @@ from calibration.virtual_wing import (
 from calibration.wing.laboratory import WEIGHED_MASS_FILE, read_weighed_mass, write_lab_folder
 from fe.runtime.errors import OutsideModelError
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import DigitalState, Geometry
-from fe.runtime.transient import ModalIntegrator
+from fe.runtime.state import TIP_FORCE, DigitalState, Geometry
+from tests.wings import wing_integrator
 
 TRUTH = DigitalState(young_modulus_factor=1.0073, damping_alpha=1.03, damping_beta=7.66e-4)
 
@@ -62,7 +62,7 @@ def wing() -> ReducedModel:
 def test_the_release_is_the_integrators(wing: ReducedModel) -> None:
     bench = VirtualWing(wing, TRUTH)
     time, signal = bench.ring_down(0.03, 0.4, 1000.0)
-    integrator = ModalIntegrator(
+    integrator = wing_integrator(
         wing,
         young_modulus_factor=TRUTH.young_modulus_factor,
         stiffness_loss=(0.0, 0.0),
@@ -71,21 +71,32 @@ def test_the_release_is_the_integrators(wing: ReducedModel) -> None:
         damping_alpha=TRUTH.damping_alpha,
         damping_beta=TRUTH.damping_beta,
     )
-    state = integrator.released(0.03)
-    strain = [integrator.response(state).strain[RECORDED_GAUGE - 1]]
+    state = integrator.released(0.03, (0.0, 0.0), TIP_FORCE)
+    strain = [integrator.outputs(state)[:-1][RECORDED_GAUGE - 1]]
     for _ in time[1:]:
         state = integrator.advance(state, 1e-3, (0.0, 0.0))
-        strain.append(integrator.response(state).strain[RECORDED_GAUGE - 1])
+        strain.append(integrator.outputs(state)[:-1][RECORDED_GAUGE - 1])
     np.testing.assert_allclose(signal, SENSITIVITY * np.array(strain), atol=1e-12)
-    held = wing.static_response(1.0073, (0.0, 0.0), 0.0, 1.0)
-    holding_force = 0.03 / held.tip_displacement
+    held = wing.static_response(
+        young_modulus_factor=1.0073, stiffness_loss=(0.0, 0.0), load_factor=0.0, tip_force=1.0
+    )
+    holding_force = 0.03 / held.displacement[0]
     # What six modes leave out of the static strain is small.
     assert signal[0] == pytest.approx(SENSITIVITY * holding_force * held.strain[RECORDED_GAUGE - 1], rel=0.02)
 
 
 @pytest.mark.slow
 def test_overdamped_and_critical_modes(wing: ReducedModel) -> None:
-    for beta in (0.03, 1.0 / (math.pi * wing.modes(1.0, (0.0, 0.0), 0.169, 0.134).frequency[3])):
+    for beta in (
+        0.03,
+        1.0
+        / (
+            math.pi
+            * wing.modes(
+                young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
+            ).frequency[3]
+        ),
+    ):
         state = DigitalState(damping_alpha=0.0, damping_beta=beta)
         _, signal = VirtualWing(wing, state).ring_down(0.03, 1.0, 500.0)
         assert np.all(np.isfinite(signal))
@@ -95,8 +106,12 @@ def test_overdamped_and_critical_modes(wing: ReducedModel) -> None:
 @pytest.mark.slow
 def test_records_give_back_the_truth(wing: ReducedModel) -> None:
     bench = VirtualWing(wing, TRUTH, frequency_error=(-0.01, 0.045))
-    first, second = wing.modes(1.0073, (0.0, 0.0), 0.169, 0.134).flapwise
-    frequency = wing.modes(1.0073, (0.0, 0.0), 0.169, 0.134).frequency
+    first, second = wing.modes(
+        young_modulus_factor=1.0073, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
+    ).followed
+    frequency = wing.modes(
+        young_modulus_factor=1.0073, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
+    ).frequency
     records = measure_ring_down(bench, 3, sampling_rate=250.0)
     trials = fit_trials(records, Frequencies.FITTED)
     assert trials.frequency(0).mean == pytest.approx(0.99 * frequency[first], rel=2e-4)

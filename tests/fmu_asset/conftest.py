@@ -15,7 +15,7 @@ import pytest
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.door.binding import Binding, load_binding, parse_binding
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 ROOT = Path(__file__).parents[2]
 NODES = 16
@@ -47,9 +47,21 @@ def chain_model(stiffness: float = 9.0e4, regions: tuple[str, ...] = ("z1", "z2"
     allowances = {item.name: 0.0 for item in fields(ReducedModel) if item.name.endswith("_allowance")}
     return ReducedModel(
         design_hash="chain",
+        name="uav_wing",
         region_names=" ".join(regions),
+        parameter_names="young_modulus_factor",
+        mass_names="servo_mass pitot_mass",
+        control_names="load_factor tip_force",
+        control_units="1 N",
+        gauge_names=" ".join(f"gauge_{number}" for number in range(1, GAUGES + 1)),
+        displacement_names="tip",
+        acceleration_names="",
+        nominal=np.array((1.0, *(0.0,) * count, 0.169, 0.134, 1.0, 0.0)),
+        damping=np.array((1.0735, 7.3124e-4)),
+        stiffness_factors=np.array([(1, 0), *((0, number + 1) for number in range(count)), (0, 0)]),
+        load_factors=np.array([(1, 0), (2, 0)]),
         validity_box=np.array(
-            [[0.85, 1.15], *[[0.0, 0.85]] * count, [-1.0, 4.0], [-20.0, 20.0], [0.1, 0.25], [0.1, 0.2]]
+            [[0.85, 1.15], *[[0.0, 0.85]] * count, [0.1, 0.25], [0.1, 0.2], [-1.0, 4.0], [-20.0, 20.0]]
         ),
         static_stiffness=terms,
         static_load=load,
@@ -68,7 +80,7 @@ def chain_model(stiffness: float = 9.0e4, regions: tuple[str, ...] = ("z1", "z2"
         modal_load=load,
         modal_output=output,
         cross_mass=mass,
-        flapwise_reference=shapes[:, :2].T.copy(),
+        followed_shapes=shapes[:, :2].T.copy(),
         mode_count=8,
         **allowances,
     )

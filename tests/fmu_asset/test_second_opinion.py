@@ -15,7 +15,7 @@ from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import build_companion
 from fmu_asset.compiled.package import FmiVersion
 from fmu_asset.packing.script import build_script_fmu
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from scenarios import asset_scripts
 
 

@@ -11,8 +11,7 @@ import pytest
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
-from fe.reduction.model_cache import reduced_model
-from fe.reduction.patch_cache import patch_arrays
+from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.patch import FreePlay, LocalStiffnessLoss, MicroSlip, ModelPatch
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.state import DigitalState
@@ -21,7 +20,7 @@ from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from fmu_asset.packing.patched_runtime import output_channels
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 
@@ -35,7 +34,9 @@ def test_the_shipped_wing_as_an_fmu(binding: Binding, tmp_path: Path) -> None:
     with FmiAsset(path, binding, parameters={"young_modulus_factor": 1.0073}) as asset:
         for z1, z2 in ((0.0, 0.0), (0.6, 0.2), (0.8, 0.8)):
             seen = asset.step({"load_factor": 3.0}, {"z1": z1, "z2": z2})
-            expected = model.static_response(1.0073, (z1, z2), 3.0)
+            expected = model.static_response(
+                young_modulus_factor=1.0073, stiffness_loss=(z1, z2), load_factor=3.0
+            )
             np.testing.assert_array_equal(seen.values, expected.strain)
             assert 0.0 < seen.extra["strain_error_bound"] < 1e-3 * seen.values.max()
 

@@ -41,8 +41,10 @@ def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     trials = fit_trials(records, Frequencies.FITTED)
     from fe.reduction.model_cache import reduced_model
 
-    modes = reduced_model().modes(0.99, (0.0, 0.0), 0.18, 0.11)
-    first, second = modes.flapwise
+    modes = reduced_model().modes(
+        young_modulus_factor=0.99, stiffness_loss=(0.0, 0.0), servo_mass=0.18, pitot_mass=0.11
+    )
+    first, second = modes.followed
     assert trials.frequency(0).mean == pytest.approx(modes.frequency[first], rel=1e-3)
     assert trials.frequency(1).mean == pytest.approx(modes.frequency[second], rel=5e-3)
     # the same again, bit for bit

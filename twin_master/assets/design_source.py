@@ -201,7 +201,7 @@ class WingFmuSource(FmuSource):
         """
         from fmu_asset.compiled.compiler import find_compiler
         from fmu_asset.door.binding import load_binding
-        from fmu_asset.packing.wing_fmu import check_kind
+        from fmu_asset.packing.structure_fmu import check_kind
 
         read_calibration(self._scenario.calibration)
         self.files()
@@ -425,20 +425,16 @@ def write_design_field(
     """
     from fe.reduction.fields import write_wing_vtu
     from fe.reduction.model_cache import wing_fields
-    from fe.runtime.state import losses_of
     from reporting.files import write_error
 
     if {*state} != {*design.regions} or {*control} != {"load_factor"}:
         return False
     try:
-        write_wing_vtu(
-            path,
-            wing_fields(design),
-            young_modulus_factor=scenario.asset.true_parameters.get("young_modulus_factor", mean),
-            stiffness_loss=losses_of(state, design.regions),
-            load_factor=control["load_factor"],
-            tip_force=scenario.asset.constant_load.get("tip_force", 0.0),
-        )
+        wing = wing_fields(design)
+        e = scenario.asset.true_parameters.get("young_modulus_factor", mean)
+        force = scenario.asset.constant_load.get("tip_force", 0.0)
+        values = {**control, "young_modulus_factor": e, "tip_force": force}
+        write_wing_vtu(path, wing, wing.model.vector(values, state))
     except OSError as error:
         raise write_error(error, path) from error
     return True

@@ -10,7 +10,6 @@ from fe.runtime.patch import PortForce, SensorDrift
 from fe.runtime.patched_steps import PatchedSteps
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from fmu_asset.packing.patch_file import PatchFile, load_patch
 from fmu_asset.packing.patched_runtime import (
@@ -20,8 +19,8 @@ from fmu_asset.packing.patched_runtime import (
     plain_effects,
 )
 from fmu_asset.packing.wing_packing import arrays_for
-from fmu_asset.slaves.behaviour import Moment, UnacceptableEffectError, WingParameters
-from fmu_asset.slaves.variables import QUASI_STATIC
+from fmu_asset.slaves.base import UnacceptableValuesError
+from fmu_asset.slaves.table import structure_table
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.wing_model import check_wing_scenario, wing_observation_table
 from twin_master.errors import MissionInputError
@@ -78,38 +77,22 @@ def model_observation_table(
     arrays = arrays_for(design, patch)
     steps = None if arrays is None else partial(PatchedSteps, wing, PatchedWing(arrays))
     behaviour = patched_behaviour(wing, effects, steps)
-    moment = Moment(0.0, 0.0, effect_values(effects, active=True))
+    behaviour.tune(effect_values(effects, active=True), 0.0)
+    nominal = {row.name: row.start or 0.0 for row in structure_table(wing, {})[0]}
     states, controls = model.states.coordinates, scenario.control
     order = [scenario.state_names.index(name) for name in wing.regions]
     force = scenario.asset.constant_load.get("tip_force", 0.0)
     table = np.empty((len(draws.values), len(states), len(controls), wing.gauge_count))
     try:
         for row, value in enumerate(draws.values):
-            parameters = _parameters(float(value))
+            parameters = {**nominal, "young_modulus_factor": float(value)}
             for state, levels in enumerate(states):
                 for index, control in enumerate(controls):
-                    inputs = (
-                        control.values["load_factor"],
-                        *levels[order].tolist(),
-                        force,
-                    )
-                    table[row, state, index] = behaviour.start(parameters, inputs, moment).strain
-    except UnacceptableEffectError as error:
+                    inputs = (control.values["load_factor"], force, *levels[order].tolist())
+                    table[row, state, index] = behaviour.start(parameters, 0.0, inputs)[: wing.gauge_count]
+    except UnacceptableValuesError as error:
         raise MissionInputError(f"the twin's model cannot carry {where}: {error}") from error
     return table
-
-
-def _parameters(young_modulus_factor: float) -> WingParameters:
-    state = DigitalState()
-    return WingParameters(
-        young_modulus_factor=young_modulus_factor,
-        damping_alpha=state.damping_alpha,
-        damping_beta=state.damping_beta,
-        servo_mass=state.servo_mass,
-        pitot_mass=state.pitot_mass,
-        initial_tip_displacement=0.0,
-        response=QUASI_STATIC,
-    )
 
 
 def effect_names(patch_file: Path, gauge_count: int) -> tuple[str, ...]:

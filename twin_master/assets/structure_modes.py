@@ -14,7 +14,7 @@ from twin_master.scenario.schema import Scenario
 from twin_master.seeds import seed_sequence
 
 if TYPE_CHECKING:
-    from fe.runtime.structure_model import StructureModel
+    from fe.runtime.reduced import ReducedModel
     from fmu_asset.door.binding import Binding
     from fmu_asset.door.session import FmiAsset
 
@@ -22,13 +22,13 @@ Float = NDArray[np.float64]
 
 
 def modal_values(
-    model: "StructureModel", vector: Float, section: ModesSection, damping: tuple[float, float] | None = None
+    model: "ReducedModel", vector: Float, section: ModesSection, damping: tuple[float, float] | None = None
 ) -> Float:
     """Return frequency [Hz], damping ratio and relative shape (M, 1 + A) of the observed modes of a model.
 
     Parameters
     ----------
-    model : StructureModel
+    model : ReducedModel
     vector : (V,)
         Values of all that can be chosen.
     section : ModesSection
@@ -61,7 +61,7 @@ class RecordedStructure:
     ----------
     scenario : Scenario
         With `observation.modes` and `truth.record`.
-    model : StructureModel
+    model : ReducedModel
         The model that was packed.
     session : callable
         Opens the FMU with a binding and parameters.
@@ -74,7 +74,7 @@ class RecordedStructure:
     def __init__(
         self,
         scenario: Scenario,
-        model: "StructureModel",
+        model: "ReducedModel",
         session: "Callable[[Binding, Mapping[str, float]], FmiAsset]",
         binding: "Binding",
         parameters: Mapping[str, float],

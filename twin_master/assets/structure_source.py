@@ -40,7 +40,7 @@ from twin_master.scenario.asset import BeliefSection, FileSection
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
-    from fe.runtime.structure_model import StructureModel
+    from fe.runtime.reduced import ReducedModel
     from fe.structure.design import StructureDesign
     from fmu_asset.door.binding import Binding
     from fmu_asset.door.session import FmiAsset
@@ -133,7 +133,7 @@ class StructureFmuSource(FmuSource):
     """The FMU that is packed of a structure."""
 
     _section: StructureSection
-    _model: "StructureModel | None" = None
+    _model: "ReducedModel | None" = None
 
     @property
     def origin(self) -> FlownAndBelieved:
@@ -155,10 +155,10 @@ class StructureFmuSource(FmuSource):
             A file cannot be read or is wrong, the mesh does not hold what the structure names, or the
             scenario speaks of what the structure does not have.
         """
-        from fe.reduction.structure_cache import check_structure
+        from fe.reduction.model_cache import check_structure
         from fmu_asset.compiled.compiler import find_compiler
         from fmu_asset.door.binding import load_binding
-        from fmu_asset.structures.binding import names_of_design, structure_binding
+        from fmu_asset.structures.binding import structure_binding
 
         self.files()
         design = self._design()
@@ -171,7 +171,7 @@ class StructureFmuSource(FmuSource):
         binding = (
             load_binding(self._section.binding_path)
             if own
-            else structure_binding(names_of_design(design), frequencies_observed(self._scenario))
+            else structure_binding(design, frequencies_observed(self._scenario))
         )
         self._check_names(binding)
         if self._scenario.observation.modes is None:
@@ -186,16 +186,18 @@ class StructureFmuSource(FmuSource):
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
-        from fe.reduction.structure_cache import reduced_structure
-        from fmu_asset.structures.binding import names_of_model, structure_binding_text
-        from fmu_asset.structures.build import build_structure_fmu
+        from fe.reduction.model_cache import reduced_structure
+        from fe.structure.design import load_structure
+        from fmu_asset.packing.structure_fmu import build_fmu
+        from fmu_asset.structures.binding import structure_binding_text
 
         model = reduced_structure(self._path(FLOWN_COPY), progress=progress)
         if not self._path(BINDING_COPY).exists():
-            text = structure_binding_text(names_of_model(model), frequencies_observed(self._scenario))
+            design = load_structure(self._path(FLOWN_COPY))
+            text = structure_binding_text(design, frequencies_observed(self._scenario))
             atomic_write_text(self._path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):
-            build_structure_fmu(model, self.fmu_path(), kind=self._section.packed, replace=True)
+            build_fmu(model, self.fmu_path(), kind=self._section.packed, replace=True)
         self._model = model
         return {FLOWN_DESIGN_HASH: model.design_hash, "fmu": hash_file(self.fmu_path())}
 
@@ -244,7 +246,7 @@ class StructureSource:
     def __init__(self, scenario: Scenario, section: StructureBelief) -> None:
         self._scenario = scenario
         self._places = named_files(scenario, section)
-        self._model: StructureModel | None = None
+        self._model: ReducedModel | None = None
         self._mean: dict[str, float] = {}
 
     @property
@@ -268,7 +270,7 @@ class StructureSource:
         MissingObservationModelError
             The scenario's states, controls or sensors are not those of the structure.
         """
-        from fe.reduction.structure_cache import check_structure
+        from fe.reduction.model_cache import check_structure
 
         self.files()
         design, scenario = self._design(), self._scenario
@@ -299,7 +301,7 @@ class StructureSource:
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Copy what is given into the run folder and reduce the structure; return the hash of its design."""
-        from fe.reduction.structure_cache import reduced_structure
+        from fe.reduction.model_cache import reduced_structure
 
         keep_files(folder, self.files())
         self._places = {copy: folder / copy for copy in self._places}
@@ -307,7 +309,7 @@ class StructureSource:
         return {"design": self._model.design_hash}
 
     @property
-    def _prepared(self) -> "StructureModel":
+    def _prepared(self) -> "ReducedModel":
         if self._model is None:
             raise MissionInputError("the model was not prepared: call `prepare` first.")
         return self._model

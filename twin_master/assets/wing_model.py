@@ -36,14 +36,18 @@ def wing_observation_table(
     check_wing_scenario(scenario, wing.regions, wing.gauge_count)
     load = scenario.asset.constant_load.get("tip_force", 0.0)
     states = model.states.coordinates
-    order = [scenario.state_names.index(name) for name in wing.regions]
     factors = np.array([control.values["load_factor"] for control in scenario.control])
     shape = (len(draws.values), len(states), len(factors))
     draw, state, control = (index.ravel() for index in np.indices(shape))
-    strains = wing.static_strains(
-        draws.values[draw], states[state][:, order], factors[control], np.full(draw.size, load)
+    vectors = wing.vectors(
+        {
+            "young_modulus_factor": draws.values[draw],
+            **dict(zip(scenario.state_names, states[state].T, strict=True)),
+            "load_factor": factors[control],
+            "tip_force": load,
+        }
     )
-    return strains.reshape(*shape, wing.gauge_count)
+    return wing.static_outputs(vectors)[:, : wing.gauge_count].reshape(*shape, wing.gauge_count)
 
 
 def check_wing_scenario(scenario: Scenario, regions: tuple[str, ...], gauge_count: int) -> None:
@@ -78,7 +82,12 @@ def wing_asset(wing: "ReducedModel", scenario: Scenario) -> StatelessAsset:
     force = scenario.asset.constant_load.get("tip_force", 0.0)
 
     def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        response = wing.static_response(e, wing.losses(health), control["load_factor"], force)
+        response = wing.static_response(
+            stiffness_loss=health,
+            young_modulus_factor=e,
+            load_factor=control["load_factor"],
+            tip_force=force,
+        )
         return AssetReading(response.strain, {"strain_error_bound": response.strain_error_bound})
 
     return StatelessAsset(observe)

@@ -403,8 +403,10 @@ def test_our_wing() -> None:
     generator = np.random.default_rng(5)
     points = wing.frequency.limits[:, 0] + generator.random((20, 3)) * np.diff(wing.frequency.limits)[:, 0]
     for point, found in zip(points.tolist(), wing.frequency.frequency(points), strict=True):
-        modes = model.modes(point[0], (0.0, 0.0), point[1], point[2])
-        np.testing.assert_allclose(found, modes.frequency[list(modes.flapwise)], rtol=1e-5)
+        modes = model.modes(
+            young_modulus_factor=point[0], stiffness_loss=(0.0, 0.0), servo_mass=point[1], pitot_mass=point[2]
+        )
+        np.testing.assert_allclose(found, modes.frequency[list(modes.followed)], rtol=1e-5)
     result = joint_posterior(model, STATIC, MODAL)
     assert result.samples.tobytes() == joint_posterior(wing, STATIC, MODAL).samples.tobytes()
     mean, deviation = result.diagnostics.weighted_mean, result.diagnostics.weighted_standard_deviation

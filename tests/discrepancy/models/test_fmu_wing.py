@@ -17,7 +17,7 @@ from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, Primitive, RootCompliance
 from fmu_asset.packing.patch_file import parse_patch
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 OUTPUTS = (
     ("strain[1]", Quantity.STRAIN), ("strain[9]", Quantity.STRAIN),

@@ -14,14 +14,14 @@ from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_excitation import Excitation
 from discrepancy.models.interface import Conditions
-from fe.reduction.structure_basis import reduce_structure
+from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch import ModelPatch, PowerStiffness
-from fe.runtime.structure_model import StructureModel
-from fe.runtime.structure_motion import StructureMotion
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.structures.rig import rig_text
 
 OUTPUTS = (("tip", Quantity.DISPLACEMENT), ("g1", Quantity.STRAIN), ("shake", Quantity.ACCELERATION))
@@ -36,12 +36,12 @@ TRIAL = Trial(
 @pytest.fixture(scope="module")
 def pair(
     write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple[FmuModel, StructureModel]]:
+) -> Iterator[tuple[FmuModel, ReducedModel]]:
     """The model of the search, and the reduced structure inside it."""
     folder = tmp_path_factory.mktemp("rig")
     file = write_beam(folder, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
     reduced = reduce_structure(load_and_assemble(file), "beam").model
-    fmu = build_structure_fmu(reduced, folder / "beam.fmu").path
+    fmu = build_fmu(reduced, folder / "beam.fmu").path
     path = folder / "rig.toml"
     path.write_text(rig_text(load_structure(file), os.path.relpath(fmu, folder)), encoding="utf-8")
     model = FmuModel.load(path)
@@ -49,7 +49,7 @@ def pair(
     model.close()
 
 
-def test_it_is_the_structure_at_rest(pair: tuple[FmuModel, StructureModel]) -> None:
+def test_it_is_the_structure_at_rest(pair: tuple[FmuModel, ReducedModel]) -> None:
     """Static trials at other parameters and masses; without a recorded load factor there is no weight."""
     model, reduced = pair
     assert [parameter.name for parameter in model.parameters] == ["e", "pump"]
@@ -61,14 +61,14 @@ def test_it_is_the_structure_at_rest(pair: tuple[FmuModel, StructureModel]) -> N
         np.testing.assert_allclose(values, [found.displacement[0], found.strain[0]], rtol=1e-10, atol=1e-15)
 
 
-def test_it_is_the_structure_in_motion(pair: tuple[FmuModel, StructureModel]) -> None:
+def test_it_is_the_structure_in_motion(pair: tuple[FmuModel, ReducedModel]) -> None:
     """A tip that is held aside and let go, with its acceleration."""
     model, reduced = pair
     trial = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4))
     seen = model.respond(trial, OUTPUTS, ModelPatch(), Conditions(np.array([1.0, 0.05]))).values
     unit = reduced.static_response({"load_factor": 0.0, "push": 1.0}).displacement[0]
     held, free = (reduced.vector({"load_factor": 0.0, "push": force}) for force in (1e-4 / unit, 0.0))
-    motion = StructureMotion(reduced, held, *reduced.damping)
+    motion = ModalIntegrator(reduced, held, *reduced.damping)
     start = motion.at_rest(reduced.load_coefficients(held))
     load = reduced.load_coefficients(free)
     wanted = np.array(
@@ -82,7 +82,7 @@ def test_it_is_the_structure_in_motion(pair: tuple[FmuModel, StructureModel]) ->
 
 
 def test_systems_of_small_steps_come_from_steps_that_tell_all_modes(
-    pair: tuple[FmuModel, StructureModel],
+    pair: tuple[FmuModel, ReducedModel],
 ) -> None:
     """At 10 kHz modes of 5.8 and 8.7 kHz look like slower ones; smaller steps need a finer base."""
     model, _ = pair
@@ -98,7 +98,7 @@ def test_systems_of_small_steps_come_from_steps_that_tell_all_modes(
     assert motion.ports.parts(step) == 2
 
 
-def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(pair: tuple[FmuModel, StructureModel]) -> None:
+def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(pair: tuple[FmuModel, ReducedModel]) -> None:
     """A spring of next to no stiffness changes nothing, nor the acceleration that a release begins with."""
     model, _ = pair
     trial = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4, mode_count=1))
@@ -115,7 +115,7 @@ def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(pair: tuple[FmuModel,
 
 
 def test_an_accelerometer_that_nobody_reads_does_not_shorten_the_steps(
-    pair: tuple[FmuModel, StructureModel],
+    pair: tuple[FmuModel, ReducedModel],
 ) -> None:
     model, _ = pair
     trial = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4, mode_count=1))

@@ -21,7 +21,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
 from fe.reduction.built_once import cache_folder
-from fe.reduction.model_cache import cache_key
+from fe.reduction.model_cache import entry
 from fe.runtime.patch import (
     PRIMITIVES,
     LoadGain,
@@ -405,7 +405,7 @@ def test_the_posterior_of_a_calibration_is_the_prior(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     design = load_design().changed(mesh={"refinement": 0.25})
     cache_folder().mkdir()
-    coarse_patch_arrays.save(cache_folder() / f"wing-{cache_key(design)}-patches.npz")
+    coarse_patch_arrays.save(entry("patches", design.hash, None))
     result = replace(make_calibration(), design=design)
     save_calibration(result, tmp_path / "wing.nc")
     model = WingModel.of_calibration(tmp_path / "wing.nc")

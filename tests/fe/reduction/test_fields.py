@@ -25,7 +25,7 @@ def wing(coarse_operators: AffineOperators, coarse_reduction: Reduction) -> Wing
 @pytest.fixture(scope="module")
 def written(wing: WingFields, tmp_path_factory: pytest.TempPathFactory) -> meshio.Mesh:
     path = tmp_path_factory.mktemp("vtu") / "wing.vtu"
-    write_wing_vtu(path, wing, **STATE)
+    write_wing_vtu(path, wing, wing.model.vector(**STATE))
     assert [p.name for p in path.parent.iterdir()] == ["wing.vtu"]
     return meshio.read(path)
 
@@ -113,9 +113,7 @@ def test_modes_are_those_of_the_full_model(
     wing: WingFields, coarse_operators: AffineOperators, tmp_path: Path
 ) -> None:
     path = tmp_path / "modes.vtu"
-    write_modes_vtu(
-        path, wing, young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
-    )
+    write_modes_vtu(path, wing, wing.model.nominal)
     written = meshio.read(path)
     full = eigenmodes(coarse_operators, 1.0, (0.0, 0.0), 0.169, 0.134)
     assert len(written.point_data) == wing.model.mode_count
@@ -131,19 +129,20 @@ def test_modes_are_those_of_the_full_model(
 
 def test_equal_states_give_equal_files(wing: WingFields, tmp_path: Path) -> None:
     for name in ("one.vtu", "two.vtu"):
-        write_wing_vtu(tmp_path / name, wing, **STATE)
+        write_wing_vtu(tmp_path / name, wing, wing.model.vector(**STATE))
     assert (tmp_path / "one.vtu").read_bytes() == (tmp_path / "two.vtu").read_bytes()
 
 
 def test_bad_states_and_places_leave_no_file(wing: WingFields, tmp_path: Path) -> None:
+    state = wing.model.vector(**STATE)
     with pytest.raises(OutsideModelError):
-        write_wing_vtu(tmp_path / "wing.vtu", wing, **{**STATE, "load_factor": float("nan")})
+        write_wing_vtu(tmp_path / "wing.vtu", wing, wing.model.vector(load_factor=float("nan")))
     assert not list(tmp_path.iterdir())
     with pytest.raises(FileNotFoundError):
-        write_wing_vtu(tmp_path / "absent" / "wing.vtu", wing, **STATE)
+        write_wing_vtu(tmp_path / "absent" / "wing.vtu", wing, state)
     (tmp_path / "folder.vtu").mkdir()
     with pytest.raises(OSError, match=re.escape(f"'{tmp_path / 'folder.vtu'}'")):
-        write_wing_vtu(tmp_path / "folder.vtu", wing, **STATE)
+        write_wing_vtu(tmp_path / "folder.vtu", wing, state)
     assert [path.name for path in tmp_path.iterdir()] == ["folder.vtu"]
 
 
@@ -154,7 +153,7 @@ def test_basis_comes_back_to_the_last_bit(wing: WingFields) -> None:
         FieldBasis.from_bytes(content[:1000], "the basis")
     with pytest.raises(ReducedModelFileError, match="lacks"):
         FieldBasis.from_bytes(wing.model.to_bytes(), "the basis")
-    for name in ("points", "cells", "region", "static_displacement", "static_strain", "modal_displacement"):
+    for name in ("points", "cells", "region", "static_displacement", "modal_displacement"):
         for value in (np.array(1.0), np.array("a"), getattr(wing.basis, name)[:-1, ...]):
             with pytest.raises(ReducedModelFileError, match="field basis"):
                 replace(wing.basis, **{name: value})

@@ -14,16 +14,16 @@ from benchmarks.study_regions import bracket, plate, tube
 from fe.full.affine import AffineSum
 from fe.full.subspace import Norm
 from fe.reduction.dual_solutions import DualProblem
-from fe.reduction.structure_basis import StructureSettings
-from fe.reduction.structure_cache import reduced, reduced_structure
+from fe.reduction.model_cache import reduced, reduced_structure
+from fe.reduction.settings import StructureSettings
 from fe.reduction.structure_errors import measured_errors
 from fe.runtime.errors import ReductionError
-from fe.runtime.structure_model import StructureModel
+from fe.runtime.reduced import ReducedModel
 from fe.structure.design import load_structure, structure_hash
 from fe.structure.operators import Structure, load_and_assemble
 
 
-def test_four_regions_around_a_hole(coarse_plate: Structure, plate_model: StructureModel) -> None:
+def test_four_regions_around_a_hole(coarse_plate: Structure, plate_model: ReducedModel) -> None:
     """The bound holds at random states, nearly as asked for, and tells the error within a few times."""
     errors = measured_errors(coarse_plate, plate_model, 20)
     assert max(errors.strain, errors.displacement) <= errors.bound < 8e-3

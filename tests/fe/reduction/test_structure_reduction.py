@@ -11,25 +11,25 @@ from scipy.linalg import expm
 
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
-from fe.reduction.structure_basis import StructureReduction, reduce_structure
-from fe.reduction.structure_cache import reduced_structure
+from fe.reduction.model_cache import reduced_structure
+from fe.reduction.reduced_basis import Reduction, reduce_structure
 from fe.reduction.structure_errors import measured_errors
 from fe.runtime.errors import MeshError, OutsideModelError, ReducedModelFileError, ReductionError
-from fe.runtime.structure_model import StructureModel
-from fe.runtime.structure_motion import StructureMotion, StructureMotionState
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.transient import ModalIntegrator, TransientState
 from fe.structure.operators import Structure, load_and_assemble
 
 HURT = {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 3.0, "push": -120.0}
 
 
-def test_random_states_against_the_full_model(beam: Structure, beam_reduction: StructureReduction) -> None:
+def test_random_states_against_the_full_model(beam: Structure, beam_reduction: Reduction) -> None:
     """Strains and displacements err by less than their bound, which keeps its tolerance; modes by 2e-5."""
     errors = measured_errors(beam, beam_reduction.model, 6, seed=7)
     assert max(errors.strain, errors.displacement) < errors.bound < 1e-3
     assert errors.frequency < 2e-5
 
 
-def test_a_state_in_all_its_parts(beam: Structure, beam_reduction: StructureReduction) -> None:
+def test_a_state_in_all_its_parts(beam: Structure, beam_reduction: Reduction) -> None:
     """Parameter times loss, controls, and the weight of a free mass are those of the full sums."""
     model = beam_reduction.model
     stiffness = beam.stiffness({"e": 1.05}, {"z1": 0.6, "z2": 0.3})
@@ -47,7 +47,7 @@ def test_a_state_in_all_its_parts(beam: Structure, beam_reduction: StructureRedu
     np.testing.assert_allclose(np.abs(modes.output[:4]), wanted, atol=2e-3 * wanted.max())
 
 
-def test_many_states_at_once_are_the_same(beam_reduction: StructureReduction) -> None:
+def test_many_states_at_once_are_the_same(beam_reduction: Reduction) -> None:
     model = beam_reduction.model
     low, high = model.validity_box.T
     vectors = low + (high - low) * np.random.default_rng(3).random((5, len(low)))
@@ -56,12 +56,12 @@ def test_many_states_at_once_are_the_same(beam_reduction: StructureReduction) ->
         np.testing.assert_allclose(outputs, [*single.strain, *single.displacement], rtol=1e-11, atol=1e-16)
 
 
-def test_a_released_beam_moves_as_the_full_model(beam: Structure, beam_reduction: StructureReduction) -> None:
+def test_a_released_beam_moves_as_the_full_model(beam: Structure, beam_reduction: Reduction) -> None:
     """Ring-down after a push: once the high modes have died away, strain, position and acceleration agree."""
     model = beam_reduction.model
     vector = model.vector({**HURT, "load_factor": 0.0, "push": 100.0})
     let_go = model.vector({**HURT, "load_factor": 0.0, "push": 0.0})
-    motion = StructureMotion(model, vector, beam.damping_alpha, beam.damping_beta)
+    motion = ModalIntegrator(model, vector, beam.damping_alpha, beam.damping_beta)
     state = motion.at_rest(model.load_coefficients(vector))
     time, steps = 6e-3, 3
     for _ in range(steps):
@@ -85,22 +85,22 @@ def test_a_released_beam_moves_as_the_full_model(beam: Structure, beam_reduction
     at_start = np.abs(np.concatenate((beam.gauge_output @ start, beam.displacement_output @ start, [np.inf])))
     size = np.where(np.isinf(at_start), np.abs(wanted[-1]), at_start)
     assert np.all(np.abs(motion.outputs(state) - wanted) < 5e-3 * size)
-    kept = StructureMotionState.from_list(state.to_list(), model.mode_count)
+    kept = TransientState.from_list(state.to_list(), model.mode_count)
     assert np.array_equal(motion.outputs(kept), motion.outputs(state))
-    same = StructureMotion(model, vector, beam.damping_alpha, beam.damping_beta)
+    same = ModalIntegrator(model, vector, beam.damping_alpha, beam.damping_beta)
     taken = motion.outputs(same.take_over(state, motion))
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
 
 
-def test_the_file_gives_the_model_back(beam_reduction: StructureReduction) -> None:
+def test_the_file_gives_the_model_back(beam_reduction: Reduction) -> None:
     content = beam_reduction.model.to_bytes()
-    again = StructureModel.from_bytes(content)
+    again = ReducedModel.from_bytes(content)
     assert again.to_bytes() == content
     assert np.array_equal(
         again.static_response(HURT).strain, beam_reduction.model.static_response(HURT).strain
     )
     with pytest.raises(ReducedModelFileError):
-        StructureModel.from_bytes(content[:-100])
+        ReducedModel.from_bytes(content[:-100])
 
 
 def test_a_load_that_no_output_sees(write_beam: Callable[..., Path], tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_a_load_that_no_output_sees(write_beam: Callable[..., Path], tmp_path: P
     ],
 )
 def test_values_outside_are_refused(
-    beam_reduction: StructureReduction, values: dict[str, float], sentence: str
+    beam_reduction: Reduction, values: dict[str, float], sentence: str
 ) -> None:
     with pytest.raises(OutsideModelError, match=sentence):
         beam_reduction.model.static_response(values)

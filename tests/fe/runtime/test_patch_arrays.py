@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fe.full.patch_operators import strip_edges
-from fe.reduction import patch_cache
-from fe.reduction.model_cache import cache_key
+from fe.reduction import model_cache
+from fe.reduction.model_cache import entry
 from fe.reduction.patch_basis import PatchSettings, area_shares
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.patch_arrays import PatchArrays
@@ -86,14 +86,14 @@ def test_the_cache_builds_once(
         built.append(design.hash)
         return coarse_patch_arrays
 
-    monkeypatch.setattr(patch_cache, "build_patch_arrays", build)
-    first = patch_cache.patch_arrays(coarse_design)
-    assert patch_cache.patch_arrays(coarse_design).to_bytes() == first.to_bytes()
+    monkeypatch.setattr(model_cache, "build_patch_arrays", build)
+    first = model_cache.patch_arrays(coarse_design)
+    assert model_cache.patch_arrays(coarse_design).to_bytes() == first.to_bytes()
     assert built == [coarse_design.hash]
     other = PatchSettings(vectors=30)
-    assert cache_key(coarse_design) != cache_key(coarse_design, other)
-    (file,) = (tmp_path / "uav-twin").glob("*-patches.npz")
+    assert entry("patches", coarse_design.hash, None) != entry("patches", coarse_design.hash, other)
+    (file,) = (tmp_path / "uav-twin").glob("patches-*.npz")
     file.write_bytes(b"rubbish")
-    patch_cache.patch_arrays(coarse_design)
+    model_cache.patch_arrays(coarse_design)
     assert len(built) == 2
     assert "not usable" in caplog.text

@@ -80,14 +80,18 @@ def test_without_a_patch_it_is_the_reduced_model_within_its_error_bound(
 ) -> None:
     wing, model = coarse_patched_wing, coarse_reduction.model
     for e, loss, factor, force in ((1.0, (0.0, 0.0), 3.0, 0.0), (0.95, (0.6, 0.3), 2.0, 10.0)):
-        response = model.static_response(e, loss, factor, force)
+        response = model.static_response(
+            young_modulus_factor=e, stiffness_loss=loss, load_factor=factor, tip_force=force
+        )
         u = wing.structure(e, loss, *MASSES).static(wing.load(factor) + force * wing.force_row("tip_load"))
         scale = np.abs(response.strain).max()
         strain = wing.arrays.strain_rows[0] @ u
         assert np.abs(strain - response.strain).max() <= response.strain_error_bound + 3e-4 * scale
-        assert float(wing.arrays.tip_row @ u) == pytest.approx(response.tip_displacement, rel=5e-4)
+        assert float(wing.arrays.tip_row @ u) == pytest.approx(response.displacement[0], rel=5e-4)
         frequency = wing.structure(e, loss, *MASSES).modes(3)[0] / (2.0 * np.pi)
-        assert frequency == pytest.approx(model.modes(e, loss, *MASSES).frequency[:3], rel=FREQUENCY)
+        names = ("servo_mass", "pitot_mass")
+        modes = model.modes({"young_modulus_factor": e, **dict(zip(names, MASSES, strict=True))}, loss)
+        assert frequency == pytest.approx(modes.frequency[:3], rel=FREQUENCY)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3])

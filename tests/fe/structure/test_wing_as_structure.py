@@ -15,7 +15,7 @@ from skfem import ElementHexS2
 
 from fe.full.assembly import Discretisation, cell_axes, positions, rotate_elasticity
 from fe.full.operators import assemble, cell_density, cell_elasticity
-from fe.reduction.structure_cache import reduced
+from fe.reduction.model_cache import reduced
 from fe.structure.affine import StiffnessTerm
 from fe.structure.elements import HEXAHEDRA_20
 from fe.structure.operators import load_and_assemble

@@ -12,32 +12,31 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fe.reduction.structure_basis import StructureReduction
-from fe.runtime.structure_model import StructureModel
+from fe.reduction.reduced_basis import Reduction
+from fe.runtime.reduced import ReducedModel
 from fmu_asset.check import check_fmu
-from fmu_asset.packing.wing_fmu import recorded_content_hash
-from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
 
 OK, DISCARD, ERROR = 0, 2, 3
 DRIVER = Path(__file__).with_name("driver.c")
 
 
 @pytest.fixture(scope="module")
-def beam_model(beam_reduction: StructureReduction) -> StructureModel:
+def beam_model(beam_reduction: Reduction) -> ReducedModel:
     return beam_reduction.model
 
 
 @pytest.fixture(scope="module")
 def pair(
-    compiler: list[str], beam_model: StructureModel, tmp_path_factory: pytest.TempPathFactory
+    compiler: list[str], beam_model: ReducedModel, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path]:
     """The beam as a compiled FMU, and as one that runs in Python."""
     folder = tmp_path_factory.mktemp("pair")
-    compiled = build_structure_fmu(beam_model, folder / "compiled.fmu", kind="compiled").path
-    return compiled, build_structure_fmu(beam_model, folder / "python.fmu").path
+    compiled = build_fmu(beam_model, folder / "compiled.fmu", kind="compiled").path
+    return compiled, build_fmu(beam_model, folder / "python.fmu").path
 
 
-def _fly(slave: Any, model: StructureModel, seed: int, response: int) -> list[list[float]]:
+def _fly(slave: Any, model: ReducedModel, seed: int, response: int) -> list[list[float]]:
     """Parameters, inputs and steps at random: health mostly stays, a load is often none at all."""
     rng = np.random.default_rng(seed)
     inputs = [v for v in slave.description.variables if v.causality == "input"]
@@ -67,7 +66,7 @@ def _fly(slave: Any, model: StructureModel, seed: int, response: int) -> list[li
 
 
 def test_outputs_equal_those_of_the_python_fmu(
-    pair: tuple[Path, Path], beam_model: StructureModel, open_slave: Callable[..., Any]
+    pair: tuple[Path, Path], beam_model: ReducedModel, open_slave: Callable[..., Any]
 ) -> None:
     """Strains, displacements, accelerations, both bounds, frequencies, damping ratios: to 1e-12."""
     slaves = [open_slave(path) for path in pair]
@@ -92,9 +91,9 @@ def test_outputs_equal_those_of_the_python_fmu(
 
 
 def test_a_compiled_fmu_bounds_as_python_does(
-    compiler: list[str], plate_model: StructureModel, tmp_path: Path, open_slave: Any
+    compiler: list[str], plate_model: ReducedModel, tmp_path: Path, open_slave: Any
 ) -> None:
-    compiled = build_structure_fmu(plate_model, tmp_path / "compiled.fmu", kind="compiled").path
+    compiled = build_fmu(plate_model, tmp_path / "compiled.fmu", kind="compiled").path
     slave, rng = open_slave(compiled), np.random.default_rng(3)
     assert slave.start(response=1) == 0, slave.log
     place, names = slave.reference, [v.name for v in slave.description.variables if v.kind == "Real"]

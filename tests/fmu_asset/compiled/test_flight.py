@@ -16,7 +16,7 @@ import pytest
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.variables import (
     STATUS_BAD_CALL,
     STATUS_BAD_STATE,

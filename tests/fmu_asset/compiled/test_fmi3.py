@@ -16,15 +16,14 @@ from fmpy.fmi3 import FMU3Slave, fmi3IntermediateUpdateCallback, fmi3LogMessageC
 from fmpy.validation import validate_fmu
 from scipy.linalg import eigh
 
-from fe.reduction.structure_basis import StructureReduction
+from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.check import check_fmu
 from fmu_asset.door.binding import load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.packing.wing_fmu import build_fmu, recorded_content_hash
-from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
 from scenarios import binding_files
 from tests.kept import compiled_wing
 
@@ -168,8 +167,8 @@ def test_the_sources_are_clean_and_export_all_of_fmi_3(
     assert "structure_fmi2.c" not in {path.name for path in (tmp_path / "sources").iterdir()}
 
 
-def test_a_structure_has_arrays_too(beam_reduction: StructureReduction, tmp_path: Path) -> None:
-    path = build_structure_fmu(beam_reduction.model, tmp_path / "beam.fmu", kind="source", fmi=3).path
+def test_a_structure_has_arrays_too(beam_reduction: Reduction, tmp_path: Path) -> None:
+    path = build_fmu(beam_reduction.model, tmp_path / "beam.fmu", kind="source", fmi=3).path
     assert validate_fmu(str(path)) == []
     with zipfile.ZipFile(path) as archive:
         text = archive.read("modelDescription.xml").decode()

@@ -24,7 +24,7 @@ from fmu_asset.compiled.exchange import STATES as STATE_NAMES
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from tests.kept import compiled_wing
 
 STATES = 16

@@ -18,7 +18,7 @@ import pytest
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.compiled.compiler import CROSS_COMPILER
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 COURSE = [(1.0 + 0.25 * k, 0.1 * (k // 3), 0.2, -5.0 if k % 2 else 0.0) for k in range(9)]
 
@@ -68,7 +68,9 @@ def test_a_host_without_python_needs_nothing_else(
         env={},
     )
     assert done.returncode == 0, done.stdout
-    expected = model.static_response(1.0, (0.0, 0.0), 1.0).strain
+    expected = model.static_response(
+        young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), load_factor=1.0
+    ).strain
     np.testing.assert_allclose([float(line) for line in done.stdout.split()], expected, rtol=1e-12)
 
 
@@ -126,7 +128,9 @@ def test_both_fmus_fly_in_libcosim(compiled_fmu: Path, fmu: Path, model: Reduced
     seen = json.loads(done.stdout.split("SEEN", 1)[1].splitlines()[0])
     assert len(seen) == len(COURSE)
     for (load_factor, z1, z2, force), (compiled, python) in zip(COURSE, seen, strict=True):
-        expected = model.static_response(1.0, (z1, z2), load_factor, force)
+        expected = model.static_response(
+            young_modulus_factor=1.0, stiffness_loss=(z1, z2), load_factor=load_factor, tip_force=force
+        )
         np.testing.assert_allclose(compiled[:24], expected.strain, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(compiled, python, rtol=1e-9, atol=1e-15)
 
@@ -157,7 +161,9 @@ def test_the_compiled_fmu_runs_in_omsimulator(
         last = list(csv.DictReader(lines))[-1]
     strain = {name: float(value) for name, value in last.items() if "strain[" in name}
     assert len(strain) == 24
-    expected = model.static_response(1.0, (0.0, 0.0), 1.0).strain
+    expected = model.static_response(
+        young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), load_factor=1.0
+    ).strain
     for name, value in strain.items():
         assert value == pytest.approx(
             expected[int(name.split("[")[1].split("]")[0]) - 1], rel=1e-9, abs=1e-15

@@ -24,7 +24,7 @@ from fmu_asset.compiled.compiler import compile_library, find_compiler
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError, FmuCallError, FmuUnsupportedError
-from fmu_asset.packing.wing_fmu import build_fmu, recorded_content_hash
+from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
 from tests.command_line import command
 
 BIN = Path(sys.executable).parent
@@ -95,7 +95,9 @@ def test_start_values_come_from_the_state(
         assert slave.everything()[1:3] == [0.1, 1.0 / 3.0]
         assert slave.fmu.getReal([slave.reference["young_modulus_factor"]]) == [1.0 + 1e-15]
         assert slave.start() == 0
-        expected = model.static_response(1.0 + 1e-15, (0.1, 1.0 / 3.0), 1.0)
+        expected = model.static_response(
+            young_modulus_factor=1.0 + 1e-15, stiffness_loss=(0.1, 1.0 / 3.0), load_factor=1.0
+        )
         np.testing.assert_allclose(slave.everything()[10:34], expected.strain, rtol=1e-12)
     finally:
         slave.close()

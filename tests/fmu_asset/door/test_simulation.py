@@ -29,7 +29,7 @@ from fmu_asset.errors import (
     FmuTimeoutError,
     FmuWorkerError,
 )
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 NOT_A_NUMBER, SLEEP, DIE, DISCARD = 1.0, 2.0, 3.0, 5.0
 BOTH = pytest.mark.parametrize("isolated", [True, False], ids=["worker", "in process"])

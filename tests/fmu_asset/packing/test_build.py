@@ -18,7 +18,7 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
 from fmu_asset.check import check_fmu
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.packing.wing_fmu import build_fmu, recorded_content_hash
+from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
 
 BIN = Path(sys.executable).parent
 ROOT = Path(__file__).parents[3]
@@ -33,7 +33,7 @@ def test_two_builds_in_different_processes_are_equal(fmu: Path, model: ReducedMo
     model.save(tmp_path / "model.npz")
     program = (
         "import sys; from fe.runtime.reduced import ReducedModel; "
-        "from fmu_asset.packing.wing_fmu import build_fmu; "
+        "from fmu_asset.packing.structure_fmu import build_fmu; "
         "build_fmu(ReducedModel.load(sys.argv[1]), sys.argv[2])"
     )
     environment = {**os.environ, "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo", "LC_ALL": "C"}
@@ -142,7 +142,7 @@ def test_needs_numpy_alone(fmu: Path, tmp_path: Path) -> None:
         "sys.path.insert(0, 'resources')\n"
         "name = open('resources/slavemodule.txt').read()\n"
         "module = __import__(name)\n"
-        "wing = getattr(module, 'UavWing_' + name.rpartition('_')[2])\n"
+        "wing = getattr(module, 'Structure_' + name.rpartition('_')[2])\n"
         "wing = wing(instance_name='a', resources='resources')\n"
         "wing.enter_initialization_mode(); wing.exit_initialization_mode()\n"
         "assert wing.do_step(0.0, 1.0) is True, wing.log_queue\n"
@@ -158,7 +158,7 @@ def test_a_changed_file_is_noticed(fmu: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(fmu) as source, zipfile.ZipFile(changed, "w") as target:
         for name in source.namelist():
             data = source.read(name)
-            target.writestr(name, data.replace(b'"mode_count": 6', b'"mode_count": 5'))
+            target.writestr(name, data.replace(b'"chain"', b'"other"'))
     assert any("GUID" in problem for problem in check_fmu(changed).problems)
     foreign = tmp_path / "foreign.fmu"
     with zipfile.ZipFile(fmu) as source, zipfile.ZipFile(foreign, "w") as target:

@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fe.reduction.structure_basis import StructureReduction
-from fe.runtime.structure_model import StructureModel
-from fe.runtime.structure_motion import StructureMotion
+from fe.reduction.reduced_basis import Reduction
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import WING
+from fe.runtime.transient import ModalIntegrator
+from fe.structure.operators import Structure
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.check.file import check_file
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.structures.binding import names_of_model, structure_binding
-from fmu_asset.structures.build import build_structure_fmu, structure_fmu_bytes
+from fmu_asset.packing.structure_fmu import build_fmu, fmu_bytes
+from fmu_asset.slaves.table import structure_table
+from fmu_asset.structures.binding import structure_binding
 
 
 @pytest.fixture(scope="module")
-def model(beam_reduction: StructureReduction) -> StructureModel:
+def model(beam_reduction: Reduction) -> ReducedModel:
     """The reduced beam."""
     return beam_reduction.model
 
 
 @pytest.fixture(scope="module")
-def fmu(model: StructureModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fmu(model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its FMU."""
-    return build_structure_fmu(model, tmp_path_factory.mktemp("fmu") / "beam.fmu").path
+    return build_fmu(model, tmp_path_factory.mktemp("fmu") / "beam.fmu").path
 
 
-def _inputs(model: StructureModel, steps: int) -> list[dict[str, float]]:
+def _inputs(model: ReducedModel, steps: int) -> list[dict[str, float]]:
     random = np.random.default_rng(11)
     return [
         {name: float(random.uniform(*model.validity[name])) for name in (*model.controls, *model.regions)}
@@ -38,10 +42,10 @@ def _inputs(model: StructureModel, steps: int) -> list[dict[str, float]]:
     ]
 
 
-def test_every_step_is_that_of_the_model(model: StructureModel, fmu: Path) -> None:
+def test_every_step_is_that_of_the_model(model: ReducedModel, fmu: Path, beam: Structure) -> None:
     """Quasi-static: strains, displacements and bounds to 1e-12 of the largest; accelerations are zero."""
     with FmiAsset(
-        fmu, structure_binding(names_of_model(model)), parameters={"e": 1.06, "pump": 0.03}, isolated=False
+        fmu, structure_binding(beam.design), parameters={"e": 1.06, "pump": 0.03}, isolated=False
     ) as asset:
         for chosen in _inputs(model, 20):
             seen = asset.step(
@@ -56,12 +60,12 @@ def test_every_step_is_that_of_the_model(model: StructureModel, fmu: Path) -> No
             assert seen.extra["strain_error_bound"] == pytest.approx(found.strain_error_bound, rel=1e-12)
 
 
-def test_motion_is_that_of_the_model(model: StructureModel, fmu: Path) -> None:
+def test_motion_is_that_of_the_model(model: ReducedModel, fmu: Path, beam: Structure) -> None:
     """Transient, health changing on the way; a state that is restored goes on to the bit."""
     steps = _inputs(model, 12)
     for number in range(1, 6):  # the load jumps while health stays
         steps[number] |= {name: steps[0][name] for name in model.regions}
-    binding = structure_binding(names_of_model(model))
+    binding = structure_binding(beam.design)
     binding = binding.model_copy(update={"binding": binding.binding.model_copy(update={"step_size": 1e-3})})
     seen, kept, after = [], b"", []
     with FmiAsset(fmu, binding, parameters={"response": 2}, isolated=False) as asset:
@@ -82,13 +86,13 @@ def test_motion_is_that_of_the_model(model: StructureModel, fmu: Path) -> None:
                 ).values
             )
     assert np.array_equal(after, seen[8:])
-    motion = StructureMotion(model, model.nominal, *model.damping)
+    motion = ModalIntegrator(model, model.nominal, *model.damping)
     state = motion.at_rest(model.load_coefficients(model.nominal))
     wanted, health = [], dict.fromkeys(model.regions, 0.0)
     for chosen in steps:
         vector = model.vector(chosen)
         if health != (health := {name: chosen[name] for name in model.regions}):
-            before, motion = motion, StructureMotion(model, vector, *model.damping)
+            before, motion = motion, ModalIntegrator(model, vector, *model.damping)
             state = motion.take_over(state, before)
         state = motion.advance(state, 1e-3, model.load_coefficients(vector))
         wanted.append(motion.outputs(state))
@@ -103,9 +107,15 @@ def test_the_check_of_the_file_finds_nothing(fmu: Path) -> None:
     assert {"fmpy validate", "content", "units", "ranges"} <= set(findings)
 
 
-def test_equal_models_make_equal_bytes_and_bad_starts_are_refused(model: StructureModel, fmu: Path) -> None:
-    assert structure_fmu_bytes(model)[0] == fmu.read_bytes()
+def test_a_structure_of_the_wings_name_is_no_wing(model: ReducedModel) -> None:
+    table, roles = structure_table(replace(model, name=WING), {})
+    assert roles.displacement_bound == "displacement_error_bound"
+    assert [row.name for row in table] == [row.name for row in structure_table(model, {})[0]]
+
+
+def test_equal_models_make_equal_bytes_and_bad_starts_are_refused(model: ReducedModel, fmu: Path) -> None:
+    assert fmu_bytes(model)[0] == fmu.read_bytes()
     with pytest.raises(FmuBuildError, match="'z9'"):
-        structure_fmu_bytes(model, {"z9": 1.0})
+        fmu_bytes(model, start={"z9": 1.0})
     with pytest.raises(FmuBuildError, match=r"health\.z1"):
-        structure_fmu_bytes(model, {"health.z1": 0.9})
+        fmu_bytes(model, start={"health.z1": 0.9})

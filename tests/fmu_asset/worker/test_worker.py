@@ -18,7 +18,7 @@ from fe.runtime.reduced import ReducedModel
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuOutputError, FmuStateError, FmuTimeoutError, FmuWorkerError
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 
 ROOT = Path(__file__).parents[3]
 FINE, NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD, WANDER, TALK = map(float, range(8))

@@ -284,7 +284,9 @@ def library_of(wing: ReducedModel, scale: np.ndarray, e: float = 1.0073) -> dict
     levels = (0, 20, 40, 60, 80)
 
     def strains(factor: float, z1: int, z2: int, load: float) -> list[float]:
-        strain = wing.static_response(factor, (z1 / 100, z2 / 100), load).strain
+        strain = wing.static_response(
+            young_modulus_factor=factor, stiffness_loss=(z1 / 100, z2 / 100), load_factor=load
+        ).strain
         return list(1e6 * scale * strain)
 
     draws = {"mean": e, "1.0": 1.0, "1.01": 1.01}
@@ -399,7 +401,9 @@ class TestOnTheWing:
             flown = load_strain_library(twisted).strain_at((0.0, 0.0), 1)
             np.testing.assert_allclose(tree["truth"]["strain"][0], flown)
             mean = float(figures["young_modulus_factor_mean"].value or 0.0)
-            believed = wing.static_response(mean, (0.0, 0.0), 3.0).strain
+            believed = wing.static_response(
+                young_modulus_factor=mean, stiffness_loss=(0.0, 0.0), load_factor=3.0
+            ).strain
             np.testing.assert_allclose(tree["filtered"]["quantity_mean"][0], believed, rtol=1e-3)
         assert (whole.folder / "wing.vtu").stat().st_size > 10_000
         config = json.loads((whole.folder / "config.json").read_text(encoding="utf-8"))

@@ -12,7 +12,7 @@ from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
 from fmu_asset.errors import FmuError
-from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.packing.structure_fmu import build_fmu
 from twin_master.assets.virtual_experiments import FmuTestBench
 from twin_master.errors import MissionInputError
 

@@ -1,4 +1,4 @@
-"""Packing a reduced model as the wing FMU: FMI 2.0 or 3.0 co-simulation, reproducible to the byte.
+"""Packing a reduced model, of a wing or a structure, as an FMU of FMI 2.0 or 3.0, reproducible to the byte.
 
 What goes into the compiled kind is in `compiled`. Of the Python kind, slave base class and binaries are
 pythonfmu's; the archive is packed here and not by its builder, which stamps times, a random GUID and module
@@ -10,18 +10,19 @@ import os
 import re
 import zipfile
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Literal, TypedDict, Unpack
 
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
+from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
 from fmu_asset.compiled.compiler import PLATFORM, Platform
 from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
-from fmu_asset.compiled.variable_header import Roles
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
-from fmu_asset.slaves.variables import UNITS, FmuVariable, variable_table
+from fmu_asset.slaves.table import Roles, is_wing, structure_table
+from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .contents import (
     PLACEHOLDER,
@@ -38,48 +39,54 @@ from .contents import (
     write_fmu,
 )
 from .patch_file import PatchFile
-from .patched_runtime import MODE_COUNT, output_channels, patched_members, plain_effects
+from .patched_runtime import output_channels, patched_members, plain_effects
 from .python_fmu import python_members
 
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""
 
-DESCRIPTION = (
+_OF_THE_WING = (
     "Structure of a UAV half-wing: strains, tip displacement and modes from a reduced finite element model "
     "under load factor and tip force, with regions that can lose stiffness."
 )
+_OF_A_STRUCTURE = (
+    "Structure {}: strains, displacements, accelerations and modes from a reduced finite element model under "
+    "its loads, with regions that can lose stiffness."
+)
+_ACCELERATION = Unit("m/s2", (("m", 1), ("s", -2)))
 
-_IMPORTS = """from .slaves.wing_contents import load_contents
-from .slaves.wing_slave import WingSlave as _Slave
-"""
+
+class FmuOptions(TypedDict, total=False):
+    """What may be said of an FMU to be packed, see `build_fmu`."""
+
+    state: DigitalState | None
+    start: Mapping[str, float] | None
+    kind: FmuKind
+    note: str
+    resources: Mapping[str, bytes] | None
+    patch: PatchFile | None
+    activate: bool
+    arrays: PatchArrays | None
+    fmi: FmiVersion
+    interface: Interface
+    platforms: Sequence[Platform]
 
 
 def build_fmu(
-    model: ReducedModel,
-    path: str | os.PathLike[str],
-    *,
-    state: DigitalState | None = None,
-    kind: FmuKind = "python",
-    note: str = "",
-    resources: Mapping[str, bytes] | None = None,
-    patch: PatchFile | None = None,
-    activate: bool = False,
-    arrays: PatchArrays | None = None,
-    fmi: FmiVersion = 2,
-    interface: Interface = "co-simulation",
-    platforms: Sequence[Platform] = (PLATFORM,),
-    replace: bool = False,
+    model: ReducedModel, path: str | os.PathLike[str], *, replace: bool = False, **options: Unpack[FmuOptions]
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
 
     Parameters
     ----------
     model : ReducedModel
-        The wing.
+        The wing or structure.
     path : path-like
         Where to write, with the suffix .fmu.
     state : DigitalState, optional
-        Start values of parameters and health; the digital state's defaults if absent.
+        Start values of parameters and health of a wing; the nominal ones if absent.
+    start : mapping of str to float, optional
+        Start values by variable name that take the place of these.
     kind : {"python", "compiled", "source"}
         What evaluates the model: Python in the host, C compiled now, or C to be compiled elsewhere.
     note : str
@@ -92,7 +99,7 @@ def build_fmu(
     activate : bool
         Whether these are switched on from the start.
     arrays : PatchArrays, optional
-        The wing in the basis for patches (`fe.reduction.patch_cache.patch_arrays`); needed where an effect
+        The wing in the basis for patches (`fe.reduction.model_cache.patch_arrays`); needed where an effect
         changes structure or loads, or turns a gauge.
     fmi : {2, 3}
         Version of FMI; 3 for the kinds in C.
@@ -106,27 +113,16 @@ def build_fmu(
     Raises
     ------
     FmuBuildError
-        If the file exists, the suffix is wrong, a start value lies outside the model's validity box, a
-        resource would take the place of another file, the kind is not of that version of FMI, the wrong
-        pythonfmu is installed, or there is no C compiler for a compiled one.
+        If the file exists, the suffix is wrong, a start value is of no variable or lies outside the model's
+        validity box, a name is taken by a variable of the FMU, a resource would take the place of another
+        file, the kind is not of that version of FMI, the wrong pythonfmu is installed, or there is no C
+        compiler for a compiled one.
     PatchFileError
         If the FMU cannot carry an effect of the patch.
     """
     target = checked_target(path, replace=replace)
-    content, content_hash = fmu_bytes(
-        model,
-        state,
-        kind,
-        note=note,
-        resources=resources,
-        patch=patch,
-        activate=activate,
-        arrays=arrays,
-        fmi=fmi,
-        interface=interface,
-        platforms=platforms,
-    )
-    return write_fmu(target, content, content_hash, "uav_wing", model.design_hash)
+    content, content_hash = fmu_bytes(model, **options)
+    return write_fmu(target, content, content_hash, stem_of(model), model.design_hash)
 
 
 def fmu_bytes(
@@ -134,6 +130,7 @@ def fmu_bytes(
     state: DigitalState | None = None,
     kind: FmuKind = "python",
     *,
+    start: Mapping[str, float] | None = None,
     note: str = "",
     resources: Mapping[str, bytes] | None = None,
     patch: PatchFile | None = None,
@@ -145,91 +142,86 @@ def fmu_bytes(
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
     check_version(kind, fmi, interface)
-    start = start_values(model, state or DigitalState())
-    mode_count = min(MODE_COUNT, model.mode_count)
-    table = _table_of(model, mode_count, start)
+    values = start_values(model, state) if state is not None else {}
+    values |= {name: float(value) for name, value in (start or {}).items()}
+    try:
+        table, roles = structure_table(model, values)
+    except ValueError as error:
+        raise FmuBuildError(f"The FMU of the structure {model.name} cannot be built: {error}.") from error
     effects = []
     if patch is not None:
         check_kind(kind)
         effects = plain_effects(patch.for_outputs(output_channels(model.gauge_count)))
-        start |= {switch_of(effect): float(activate) for effect in effects}
-        table += effect_rows(effects, len(table), start)
-        check_start(table)
-    description = f"{DESCRIPTION} {note}".strip()
+        values |= {switch_of(effect): float(activate) for effect in effects}
+        table += effect_rows(effects, len(table), values)
+    check_start(table)
+    name, kept = stem_of(model), {} if not effects else patched_members(model, effects, arrays)
     if kind == "python":
-        setting = {"mode_count": mode_count, "start": start}
-        template = python_members(
-            "uav_wing",
-            "UavWing_",
-            imports=_IMPORTS,
+        kept["resources/start.json"] = (json.dumps(values, sort_keys=True, indent=1) + "\n").encode()
+    template = kept | _template(model, table, roles, kind, note, fmi, interface)
+    for file, content in (resources or {}).items():
+        if f"resources/{file}" in template or "/" in file or not file:
+            raise FmuBuildError(f"A resource of an FMU cannot have the name {file!r}; choose another one.")
+        template[f"resources/{file}"] = content
+    content_hash = content_hash_of(template)
+    members = filled(template, content_hash)
+    if kind == "compiled":
+        members |= binaries_of(members, f"{name}_{tag_of(content_hash)}", fmi, platforms)
+    return archive_bytes(members), content_hash
+
+
+def _template(
+    model: ReducedModel,
+    table: tuple[FmuVariable, ...],
+    roles: Roles,
+    kind: FmuKind,
+    note: str,
+    fmi: FmiVersion,
+    interface: Interface,
+) -> dict[str, bytes]:
+    """Return the files of an FMU with the placeholder in them, but for start values and effects."""
+    name = stem_of(model)
+    description = _OF_THE_WING if is_wing(model) else _OF_A_STRUCTURE.format(model.name)
+    description = f"{description} {note}".strip()
+    if kind == "python":
+        return python_members(
+            name,
+            "Structure_",
+            imports="from .slaves.contents import load_contents\n",
             table=table,
             description=description,
             resources={
                 "reduced_model.npz": model.to_bytes(),
-                "start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
+                DESIGN_RECORD: design_record(model.design_hash),
             },
-            units=UNITS + units_of(table),
-        ) | room_members("fe.runtime", f"resources/uav_wing_{PLACEHOLDER}_runtime/fe")
-        if effects:
-            template |= patched_members(model, effects, arrays)
-    else:
-        template = compiled_members(
-            model,
-            table,
-            _roles_of(model),
-            model_name="uav_wing",
-            identifier=f"uav_wing_{PLACEHOLDER}",
-            guid=PLACEHOLDER,
-            content_tag=PLACEHOLDER,
-            description=description,
-            fmi=fmi,
-            interface=interface,
-        )
-    for name, content in (resources or {}).items():
-        if f"resources/{name}" in template or "/" in name or not name:
-            raise FmuBuildError(f"A resource of an FMU cannot have the name {name!r}; choose another one.")
-        template[f"resources/{name}"] = content
-    return packed(template, "uav_wing", kind, fmi, platforms)
-
-
-def packed(
-    template: Mapping[str, bytes],
-    stem: str,
-    kind: FmuKind,
-    fmi: FmiVersion,
-    platforms: Sequence[Platform] = (PLATFORM,),
-) -> tuple[bytes, str]:
-    """Return the archive of the files with their placeholders, compiled where the kind is, and their hash."""
-    content_hash = content_hash_of(template)
-    members = filled(template, content_hash)
-    if kind == "compiled":
-        members |= binaries_of(members, f"{stem}_{tag_of(content_hash)}", fmi, platforms)
-    return archive_bytes(members), content_hash
-
-
-def _table_of(model: ReducedModel, mode_count: int, start: Mapping[str, float]) -> tuple[FmuVariable, ...]:
-    """Return the checked table of a wing without missing effects."""
-    table = variable_table(
-        gauge_count=model.gauge_count,
-        mode_count=mode_count,
-        regions=model.regions,
-        validity=model.validity,
-        start=start,
+            units=_units(table),
+        ) | room_members("fe.runtime", f"resources/{name}_{PLACEHOLDER}_runtime/fe")
+    return compiled_members(
+        model,
+        table,
+        roles,
+        units=_units(table),
+        model_name=name,
+        placeholder=PLACEHOLDER,
+        description=description,
+        fmi=fmi,
+        interface=interface,
     )
-    check_start(table)
-    return table
 
 
-def _roles_of(model: ReducedModel) -> Roles:
-    """Return which variables of the wing are what; its second load, the tip force, holds the tip aside."""
-    losses = (f"health.{name}" for name in model.regions)
-    return Roles(
-        chosen=("young_modulus_factor", *losses, "mass.servo", "mass.pitot", "load_factor", "tip_force"),
-        outputs=model.gauge_count + 1,
-        point_load=1,
-        release="initial_tip_displacement",
-        load_point="load_point_displacement",
-    )
+def stem_of(model: ReducedModel) -> str:
+    """Return the name of a structure as an identifier of C."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", model.name).strip("_")[:40]
+    return plain if plain[:1].isalpha() else f"structure_{plain}".rstrip("_")
+
+
+def _units(table: tuple[FmuVariable, ...]) -> tuple[Unit, ...]:
+    """Return the units of the table; of a control's unit that is not known no more than its name is told."""
+    moving = any(row.unit == _ACCELERATION.name for row in table)
+    known = (*UNITS, *((_ACCELERATION,) if moving else ()), *units_of(table))
+    names = {unit.name for unit in known}
+    others = sorted({row.unit for row in table if row.unit is not None} - names)
+    return (*known, *(Unit(name) for name in others))
 
 
 def check_kind(kind: FmuKind) -> None:
@@ -251,7 +243,7 @@ def check_version(kind: FmuKind, fmi: FmiVersion, interface: Interface = "co-sim
 
 
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:
-    """Return the start values of the FMU's variables that a digital state gives, by variable name."""
+    """Return the start values of a wing's FMU that a digital state gives, by variable name."""
     losses = zip(model.regions, model.losses(state.stiffness_loss), strict=True)
     return {
         "young_modulus_factor": float(state.young_modulus_factor),

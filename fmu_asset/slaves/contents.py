@@ -1,4 +1,4 @@
-"""What the FMU of the wing holds in its resources: its table of variables and its behaviour.
+"""What the FMU of a structure holds in its resources: its table of variables and its behaviour.
 
 This file is copied into the FMU, as `behaviour`.
 """
@@ -11,25 +11,19 @@ from typing import Any
 from fe.runtime.reduced import ReducedModel
 
 from .base import Contents
-from .behaviour import WingBehaviour
-from .variables import variable_table
+from .behaviour import StructureBehaviour, later_outputs
+from .table import structure_table
 
 
 def load_contents(resources: Path) -> Contents:
-    """Return what the files that `fmu_asset.packing.wing_fmu` packed describe."""
-    model = ReducedModel.load(resources / "reduced_model.npz")
-    setting = _read(resources / "start.json")
-    count, start = setting["mode_count"], setting["start"]
-    table = variable_table(
-        gauge_count=model.gauge_count,
-        mode_count=count,
-        regions=model.regions,
-        validity=model.validity,
-        start=start,
-    )
+    """Return what the files that `fmu_asset.packing.structure_fmu` packed describe."""
+    model, start = ReducedModel.load(resources / "reduced_model.npz"), _read(resources / "start.json")
+    own = {name: value for name, value in start.items() if not name.startswith("effect.")}
+    table, roles = structure_table(model, own)
+    later = later_outputs(table, roles)
     if not (resources / "effects.json").is_file():
-        return Contents(table, lambda: WingBehaviour(model, count))
-    # a plain wing needs nothing of these
+        return Contents(table, lambda: StructureBehaviour(model, table, roles), later)
+    # a plain structure needs nothing of these
     from .effect_variables import effect_rows
     from .patched_behaviour import PatchedBehaviour
 
@@ -45,7 +39,8 @@ def load_contents(resources: Path) -> Contents:
         steps = partial(PatchedSteps, model, PatchedWing(PatchArrays.load(arrays)))
     return Contents(
         table + effect_rows(effects, len(table), start),
-        lambda: PatchedBehaviour(model, count, effects, channels, steps),
+        lambda: PatchedBehaviour(model, table, roles, effects, channels, steps),
+        later,
     )
 
 

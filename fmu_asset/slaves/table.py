@@ -1,0 +1,174 @@
+"""The table of variables of a structure's FMU, of which the wing has names and texts of its own.
+
+Copied into the FMU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import TIP_FORCE, WING
+
+from .variables import QUASI_STATIC, TRANSIENT, FmuVariable, Table
+
+RESERVED = ("response", "status", "strain_error_bound", "displacement_error_bound")
+"""Names that controls and parameters of a structure cannot have: its FMU has variables of that name."""
+MODE_COUNT = 6
+"""Number of modes of which frequency and damping ratio are outputs, if the model has as many."""
+TIP_DISPLACEMENT_LIMIT = 0.5
+"""Linear kinematics: half a metre at the tip of a wing of 1.8 m is already generous."""
+
+_OF_THE_WING = {
+    "load_factor": "Load factor of the turn, lift over weight",
+    "tip_force": "Upward force at the load point near the tip",
+    "young_modulus_factor": "Factor on Young's modulus of the skin (e)",
+    "servo_mass": "Mass of each of the two servos",
+    "pitot_mass": "Mass of the pitot tube at the tip",
+    "tip": "Displacement of the tip, positive upwards",
+}
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Which variables of a table are what; the outputs of the model come first among the outputs.
+
+    Attributes
+    ----------
+    chosen : tuple of str
+        Names of all that can be chosen, in the order of the model: parameters, losses, masses, controls.
+    outputs : int
+        Number of strains, displacements and accelerations.
+    displacement_bound : str or None
+        The bound of the displacements, where it is an output.
+    point_load : int
+        Index of the load that holds the structure aside before a release, and whose point may be an output.
+    release, load_point : str or None
+        The parameter that says how far it is held aside, and the displacement of that point.
+    """
+
+    chosen: tuple[str, ...]
+    outputs: int
+    displacement_bound: str | None = None
+    point_load: int = 0
+    release: str | None = None
+    load_point: str | None = None
+
+
+def is_wing(model: ReducedModel) -> bool:
+    """Return whether a model is that of a wing, and no structure that only bears its name."""
+    return model.name == WING and len(model.followed_shapes) > 0
+
+
+def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tuple[FmuVariable, ...], Roles]:
+    """Return the table, inputs, parameters and outputs, and which of its rows is what.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The reduced structure.
+    start : mapping of str to float
+        Start values by variable name that take the place of the nominal ones.
+
+    Raises
+    ------
+    ValueError
+        If a start value is of no input or parameter, or a name is one of `RESERVED`.
+    """
+    for name in (*model.controls, *model.parameters):
+        if name in RESERVED:
+            raise ValueError(f"a structure with an FMU can have no control or parameter named {name!r}")
+    table, wing = Table(start), is_wing(model)
+    texts = _OF_THE_WING if wing else {}
+    nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
+    validity = model.validity
+    health = {name: f"health.{name}" for name in model.regions}
+    mass = {name: f"mass.{name.removesuffix('_mass') if wing else name}" for name in model.masses}
+
+    def add_controls(part: slice) -> None:
+        for name, unit in list(zip(model.controls, model.control_units.split(), strict=True))[part]:
+            text = texts.get(name, f"Control {name} of the loads")
+            table.add(name, "input", text, unit=unit, box=validity[name], default=nominal[name])
+
+    first = 1 if wing else len(model.controls)  # its value references are those that it always had
+    add_controls(slice(0, first))
+    for name, variable in health.items():
+        table.add(
+            variable, "input", f"Stiffness that the region {name} has lost, as a fraction",
+            unit="1", display="%", box=validity[name],
+        )  # fmt: skip
+    add_controls(slice(first, None))
+    for name in model.parameters:
+        text = texts.get(name, f"Factor {name} on the stiffness")
+        table.add(name, "parameter", text, unit="1", box=validity[name], default=nominal[name])
+
+    def add_masses() -> None:
+        for name, variable in mass.items():
+            table.add(
+                variable, "parameter", texts.get(name, f"Mass of {name}"), unit="kg", display="g",
+                box=validity[name], default=nominal[name],
+            )  # fmt: skip
+
+    if not wing:
+        add_masses()
+    for name, what, unit, value in zip(
+        ("alpha", "beta"), ("Mass", "Stiffness"), ("1/s", "s"), model.damping.tolist(), strict=True
+    ):
+        table.add(
+            f"damping.{name}", "parameter", f"{what}-proportional Rayleigh damping",
+            unit=unit, box=(0.0, None), default=value,
+        )  # fmt: skip
+    if wing:
+        add_masses()
+        table.add(
+            "initial_tip_displacement", "parameter",
+            "Transient only: displacement of the tip from its equilibrium, released at the start",
+            unit="m", display="mm", box=(-TIP_DISPLACEMENT_LIMIT, TIP_DISPLACEMENT_LIMIT),
+        )  # fmt: skip
+    table.add(
+        "response", "parameter", "Quasi-static (1) or transient (2)", kind="Enumeration",
+        box=(QUASI_STATIC, TRANSIENT), default=QUASI_STATIC, enumeration="Response",
+    )  # fmt: skip
+    for number, name in enumerate(model.gauges, start=1):
+        shown, sense = (f"[{number}]", "under upward lift") if wing else (f".{name}", "in tension")
+        table.add(
+            f"strain{shown}", "output", f"Strain at gauge {number if wing else name}, positive {sense}",
+            unit="1", display="microstrain",
+        )  # fmt: skip
+    for name in model.displacements:
+        variable = "tip_displacement" if wing else f"displacement.{name}"
+        table.add(variable, "output", texts.get(name, f"Displacement {name}"), unit="m", display="mm")
+    for name in model.accelerations:
+        table.add(
+            f"acceleration.{name}", "output", f"Acceleration {name}; zero where the response is quasi-static",
+            unit="m/s2",
+        )  # fmt: skip
+    bound = "Certified bound of the error of any static {} against the full finite element model"
+    table.add("strain_error_bound", "output", bound.format("strain"), unit="1", display="microstrain")
+
+    def add_status() -> None:
+        text = "What became of the last call"
+        table.add("status", "output", text, kind="Enumeration", enumeration="Status")
+
+    if wing:
+        add_status()
+        table.add(
+            "load_point_displacement", "output",
+            "Displacement of the point near the tip where tip_force acts, positive upwards",
+            unit="m", display="mm",
+        )  # fmt: skip
+    else:
+        table.add("displacement_error_bound", "output", bound.format("displacement"), unit="m", display="mm")
+    modes = range(1, min(MODE_COUNT, model.mode_count) + 1)
+    for mode in modes:
+        table.add(f"frequency[{mode}]", "output", f"Natural frequency of mode {mode}", unit="Hz")
+    for mode in modes:
+        table.add(f"damping_ratio[{mode}]", "output", f"Damping ratio of mode {mode}", unit="1", display="%")
+    chosen = (*model.parameters, *health.values(), *mass.values(), *model.controls)
+    outputs = model.static_count + len(model.accelerations)
+    if wing:
+        names = ("initial_tip_displacement", "load_point_displacement")
+        return table.rows(), Roles(chosen, outputs, None, TIP_FORCE, *names)
+    add_status()
+    return table.rows(), Roles(chosen, outputs, "displacement_error_bound")
