@@ -22,9 +22,11 @@ from discrepancy.checks.quality import check_against_model, check_data, mark_out
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
+from discrepancy.fits.gates import solver_share
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
+from discrepancy.judgement.by_force import shown_force
 from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
 from discrepancy.judgement.naming import name
@@ -33,18 +35,17 @@ from discrepancy.judgement.proof import prove
 from discrepancy.judgement.when import acting_sentence, begins_inside, when_sentence
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.force import MissingForce, missing_force
-from discrepancy.missing_force.naming import ForceSearch, key_of, sees_forces
+from discrepancy.missing_force.force import MissingForce
 from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wrapped import innermost
-from discrepancy.search.strategy import Search, solver_share
+from discrepancy.search.strategy import Search
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from fe.runtime.patch import ModelPatch
 from reporting.words import be
 
-from .errors import CampaignDataError, DiscrepancyError
+from .errors import CampaignDataError
 from .model_choice import load_model
 from .search_settings import SEARCH
 from .verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
@@ -210,7 +211,7 @@ def investigate(
     missing = None
     if thorough and verdict.kind not in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT):
         with stage("Seeing the missing force", "force"):
-            missing = _missing(problem, search, fit)
+            missing = shown_force(problem, search, fit)
     proof = None
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
@@ -239,27 +240,6 @@ def investigate(
         seconds,
         missing,
     )
-
-
-def _missing(problem: Problem, search: Search, fit: CandidateFit) -> MissingForce | None:
-    """Return the missing force, with the law of a verdict drawn through it; None where none can be seen."""
-    try:
-        force = search.force
-        terms = fit.candidate.terms
-        if terms and not any(term.place in problem.model.ports() for term in terms):
-            return None
-        if force is None:
-            if not sees_forces(problem):
-                return None
-            force = ForceSearch(problem)
-            force.locate()
-        key = key_of(fit.candidate)
-        found = next((item for item in search.forces if key_of(item.candidate) == key), None)
-        if found is None and terms:
-            found = force.followed(force.whole, fit.candidate, fit.point.effect)
-        return missing_force(force, force.whole if found is None else found)
-    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # it is shown, and no verdict rests on it
-        return None
 
 
 def _dated(verdict: Verdict, windows: tuple[GapWindow, ...]) -> str:

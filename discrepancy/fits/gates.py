@@ -11,7 +11,9 @@ from discrepancy.campaign.noise_tests import (
     variance_p_value,
 )
 from discrepancy.verdict import Gate
+from fe.runtime.patch import ModelPatch
 
+from .candidate import Candidate
 from .fitting import CandidateFit
 from .problem import Problem
 
@@ -144,3 +146,17 @@ def shape_gate(named: CandidateFit, family: CandidateFit | None) -> Gate:
             f"Its family with a free shape gains {gain:.1f} nats over the name.",
         )
     return Gate("shape", True, gain, SHAPE_GAIN, "A free shape explains no more than the named one.")
+
+
+def solver_share(problem: Problem, fit: CandidateFit) -> float:
+    """Return the largest rms change of a channel when the time steps are halved, over its noise."""
+    largest = 0.0
+    for number, data in enumerate(problem.trials):
+        if not data.trial.is_dynamic:
+            continue
+        candidate = fit.candidate if data.trial.kind in fit.candidate.acts_on else Candidate()
+        patch = candidate.patch(problem.setting, fit.point.effect) if candidate.terms else ModelPatch()
+        finer, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch, finer=2)
+        change = (finer - fit.responses[number]) / data.deviation
+        largest = max(largest, float(np.sqrt((change**2).mean(axis=0)).max()))
+    return largest

@@ -19,7 +19,9 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.naming import Explained
+from discrepancy.missing_force.force import MissingForce, missing_force
+from discrepancy.missing_force.hypotheses import key_of, sees_forces
+from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.missing_force.shares import ForceShare, order_of
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
@@ -71,6 +73,27 @@ def judged_by_force(problem: Problem, found: Search, first: Verdict) -> Outcome:
     if probability < SEARCH.sure or said.gain(members[0]) < SEARCH.bayes_factor:
         return said.unexplained(members[0], probability)
     return said.in_part(members[0], probability)
+
+
+def shown_force(problem: Problem, search: Search, fit: CandidateFit) -> MissingForce | None:
+    """Return the missing force, with the law of a verdict drawn through it; None where none can be seen."""
+    try:
+        force = search.force
+        terms = fit.candidate.terms
+        if terms and not any(term.place in problem.model.ports() for term in terms):
+            return None
+        if force is None:
+            if not sees_forces(problem):
+                return None
+            force = ForceSearch(problem)
+            force.locate()
+        key = key_of(fit.candidate)
+        found = next((item for item in search.forces if key_of(item.candidate) == key), None)
+        if found is None and terms:
+            found = force.followed(force.whole, fit.candidate, fit.point.effect)
+        return missing_force(force, force.whole if found is None else found)
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # it is shown, and no verdict rests on it
+        return None
 
 
 @dataclass(frozen=True)

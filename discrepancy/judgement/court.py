@@ -11,7 +11,8 @@ from scipy.stats import chi2
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import ABSOLUTE_LEVEL
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.naming import Explained, ForceSearch, Key, key_of
+from discrepancy.missing_force.hypotheses import Key, key_of
+from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.missing_force.shares import ForceShare, ForceShares
 from discrepancy.search.starting_points import acts_within
 from discrepancy.search_settings import SEARCH

@@ -12,7 +12,7 @@ import numpy as np
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, absolute_gate, is_noise_colour, prior_tests
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.naming import key_of
+from discrepancy.missing_force.hypotheses import key_of
 from discrepancy.search.honest_evidence import weigh_with_remainders
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH

@@ -13,7 +13,7 @@ from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.remainder_inference import RemainderPrior, with_remainder
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.naming import Key, key_of
+from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.search.starting_points import acts_within, are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .naming import Explained, ForceSearch, scaled
+from .hypotheses import scaled
+from .naming import Explained, ForceSearch
 
 FloatArray = NDArray[np.float64]
 

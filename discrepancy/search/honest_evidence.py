@@ -6,7 +6,7 @@ hypothesis leaves noise, thousands of nats separate what a model of a real thing
 
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.remainder_inference import RemainderPrior, infer, with_remainder
-from discrepancy.missing_force.naming import key_of
+from discrepancy.missing_force.hypotheses import key_of
 from discrepancy.search_settings import SEARCH
 
 from .strategy import Search

@@ -10,7 +10,7 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.naming import Key, key_of, log_prior
+from discrepancy.missing_force.hypotheses import Key, key_of, log_prior
 
 Tell = Callable[[str], None]
 

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Term
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import SENSORS
+from fe.runtime.patch import SENSORS, MicroSlip
 
 FloatArray = NDArray[np.float64]
 
@@ -94,3 +96,9 @@ def pairs(changes: dict[str, list[Change]], sign: FloatArray) -> Iterator[tuple[
 def _scaled(change: Change, scale: float) -> Change:
     """Return the change whose best scale alone is the given one."""
     return Change(change.term, change.start, change.vector, scale * change.size, change.size)
+
+
+def slips(problem: Problem, found: CandidateFit) -> bool:
+    """Whether a fit has a joint that slips."""
+    patch = found.candidate.patch(problem.setting, found.point.effect) if found.candidate.terms else ()
+    return any(isinstance(item, MicroSlip) for item in patch)

@@ -11,19 +11,19 @@ from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
-from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
+from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
-from discrepancy.missing_force.naming import Explained, ForceSearch, key_of, sees_forces
+from discrepancy.missing_force.hypotheses import key_of, sees_forces
+from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.models.wrapped import has_law
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import MicroSlip, ModelPatch
 
 from .growing_records import Beginnings
 from .hypotheses import Hypotheses, Tell, in_silence
-from .starting_points import acts_within, are_related, pairs, starts
+from .starting_points import acts_within, are_related, pairs, slips, starts
 
 FloatArray = NDArray[np.float64]
 
@@ -297,13 +297,13 @@ class Search(Hypotheses):
     def _settle_joints(self) -> None:
         """Divide a joint that slips more finely where the best candidate has one; fit the best ones again."""
         setting = self.problem.setting
-        if setting.joint_elements >= SEARCH.fine_joint or not _slips(self.problem, self.best()):
+        if setting.joint_elements >= SEARCH.fine_joint or not slips(self.problem, self.best()):
             return
         ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
         self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
         self.beginnings.set_up(self.problem.setting)
-        self._fit_again([item for item in ranked if _slips(self.problem, item)][: SEARCH.refitted])
-        if _slips(self.problem, self.best()):
+        self._fit_again([item for item in ranked if slips(self.problem, item)][: SEARCH.refitted])
+        if slips(self.problem, self.best()):
             self.keep(around(self.problem, self.best()), exact=True)
 
     def _fit_again(self, rough: Sequence[CandidateFit]) -> None:
@@ -446,23 +446,3 @@ def _beside(effect: Effect, base: CandidateFit) -> str:
     """Return an effect, and what a fit has already, for a line of progress."""
     there = " and ".join(base.candidate.identifiers)
     return f"{effect.identifier} beside {there}" if there else effect.identifier
-
-
-def _slips(problem: Problem, found: CandidateFit) -> bool:
-    """Whether a fit has a joint that slips."""
-    patch = found.candidate.patch(problem.setting, found.point.effect) if found.candidate.terms else ()
-    return any(isinstance(item, MicroSlip) for item in patch)
-
-
-def solver_share(problem: Problem, fit: CandidateFit) -> float:
-    """Return the largest rms change of a channel when the time steps are halved, over its noise."""
-    largest = 0.0
-    for number, data in enumerate(problem.trials):
-        if not data.trial.is_dynamic:
-            continue
-        candidate = fit.candidate if data.trial.kind in fit.candidate.acts_on else Candidate()
-        patch = candidate.patch(problem.setting, fit.point.effect) if candidate.terms else ModelPatch()
-        finer, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch, finer=2)
-        change = (finer - fit.responses[number]) / data.deviation
-        largest = max(largest, float(np.sqrt((change**2).mean(axis=0)).max()))
-    return largest

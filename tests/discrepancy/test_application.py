@@ -267,13 +267,13 @@ def test_of_a_group_one_member_is_applied(
 
 
 def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path: Path) -> None:
-    """A hardening spring with nothing but a wrong clock to explain it."""
+    """A hardening spring with nothing but a stiffness that drifts to explain it."""
     choice = choose_model("single_mass_rig")
     plan = plan_of(choice.model)
     bare = example_campaign(choice.model, "ringdown", 3, plan)
     patch = hidden(choice.model, bare, "cubic_stiffness", CUBIC, "slide")
     campaign = write_example(choice.model, tmp_path / "campaign", "ringdown", 3, plan, patch)
-    found = verdict_of(choice, campaign, named("clock_error"), tmp_path / "verdict")
+    found = verdict_of(choice, campaign, named("stiffness_drift"), tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
     assert gives(found.verdict)
     assert not gives(replace(found.verdict, hypotheses=found.verdict.hypotheses[1:]))  # the model as it is
@@ -281,7 +281,7 @@ def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path: Path) ->
     assert applied.sentence.endswith("the best hypothesis for a gap that stays unexplained: no name.")
     stored = read_patch(applied.path)
     assert stored.verdict is VerdictKind.UNEXPLAINED
-    assert [effect.identifier for effect in stored.effects] == ["clock_error"]
+    assert [effect.identifier for effect in stored.effects] == ["stiffness_drift"]
     assert stored.sentence.startswith(applied.sentence)
     with pytest.raises(
         ModelError, match="only laws at the ports of a lumped model can stand in its own file"

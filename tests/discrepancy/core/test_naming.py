@@ -13,7 +13,7 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.judgement.naming import _open, _shared, name
-from discrepancy.missing_force.naming import key_of
+from discrepancy.missing_force.hypotheses import key_of
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch, PowerDamping
