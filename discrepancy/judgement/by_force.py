@@ -109,7 +109,9 @@ class _Said:
         """Return the verdict that names a hypothesis in part."""
         effects, share = self.effects(best), self.court.told(best)
         family = ", ".join(sorted({t.effect.family for t in best.candidate.terms if t.free_shape}))
-        what = f"an effect of the family {family}, with a shape of its own," if family else _words(effects)
+        named = _words([effect for effect in effects if not effect.shape])
+        free = f"an effect of the family {family}, with a shape of its own," if family else ""
+        what = " and ".join(text for text in (named, free) if text)
         inside = self.court.shares.has_held_out and not share.held_out
         sentence = (
             f"{_capital(what)} is missing (probability {_certain(probability)}): "

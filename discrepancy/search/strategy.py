@@ -182,12 +182,12 @@ class Search(Hypotheses):
             self.tell(f"the missing force cannot be seen: {cause}")
             return False
         self.force = force
-        best = force.score(self.forces[0], len(self.effects))
-        close = [
-            item
-            for item in self.forces
-            if item.candidate.terms and force.score(item, len(self.effects)) > best - SEARCH.followed
-        ][: SEARCH.far_fits]
+        # beside another law a shape of its own would imitate nearly anything
+        able = [one for one in self.forces if len(one.candidate.terms) == 1 or not one.candidate.is_family]
+        able = [one for one in able if one.candidate.terms]
+        scores = [force.score(one, len(self.effects)) for one in able]
+        near = zip(able, scores, strict=True)
+        close = [one for one, score in near if score > max(scores) - SEARCH.followed][: SEARCH.far_fits]
         for number, item in enumerate(close):
             names = " and ".join(item.candidate.identifiers)
             self.tell(f"fitting {names} to the end, {len(close) - number - 1} more")
