@@ -92,7 +92,7 @@ def shown_force(problem: Problem, search: Search, fit: CandidateFit) -> MissingF
         if found is None and terms:
             found = force.followed(force.whole, fit.candidate, fit.point.effect)
         return missing_force(force, force.whole if found is None else found)
-    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # it is shown, and no verdict rests on it
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # a picture that cannot be is left out
         return None
 
 

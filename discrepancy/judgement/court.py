@@ -62,10 +62,9 @@ class Court:
 
     def against(self, item: Explained) -> str:
         """Return why a hypothesis is no name; empty where nothing speaks against it."""
-        acts = any(self.acts(term) for term in item.candidate.terms)
-        if not acts and np.abs(item.effect).max(initial=0.0) > SEARCH.stand_in_range:
-            return "it is an error of the readings far beyond what is usual"
-        least = SEARCH.least_end if acts else SEARCH.least_share
+        if not any(self.acts(term) for term in item.candidate.terms):
+            return "it describes readings, causes nothing and leaves more than noise"
+        least = SEARCH.least_end
         inside = self.share(item, held_out=False)
         if _is_little(inside, least):
             return f"it is {part(inside)} where it was fitted"

@@ -78,7 +78,10 @@ def model_observation_table(
     steps = None if arrays is None else partial(PatchedSteps, wing, PatchedWing(arrays))
     behaviour = patched_behaviour(wing, effects, steps)
     behaviour.tune(effect_values(effects, active=True), 0.0)
-    nominal = {row.name: row.start or 0.0 for row in structure_table(wing, {})[0]}
+    rows = structure_table(wing, {})[0]
+    nominal = {row.name: row.start or 0.0 for row in rows}
+    names = [row.name for row in rows if row.causality == "input"]
+    healths = [f"health.{region}" for region in wing.regions]
     states, controls = model.states.coordinates, scenario.control
     order = [scenario.state_names.index(name) for name in wing.regions]
     force = scenario.asset.constant_load.get("tip_force", 0.0)
@@ -88,7 +91,9 @@ def model_observation_table(
             parameters = {**nominal, "young_modulus_factor": float(value)}
             for state, levels in enumerate(states):
                 for index, control in enumerate(controls):
-                    inputs = (control.values["load_factor"], force, *levels[order].tolist())
+                    given = {**control.values, "tip_force": force}
+                    given |= zip(healths, levels[order].tolist(), strict=True)
+                    inputs = [given[name] for name in names]
                     table[row, state, index] = behaviour.start(parameters, 0.0, inputs)[: wing.gauge_count]
     except UnacceptableValuesError as error:
         raise MissionInputError(f"the twin's model cannot carry {where}: {error}") from error
