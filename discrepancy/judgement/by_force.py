@@ -65,8 +65,6 @@ def judged_by_force(problem: Problem, found: Search, first: Verdict) -> Outcome:
         return said.unexplained()
     best = court.slimmed(court.contenders[0])
     members = [best, *court.rivals(best)]
-    laws = [item for item in members if all(court.acts(term) for term in item.candidate.terms)]
-    members = laws or members  # laws cause, errors of the readings describe
     probability = sum(court.probability(item) for item in members)
     if 1 < len(members) <= SEARCH.largest_group:
         return said.group(members, probability)
@@ -191,7 +189,7 @@ class _Said:
         )
         inclusion: dict[str, float] = {}
         for weight, item in rows:
-            for name in set(plain_names(item.candidate.identifiers)):
+            for name in dict.fromkeys(plain_names(item.candidate.identifiers)):
                 inclusion[name] = inclusion.get(name, 0.0) + weight
         verdict = Verdict(
             kind, sentence, probability, self.gain(stands or court.ranked[0]), inclusion=inclusion,

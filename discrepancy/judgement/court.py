@@ -150,11 +150,9 @@ class Court:
     def probability(self, item: Explained) -> float:
         """Return the probability of a hypothesis with all that hold its effects or their families."""
         own = {_family(term) for term in item.candidate.terms}
-        acts = any(self.acts(term) for term in item.candidate.terms)
         kept = [
-            one for one in self.ranked
-            if not one.candidate.terms or one is item or not acts or not self._refuted(one)
-        ]  # fmt: skip
+            one for one in self.ranked if not one.candidate.terms or one is item or not self._refuted(one)
+        ]
         scores = np.array([self.score(one) for one in kept])
         holds = np.array([own <= {_family(term) for term in one.candidate.terms} for one in kept])
         if not holds.any():

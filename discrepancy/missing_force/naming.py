@@ -282,7 +282,7 @@ class ForceSearch:
             for place in effect.places(self.problem.setting):
                 if (effect.identifier, place) in there:
                     continue
-                for term in {Term(effect, place), Term(effect, place, bool(effect.shape))}:
+                for term in dict.fromkeys((Term(effect, place), Term(effect, place, bool(effect.shape)))):
                     for values in variants(term):
                         column = self.columns.of(base.view, base.motions, Candidate((term,)), values)
                         if column is not None and any(np.any(part.readings) for part in column):

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from discrepancy.fits.linearisation import Point
-
 from .filtered import Filtered, Process
 from .regression import Regression, Solution, local_solution, regression
 from .trial import SeenTrial
@@ -211,7 +209,7 @@ class View:
         return regression(self.filtered(processes), self.residuals, self.columns)
 
     def solve(self, processes: Processes) -> Solution:
-        """Return evidence and values of all unknowns beside missing forces; of all trials."""
+        """Return evidence and values of all unknowns beside missing forces."""
         return self.products(processes).solve(range(len(self.precisions)), self.precisions)
 
     def most_probable(
@@ -255,9 +253,12 @@ class View:
         outside = any(not shortest <= one.time <= longest for one in processes.values())
         if outside or np.abs(away).max() > FARTHEST:
             return -np.inf
-        if not all(one.is_sound for one in self.filtered(processes)):
+        filters = self.filtered(processes)
+        if not all(one.is_sound for one in filters):
             return -np.inf
-        return float(self.solve(processes).evidence - 0.5 * np.sum(np.square(away)))
+        products = regression(filters, self.residuals, self.columns)
+        value = products.solve(range(len(self.precisions)), self.precisions).evidence
+        return float(value - 0.5 * np.sum(np.square(away)))
 
     def _climbed(
         self, about: Processes, processes: Processes, port: int, first: FloatArray
@@ -311,7 +312,3 @@ class View:
             motions.append(Motion(moved.added, what.forces, remaining, moved.added - free, *moving, doubts))
             local.append(values)
         return solution, local, motions
-
-    def point(self, solution: Solution, local: Sequence[FloatArray], effect: FloatArray) -> Point:
-        """Return the point of a solution, to be linear about."""
-        return Point(solution.mean[: len(self.shared_precision)], tuple(local), effect)
