@@ -421,9 +421,9 @@ def forget_modules(folder: str) -> None:
     """
     inside = folder.rstrip(os.sep) + os.sep
     sys.path[:] = [entry for entry in sys.path if not (entry + os.sep).startswith(inside)]
-    for name, module in list(sys.modules.items()):
+    for name, module in sys.modules.copy().items():  # one step, unlike a list of items: other threads import too
         if str(getattr(module, "__file__", None) or "").startswith(inside):
-            del sys.modules[name]
+            sys.modules.pop(name, None)
 
 
 @contextmanager
