@@ -82,20 +82,26 @@ def verdict_row(found: Investigation) -> dict[str, Any]:
     if proof is not None and proof.held_out_after is not None:
         row["held_out_chi_square_per_dof_after"] = _finite(proof.held_out_after.chi_square_per_dof)
         row["gap_closed"] = _finite(proof.gap_closed)
-    if verdict.kind in NAMING and found.problem is not None and found.fit is not None:
-        draws = patch_draws(found.problem, found.fit, seed=1)
-        for effect, patches in zip(verdict.effects, draws, strict=True):
-            row["parameters"][effect.identifier] = {
-                item.name: [item.low, item.value, item.high] for item in effect.parameters
-            }
-            for item in primitive_intervals(at_unit(effect.patch), [at_unit(patch) for patch in patches]):
-                if math.isfinite(item.low) and item.low < item.high:
-                    row["estimates"][f"{effect.identifier}.{item.parameter}"] = [
-                        item.low,
-                        item.value,
-                        item.high,
-                    ]
+    if verdict.kind in NAMING:
+        row["parameters"] = {
+            effect.identifier: {item.name: [item.low, item.value, item.high] for item in effect.parameters}
+            for effect in verdict.effects
+        }
+        row["estimates"] = estimates(found)
     return row
+
+
+def estimates(found: Investigation) -> dict[str, list[float]]:
+    """Return the 90 % intervals of a verdict's effects in SI: low, value and high by effect and field."""
+    rows: dict[str, list[float]] = {}
+    if found.problem is None or found.fit is None:
+        return rows
+    draws = patch_draws(found.problem, found.fit, seed=1)
+    for effect, patches in zip(found.verdict.effects, draws, strict=True):
+        for item in primitive_intervals(at_unit(effect.patch), [at_unit(patch) for patch in patches]):
+            if math.isfinite(item.low) and item.low < item.high:
+                rows[f"{effect.identifier}.{item.parameter}"] = [item.low, item.value, item.high]
+    return rows
 
 
 def at_unit(patch: ModelPatch) -> ModelPatch:

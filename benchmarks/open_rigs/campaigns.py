@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from benchmarks.open_rigs.rigs import RIGS, Course, FloatArray, Rig, Truth, entry
+from benchmarks.open_rigs.rigs import RIGS, SCALES, Course, FloatArray, Rig, Truth, entry
 
 KINDS = ("cart", "damper", "servo", "support", "stores")
 LAWS = ("coulomb_friction", "quadratic_damping", "cubic_stiffness", "free_play", "bouc_wen_hysteresis")
@@ -31,6 +32,8 @@ TONES = (0.5, 0.9, 1.6)
 """Frequencies of what drives bodies [Hz]; stores are driven in steps, two hundred times as slowly."""
 ZERO = 5.0
 """Deviation of a zero over the noise."""
+COLOUR = 0.5
+"""Correlation of the noise with that one sample later, where it is coloured."""
 OFFSET = 0.05
 """Deviation of a constant of the drive over the amplitude of a tone."""
 
@@ -125,10 +128,10 @@ class Bench:
 def drawn(
     number: int, seed: int, samples: int = SAMPLES, turns: int = 5
 ) -> tuple[Bench, Truth, dict[str, Any]]:
-    """Return the rig of a campaign, what is true of it, and in words."""
+    """Return the rig of a campaign, what is true of it, and in words; nothing is after six turns."""
     generator = np.random.default_rng([seed, number])
     kind, turn = KINDS[number % 5], number // 5
-    hidden = "" if turn == turns else HIDDEN[kind][turn % len(HIDDEN[kind])]
+    hidden = "" if turn >= turns else HIDDEN[kind][turn % len(HIDDEN[kind])]
     name = kind
     if kind == "support":
         name = f"support {('moved', 'shaken')[turn % 2]}"
@@ -141,11 +144,42 @@ def drawn(
     if hidden:
         wanted = float(np.exp(generator.uniform(*np.log(GAPS))))
         truth, gap = bench.sized(truth, "size", wanted, 0.6)
+    if turn > turns:
+        return bench, truth, {"rig": name, "identifiers": [], "gap": 0.0, "left": "", "remainder": 0.0}
     left, pitch = LEFT[number % 3], float(np.exp(generator.uniform(*np.log((1.5, 6.0)))))
     wanted = gap * float(generator.uniform(*SHARES)) if hidden else float(generator.uniform(*ALONE))
     truth, rest = bench.sized(replace(truth, left=left, pitch=pitch), "amount", wanted, 0.5)
     effect = {"": [], "natural_convection": ["outflow"]}.get(hidden, [hidden])
-    return bench, truth, {"rig": name, "identifiers": effect, "gap": gap, "left": left, "remainder": rest}
+    told = {"rig": name, "identifiers": effect, "gap": gap, "left": left, "remainder": rest}
+    return bench, truth, told | hidden_values(name, truth)
+
+
+def hidden_values(name: str, truth: Truth) -> dict[str, Any]:
+    """Return the port of what is hidden and its values in SI, laws of powers at unit motion."""
+    ports = {"cart": "rail", "damper": "piston", "servo": "bearing", "heated": "surface"}
+    if name in ("stores", "heated"):
+        size = truth.size * (0.02 if name == "stores" else 80.0 / 40.0**1.25)
+        values = {"outflow": {"coefficient": size}, "natural_convection": {"coefficient": size}}
+        # the excess is told over the threshold, as the catalogue does
+        values["overflow"] = {"level": truth.shape}
+        port = ("upper outlet", "lower outlet")[truth.at] if name == "stores" else ports[name]
+    else:
+        force, length, speed = SCALES[name.split()[0]]
+        size, port = truth.size * force, ports.get(name, "mount")
+        yields = {"stiffness": size / length, "yield_displacement": truth.shape * length}
+        values = {
+            "coulomb_friction": {"coefficient": size},
+            "quadratic_damping": {"coefficient": size / speed**2},
+            "cubic_stiffness": {"coefficient": size / length**3},
+            "free_play": {"stiffness": size / length, "half_width": truth.shape * length},
+            "bouc_wen_hysteresis": yields,
+        }
+    known = values.get(truth.law, {})
+    identifier = "outflow" if truth.law == "natural_convection" else truth.law
+    return {
+        "place": port if truth.law else "",
+        "values": {f"{identifier}.{key}": value for key, value in known.items()},
+    }
 
 
 def varied(
@@ -153,6 +187,11 @@ def varied(
 ) -> tuple[list[Course], list[FloatArray], float]:
     """Return courses and stamps of a variant, and how well the constant of the drive is known."""
     courses, stamps, offset = list(bench.courses), list(bench.stamps), 0.0
+    if variant == "held" and bench.rig.drive.startswith(("force", "angle", "acceleration")):
+        courses = [
+            Course.stepped(tuple(one.value(float(t), 0) for t in time), tuple(time[1:].tolist()), one.push)
+            for one, time in zip(courses, stamps, strict=True)
+        ]
     if variant in ("jitter", "all"):
         interval = bench.rig.interval
         stamps = [
@@ -183,6 +222,16 @@ def blanks(count: int, variant: str, generator: np.random.Generator) -> NDArray[
     return lost
 
 
+def noise_of(generator: np.random.Generator, shape: tuple[int, ...], colour: float) -> FloatArray:
+    """Return noise (n, C) of unit deviation whose samples have a correlation with the next ones."""
+    white = generator.standard_normal(shape)
+    if not colour:
+        return white
+    before = lfilter([1.0], [1.0, -colour], np.sqrt(1.0 - colour**2) * white, axis=0)
+    begin = generator.standard_normal(shape[1:]) * colour ** np.arange(1.0, shape[0] + 1.0)[:, None]
+    return np.asarray(before + begin, dtype=np.float64)
+
+
 def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence[int]) -> None:
     """Write a campaign and its model as their user would."""
     noise, change = np.random.default_rng([*seed, 1]), np.random.default_rng([*seed, 2])
@@ -193,6 +242,7 @@ def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence
     ]
     names = [channel[0] for channel in rig.channels]
     quantity, unit, hold = rig.drive.split()
+    hold = "zero_order" if courses[0].steps else hold
     text = f'format = 1\nname = "{folder.name}"\n\n[noise]\nfile = "rest.csv"\n'
     for name, of, in_unit, deviation in rig.channels:
         text += entry(
@@ -202,7 +252,8 @@ def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence
     more |= {"offset_deviation": offset} if offset else {}
     text += entry("input", name="drive", quantity=quantity, unit=unit, hold=hold, **more)
     folder.mkdir(parents=True)
-    rest = bench.noise * noise.standard_normal((NOISE_SAMPLES, len(names)))
+    colour = COLOUR if variant == "colour" else 0.0
+    rest = bench.noise * noise_of(noise, (NOISE_SAMPLES, len(names)), colour)
     table(
         folder / "rest.csv",
         ["time", *names],
@@ -211,7 +262,7 @@ def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence
     readings = simulate(rig, truth, driven, stamps)
     for number, (course, time_, values) in enumerate(zip(courses, stamps, readings, strict=True), start=1):
         zeros = ZERO * bench.noise * noise.standard_normal(len(names))
-        values = values + zeros + bench.noise * noise.standard_normal(values.shape)
+        values = values + zeros + bench.noise * noise_of(noise, values.shape, colour)
         values[blanks(len(values), variant, change)] = np.nan
         drive = [course.value(float(t), 0) for t in time_]
         table(folder / f"{number}.csv", ["time", "drive", *names], np.column_stack((time_, drive, values)))

@@ -14,6 +14,11 @@ from scipy.integrate import solve_ivp
 FloatArray = NDArray[np.float64]
 Force = Callable[[float, float, float], float]
 
+SCALES = {
+    "cart": (6.0, 0.5, 1.5), "damper": (60.0, 0.02, 0.12), "servo": (2.0, 0.5, 2.0),
+    "support": (8.0, 0.04, 0.3),
+}  # fmt: skip
+"""Force, displacement and speed at which laws have their size."""
 TURNS_OVER = 2e-4
 """Share of the largest speed within which friction turns over."""
 
@@ -161,7 +166,7 @@ def cart(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
     """Return the position of a cart under a recorded force."""
     mass, rubs = 1.5 * truth.factors.get("mass", 1.0), 0.8 * truth.factors.get("bearing", 1.0)
     found, _ = body(
-        truth, course, stamps, mass, (6.0, 0.5, 1.5), lambda t, x, v: course.value(t, 0) - rubs * v
+        truth, course, stamps, mass, SCALES["cart"], lambda t, x, v: course.value(t, 0) - rubs * v
     )
     return found[:, :1]
 
@@ -170,7 +175,7 @@ def damper(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
     """Return the force that a prescribed motion takes: the body follows it, and only a loose one is free."""
     factor = truth.factors.get
     m, c, k = 2.0 * factor("mass", 1.0), 400.0 * factor("oil", 1.0), 3000.0 * factor("spring", 1.0)
-    hidden, more = law(truth, 60.0, 0.02, 0.12), beside(truth, course, 60.0, 0.02)
+    hidden, more = law(truth, *SCALES["damper"]), beside(truth, course, *SCALES["damper"][:2])
     loose, w = truth.amount * m if truth.left == "loose" else 0.0, 2.0 * np.pi * truth.pitch
 
     def pulled(t: float, y: FloatArray) -> float:
@@ -199,7 +204,7 @@ def servo(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
         return gains[0] * (course.value(t, 0) - x) - gains[1] * v
 
     found, _ = body(
-        truth, course, stamps, inertia, (2.0, 0.5, 2.0), lambda t, x, v: torque(t, x, v) - rubs * v
+        truth, course, stamps, inertia, SCALES["servo"], lambda t, x, v: torque(t, x, v) - rubs * v
     )
     return np.column_stack((found[:, 0], [torque(t, x, v) for t, (x, v) in zip(stamps, found, strict=True)]))
 
@@ -213,7 +218,7 @@ def support(truth: Truth, course: Course, stamps: FloatArray, *, order: int) -> 
         return course.value(t, order)
 
     found, forces = body(
-        truth, course, stamps, m, (8.0, 0.04, 0.3), lambda t, x, v: -c * v - k * x, shaken=shaken
+        truth, course, stamps, m, SCALES["support"], lambda t, x, v: -c * v - k * x, shaken=shaken
     )
     x, v = found.T
     base = 0.8 * factor("mass", 1.0)

@@ -17,6 +17,8 @@ FloatArray = NDArray[np.float64]
 
 WIDER = 10.0
 """By which a deviation of the speed is too small: that of the process does not know of steps."""
+SLOW = 0.02
+"""Share of the usual speed below which a body creeps before it slides, and no law of the speed holds."""
 
 
 def along(
@@ -59,7 +61,8 @@ def law_course(
     motion = (np.ascontiguousarray(position), np.ascontiguousarray(speed))
     _compiled_along()(LAWS.index(type(law)), type(law).of_speed, values, elements, *motion, memory, found)
     if type(law).of_speed and doubt > 0.0:
-        moves = erf(np.abs(speed) / (np.sqrt(2.0) * WIDER * doubt))
+        slow = max(WIDER * doubt, SLOW * float(np.sqrt(np.mean(speed**2))))
+        moves = erf(np.abs(speed) / (np.sqrt(2.0) * slow))
         found = moves * found + (1.0 - moves) * np.clip(holding, -np.abs(found), np.abs(found))
     if law.windows:
         inside = np.zeros(len(found), dtype=bool)

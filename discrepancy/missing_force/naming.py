@@ -49,8 +49,8 @@ ROUNDS = 8
 LONGEST_STEP = 1.5
 SETTLED = 0.05
 """Steps of the unknowns of an effect: how many, the longest, and that after which no other follows."""
-WORSE, LEAST_PART = 1.0, 0.2
-"""Loss of evidence [nat] from which a step is taken back and halved, and the least part of it."""
+LEAST_PART = 0.2
+"""Least part of a step that is taken where steps turn back."""
 SLOPE = 0.05
 """Standard normal step of the derivatives of an effect."""
 
@@ -337,30 +337,33 @@ class ForceSearch:
 
     def followed(self, base: Explained, candidate: Candidate, effect: FloatArray) -> Explained | None:
         """Return a hypothesis at its most probable values, begun beside another; None: it cannot be."""
-        processes, motions, best, share = dict(base.processes), base.motions, None, 1.0
-        last: tuple[float, FloatArray, FloatArray, Sequence[Motion]] | None = None
+        processes, motions, share, settled = dict(base.processes), base.motions, 1.0, False
+        best: Explained | None = None
+        before = np.zeros(len(effect))
         for turn in range(ROUNDS):
             view = self.linear(self.columns, base.view, motions, candidate, effect)
             if view is None:
                 break
-            if turn in (0, ROUNDS - 1):
+            if turn == 0 or settled or turn == ROUNDS - 1:
                 found = self._seen(view, candidate, effect, processes, SHARES[: 1 if turn else None])
                 processes = dict(found.processes)
             else:
                 found = self._at(view, candidate, effect, processes)
-            if best is None or found.evidence > best.evidence:
+            step = found.solution.mean[len(view.shared_precision) :] - effect
+            far = np.where(np.abs(step) > SETTLED, step, 0.0)
+            if far.any():  # a value that it cannot reach is not its own
+                loss = 0.5 * float(far @ np.linalg.solve(found.covariance, far))
+                found = replace(found, evidence=found.evidence - loss)
+            # along the motion of its base, which follows the readings, a hypothesis looks better than it is
+            if best is None or turn == 1 or found.evidence > best.evidence:
                 best = found
-            if last is not None and found.evidence < last[0] - WORSE and share > LEAST_PART:
-                share *= 0.5
-                _, at, step, motions = last
-            else:
-                share = min(1.0, 2.0 * share)
-                step = found.solution.mean[len(view.shared_precision) :] - effect
-                at, motions = effect, found.motions
-                last = (found.evidence, at, step, motions)
-            effect = stepped(candidate, at, share * np.clip(step, -LONGEST_STEP, LONGEST_STEP))
-            if np.abs(step).max(initial=0.0) < SETTLED and turn:
+            if settled:
                 break
+            turns_back = step @ before < -0.5 * (before @ before)
+            share = max(0.5 * share, LEAST_PART) if turns_back else min(1.0, 1.5 * share)
+            effect = stepped(candidate, effect, share * np.clip(step, -LONGEST_STEP, LONGEST_STEP))
+            motions, before = found.motions, step
+            settled = turn > 0 and np.abs(step).max(initial=0.0) < SETTLED
         return best
 
     def linear(

@@ -81,8 +81,8 @@ class SeenTrial:
         Prior precision of the latter.
     system : PortedSystem
         At the point, with its gains.
-    slopes : sequence of (n, n) ndarray or None
-        Derivative of its generator by each shared unknown.
+    slopes : sequence of PortedSystem or None
+        Its derivative by each shared unknown.
     parts : int
         Fine steps of an interval.
     positions, speeds : (F, P) ndarray
@@ -107,7 +107,7 @@ class SeenTrial:
     local: FloatArray
     local_precision: FloatArray
     system: PortedSystem
-    slopes: Sequence[FloatArray | None]
+    slopes: Sequence[PortedSystem | None]
     parts: int
     positions: FloatArray
     speeds: FloatArray
@@ -165,10 +165,25 @@ class SeenTrial:
             start = np.linalg.lstsq(self.system.generator, -push * force[0], rcond=1e-12)[0]
         return self._moved(start, push[:, None], force[:, None])
 
-    def turned(self, slope: FloatArray, added: FloatArray) -> FloatArray:
-        """Return the state (F, n) that a change of the generator makes of an added state (F, n)."""
-        rows = np.flatnonzero(np.any(slope, axis=1))
-        return self._moved(np.zeros(len(slope)), np.eye(len(slope))[:, rows], added @ slope[rows].T)
+    def turned(
+        self, slope: PortedSystem, added: FloatArray, forces: Mapping[int, FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the state (F, n) that a change of the system makes of an added one, and readings (N, C).
+
+        `forces` (F,) by port are those that added it.
+        """
+        pushes = added @ slope.generator.T
+        for port, force in forces.items():
+            pushes -= np.outer(force, slope.actions[port])
+        start = np.zeros(len(slope.generator))
+        if self.settled:
+            start = -np.linalg.lstsq(self.system.generator, pushes[0], rcond=1e-12)[0]
+        rows = np.flatnonzero(np.any(pushes, axis=0))
+        state = self._moved(start, np.eye(len(start))[:, rows], pushes[:, rows])
+        shown = added[:: self.parts] @ slope.outputs.T
+        for port, force in forces.items():
+            shown -= np.outer(force[:: self.parts], slope.through[port])
+        return state, self.readings(state) + self.over_noise(shown)
 
     def _moved(
         self, start: FloatArray, directions: FloatArray, pushes: FloatArray, which: IntArray | None = None
@@ -241,7 +256,10 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
     base, slopes = _ported(problem, trial, outputs, point.shared)
-    base = replace(base, outputs=base.outputs * gains[:, None], through=base.through * gains)
+    base, *slopes = (
+        item and replace(item, outputs=item.outputs * gains[:, None], through=item.through * gains)
+        for item in (base, *slopes)
+    )
     used = trial.used
     deviation = trial.noise_factor * np.array([item.static_deviation for item in data.noise])
     coloured = [
@@ -279,18 +297,20 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
 
 def _ported(
     problem: Problem, trial: Trial, outputs: Outputs, shared: FloatArray
-) -> tuple[PortedSystem, list[FloatArray | None]]:
-    """Return how the ports of a trial move, and the derivatives of the generator by the shared unknowns."""
+) -> tuple[PortedSystem, list[PortedSystem | None]]:
+    """Return how the ports of a trial move, and the derivatives of that by the shared unknowns."""
     model, unknowns = problem.model.inner, problem.shared
 
     def system(u: FloatArray) -> PortedSystem:
         return model.ported(trial, outputs, unknowns.parameters(u))  # type: ignore[attr-defined, no-any-return]
 
-    base = system(shared)
-    slopes: list[FloatArray | None] = [None] * unknowns.size
-    for k in range(len(unknowns.parameter_mean)):
-        ends = []
-        for sign in (1.0, -1.0):
-            ends.append(system(moved(shared, k, sign * SMALL)).generator)
-        slopes[k] = (ends[0] - ends[1]) / (2.0 * SMALL)
-    return base, slopes
+    def slope(k: int) -> PortedSystem | None:
+        above, below = (system(moved(shared, k, sign * SMALL)) for sign in (1.0, -1.0))
+        found = {
+            name: (getattr(above, name) - getattr(below, name)) / (2.0 * SMALL)
+            for name in ("generator", "actions", "outputs", "through")
+        }
+        return replace(above, **found) if any(np.any(item) for item in found.values()) else None
+
+    of_parameters = [slope(k) for k in range(len(unknowns.parameter_mean))]
+    return system(shared), of_parameters + [None] * (unknowns.size - len(of_parameters))

@@ -161,9 +161,9 @@ class View:
         found: list[dict[int, Turned]] = [{} for _ in self.trials]
         for trial, motion, of_trial in zip(self.trials, self.motions, found, strict=False):
             for k, slope in enumerate(trial.slopes):
-                if slope is not None and np.any(slope):
-                    state = trial.turned(slope, motion.added)
-                    of_trial[k] = Turned(trial.readings(state), float(trial.about[k]), state)
+                if slope is not None:
+                    state, readings = trial.turned(slope, motion.added, motion.forces)
+                    of_trial[k] = Turned(readings, float(trial.about[k]), state)
             shown = trial.readings(motion.added, motion.forces)
             for k, channel, scale in trial.gains:
                 alone = scale * np.eye(shown.shape[1])[channel]
