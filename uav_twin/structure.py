@@ -9,12 +9,13 @@ import typer
 
 from reporting import terminal
 from uav_twin.console_table import console_table
-from uav_twin.structure_arguments import File, MemoryLimit, assembled
+from uav_twin.structure_arguments import File, MemoryLimit, assembled, assembled_of_any
 from uav_twin.structure_field import field
 from uav_twin.structure_fmu import fmu
 from uav_twin.structure_reduce import reduce
 
 if TYPE_CHECKING:
+    from fe.structure.affine import DesignedStructure
     from fe.structure.operators import Structure
     from fe.verification.structure_comparison import StructureAgreement
 
@@ -23,7 +24,7 @@ DISPLACEMENT_LIMIT, STRAIN_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-5, 1e-6
 
 structure_app = typer.Typer(
     no_args_is_help=True,
-    help="Look at a structure from a mesh, verify its model against CalculiX, reduce it, pack it.",
+    help="Look at a structure from a mesh or matrices, verify it against CalculiX, reduce it, pack it.",
 )
 
 Modes = Annotated[int, typer.Option(min=1, max=50, help="Number of modes.")]
@@ -32,14 +33,15 @@ Modes = Annotated[int, typer.Option(min=1, max=50, help="Number of modes.")]
 @structure_app.command("info")
 def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: terminal.Json = False) -> None:
     """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it."""
-    structure = assembled(file, memory_limit)
+    structure = assembled_of_any(file, memory_limit)
     with terminal.progress().stage("Solving the loads and the modes"):
         record = structure_record(structure, modes)
     if json:
         terminal.print_json(record)
         return
     console = terminal.console()
-    console.print(console_table(("fact", "value", "unit"), _facts(record), console.width))
+    facts = _facts(record) if "mesh" in record else _facts_of_matrices(record)
+    console.print(console_table(("fact", "value", "unit"), facts, console.width))
     for remark in record["remarks"]:
         console.print(f"Note: {remark}", soft_wrap=True)
     parts = [
@@ -84,17 +86,24 @@ def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         yield title, ", ".join(f"{value:.6g}" for value in record[key]), unit
 
 
-def structure_record(structure: "Structure", modes: int) -> dict[str, Any]:
+def _facts_of_matrices(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    yield "name", record["name"], ""
+    yield "matrices", ", ".join(record["matrices"]), f"N, s, {record['length_unit']}"
+    yield "unknowns", f"{record['unknowns']:,} free, {record['held']:,} held", ""
+    if record["loose"]:
+        yield "rows left out", f"{record['loose']:,} without stiffness and mass", ""
+
+
+def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, Any]:
     """Return what is known of a structure without damage, at nominal values, by name.
 
     Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in SI units.
     """
-    from fe.structure.memory import upper_estimate
-    from fe.structure.solution import natural_frequencies, static_responses, weighed
+    from fe.structure.operators import Structure
+    from fe.structure.solution import natural_frequencies, static_responses
 
-    mesh, design = structure.mesh, structure.design
-    mass, centre = weighed(structure)
-    frequencies = natural_frequencies(structure, modes)[0].tolist() if mass > 0.0 else []
+    design, heavy = structure.design, structure.mass().diagonal().any()
+    frequencies = natural_frequencies(structure, modes)[0].tolist() if heavy else []
     loads = [
         {
             "name": name,
@@ -108,56 +117,86 @@ def structure_record(structure: "Structure", modes: int) -> dict[str, Any]:
     ]
     return {
         "name": design.name,
-        "mesh": design.mesh,
-        "remarks": list(mesh.remarks),
         "design_hash": structure.design_hash,
-        "kind": mesh.kind.name,
-        "linear_elements": not mesh.kind.edges,
-        "elements": len(mesh.cells),
-        "nodes": len(mesh.points),
-        "loose_nodes": [int(number) for number in mesh.loose],
         "unknowns": structure.unknowns,
-        "held": mesh.unknowns - structure.unknowns,
-        "memory": upper_estimate(mesh),
-        "mass": mass,
-        "length_unit": mesh.unit_name,
-        "centre_of_gravity": [float(value) / mesh.unit for value in centre],
-        "lower": [float(value) / mesh.unit for value in mesh.points.min(axis=0)],
-        "upper": [float(value) / mesh.unit for value in mesh.points.max(axis=0)],
-        "parts": list(_parts(structure)),
+        "length_unit": design.length_unit,
+        **(_of_mesh(structure) if isinstance(structure, Structure) else _of_matrices(structure)),
         "frequencies": frequencies,
         "loads": loads,
     }
 
 
+def _of_mesh(structure: "Structure") -> dict[str, Any]:
+    from fe.structure.memory import upper_estimate
+    from fe.structure.solution import weighed
+
+    mesh = structure.mesh
+    mass, centre = weighed(structure)
+    return {
+        "mesh": structure.design.mesh,
+        "remarks": list(mesh.remarks),
+        "kind": mesh.kind.name,
+        "linear_elements": not mesh.kind.edges,
+        "elements": len(mesh.cells),
+        "nodes": len(mesh.points),
+        "loose_nodes": [int(number) for number in mesh.loose],
+        "held": mesh.unknowns - structure.unknowns,
+        "memory": upper_estimate(mesh),
+        "mass": mass,
+        "centre_of_gravity": [float(value) / mesh.unit for value in centre],
+        "lower": [float(value) / mesh.unit for value in mesh.points.min(axis=0)],
+        "upper": [float(value) / mesh.unit for value in mesh.points.max(axis=0)],
+        "parts": list(_parts(structure)),
+    }
+
+
+def _of_matrices(structure: "DesignedStructure") -> dict[str, Any]:
+    from fe.structure.matrices import MatrixStructure
+
+    assert isinstance(structure, MatrixStructure)
+    terms = [term for term in structure.stiffness_terms if term.parameter or term.region]
+    return {
+        "matrices": list(structure.design.files),
+        "remarks": [],
+        "held": structure.held,
+        "loose": structure.loose,
+        "parts": [
+            _part("stiffness", str(number), "", int((term.matrix.diagonal() > 0.0).sum()), "unknowns", note)
+            for number, term in enumerate(terms, start=1)
+            for note in [", ".join(filter(None, (term.parameter, term.region)))]
+        ],
+    }
+
+
+def _part(what: str, name: str, chosen: str, count: int, of: str, note: str = "") -> dict[str, Any]:
+    return {"what": what, "name": name, "set": chosen, "count": count, "of": of, "note": note}
+
+
 def _parts(structure: "Structure") -> Iterator[dict[str, Any]]:
     design, mesh = structure.design, structure.mesh
-
-    def part(what: str, name: str, chosen: str, count: int, of: str, note: str = "") -> dict[str, Any]:
-        return {"what": what, "name": name, "set": chosen, "count": count, "of": of, "note": note}
 
     for number, material in enumerate(design.material):
         count = int((structure.material_of == number).sum())
         note = f"scaled by {material.scaled_by}" if material.scaled_by else ""
-        yield part("material", material.name, material.set, count, "elements", note)
+        yield _part("material", material.name, material.set, count, "elements", note)
     for number, damage in enumerate(design.damage):
         count = int((structure.region_of == number).sum())
-        yield part("damage region", damage.name, damage.set, count, "elements")
+        yield _part("damage region", damage.name, damage.set, count, "elements")
     for number, support in enumerate(design.support, start=1):
         count = len(mesh.nodes_of(support.set, f"support[{number}]"))
         notes = [f"holds {', '.join(support.hold)}"] * bool(support.hold) + ["springs"] * bool(
             support.springs
         )
         note = ", ".join(["rigid"] * (support.rigid_about is not None) + notes)
-        yield part("support", str(number), support.set, count, "nodes", note)
+        yield _part("support", str(number), support.set, count, "nodes", note)
     for load in design.load:
         if load.set is not None:
             nodes = mesh.nodes_of(load.set, load.name)
             faces = len(mesh.faces_between(load.set, nodes))
-            yield part("load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes")
+            yield _part("load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes")
     for gauge, place in zip(design.gauge, structure.gauge_places, strict=True):
         moved = f"put onto the surface, {place.moved / mesh.unit:.3g} {mesh.unit_name} away"
-        yield part("gauge", gauge.name, "", 1, "place", moved if place.moved > 1e-6 * mesh.size else "")
+        yield _part("gauge", gauge.name, "", 1, "place", moved if place.moved > 1e-6 * mesh.size else "")
 
 
 @structure_app.command("verify")
