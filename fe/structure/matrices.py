@@ -142,8 +142,11 @@ class _Matrices:
     unknowns: Unknowns
     unit: float
 
-    def matrix(self, name: str, where: str) -> sparse.csr_array:
-        """Return a symmetric matrix (n, n) with the rows in the order of the unknowns."""
+    def matrix(self, name: str, where: str, *, partial: bool = False) -> sparse.csr_array:
+        """Return a symmetric matrix (n, n), its rows in the order of the unknowns.
+
+        A `partial` one may end before them, as a table does whose last rows are zero.
+        """
         stored = read_matrix(self.folder, name)
         matrix, size = stored.matrix, len(self.unknowns.places)
         place = f"{where}: {self.folder / name}"
@@ -153,6 +156,8 @@ class _Matrices:
                 (np.ones(len(rows)), (rows, np.arange(len(rows)))), (size, len(rows))
             ).tocsr()
             matrix = sparse.csr_array(chosen @ matrix @ chosen.T)
+        if partial and matrix.shape[0] < size:
+            matrix.resize((size, size))
         if matrix.shape[0] != size:
             raise MeshError(
                 f"{place} has {matrix.shape[0]} rows, but there are {size} unknowns; matrices and unknowns "
@@ -256,9 +261,10 @@ def _point_mass(part: MatrixMass, files: _Matrices, number: int) -> sparse.csr_a
     """Return the mass matrix (n, n) of 1 kg, in the unit of the matrices."""
     where = f"mass[{number}]"
     if part.matrix is not None:
-        return files.matrix(part.matrix, where)
+        return files.matrix(part.matrix, where, partial=True)
     assert part.node is not None
-    columns = [files.unknowns.vector((part.node, component), where) for component in (1, 2, 3)]
+    known = [component for component in (1, 2, 3) if (part.node, component) in files.unknowns.rows]
+    columns = [files.unknowns.vector((part.node, component), where) for component in known or (1,)]
     column = sparse.csr_array(np.array(columns).T)
     return sparse.csr_array(files.unit * (column @ column.T))
 
@@ -317,7 +323,7 @@ def _stiffness_terms(
     for number, part in enumerate(design.part, start=1):
         where = f"part[{number}]"
         if part.matrix is not None:
-            own = files.matrix(part.matrix, where)
+            own = files.matrix(part.matrix, where, partial=True)
         else:
             assert part.changed is not None
             assert part.times is not None

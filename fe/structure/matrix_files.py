@@ -7,6 +7,7 @@ node component value` (Abaqus' MATRIX INPUT). Those that name nodes bring their 
 
 import io
 import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +30,12 @@ Place = tuple[int, int]
 
 _PLACE = re.compile(r"\s*(\d+)\s*[.,;\s]\s*([1-6])\s*")
 _SQUARE, _REAL = (1, 6), (1, 2)  # forms and types of Nastran
+
+
+class _Table(NamedTuple):
+    """The numbers of a text file, line by line."""
+
+    lines: FloatArray
 
 
 class StoredMatrix(NamedTuple):
@@ -70,6 +77,8 @@ def read_matrix(folder: Path, name: str) -> StoredMatrix:
     file, chosen = file_of(name)
     path = folder / file
     stored = _read(path, chosen)
+    if isinstance(stored, _Table):
+        stored = _from_table(path, stored.lines)
     if isinstance(stored, StoredMatrix):
         return stored
     if stored.ndim != 2 or stored.shape[0] != stored.shape[1]:
@@ -97,11 +106,15 @@ def read_vector(folder: Path, name: str, named: Callable[[Place], FloatArray], s
         If it cannot be read or has another length.
     """
     file, chosen = file_of(name)
-    found = _read(folder / file, chosen, vector=True)
+    found = _read(folder / file, chosen)
+    if isinstance(found, _Table):
+        found = found.lines
+        if found.shape[1] == 3:
+            parts = [value * named((int(node), int(component))) for node, component, value in found]
+            return np.asarray(np.sum(parts, axis=0))
+    if isinstance(found, StoredMatrix):
+        found = found.matrix
     values = np.asarray(found.todense() if sparse.issparse(found) else found, dtype=np.float64)
-    if values.ndim == 2 and values.shape[1] == 3 and size != 3:
-        parts = [value * named((int(node), int(component))) for node, component, value in values]
-        return np.asarray(np.sum(parts, axis=0))
     if values.size != size or max(values.shape) != size:
         fail(
             str(folder / file),
@@ -111,7 +124,7 @@ def read_vector(folder: Path, name: str, named: Callable[[Place], FloatArray], s
     return values.ravel()
 
 
-def _read(path: Path, chosen: str, *, vector: bool = False) -> Any:
+def _read(path: Path, chosen: str) -> Any:
     try:
         if path.suffix in (".npz", ".npy"):
             return _archived(path, chosen)
@@ -120,16 +133,15 @@ def _read(path: Path, chosen: str, *, vector: bool = False) -> Any:
             return scipy_io.mmread(path)
         if re.search(r"^DMIG", text, re.MULTILINE):
             return _nastran(path, chosen)
-        table = np.loadtxt(io.StringIO(text.replace(",", " ")), comments=("**", "#", "$"), ndmin=2)
-    except (ValueError, OSError, KeyError) as error:
+        return _Table(np.loadtxt(io.StringIO(text.replace(",", " ")), comments=("**", "#", "$"), ndmin=2))
+    except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
         fail(str(path), f"the file cannot be read as a matrix: {' '.join(str(error).split())}.")
-    return table if vector else _from_table(path, table)
 
 
 def _archived(path: Path, chosen: str) -> Any:
+    if path.suffix == ".npy":
+        return np.load(path, allow_pickle=False)
     with np.load(path, allow_pickle=False) as archive:
-        if isinstance(archive, np.ndarray):
-            return archive
         if "format" in archive:
             return sparse.load_npz(path)
         names = list(archive)
