@@ -108,11 +108,12 @@ def store(deck: Deck, folder: Path, name: str) -> None:
     run_calculix("\n".join([*deck.lines, *step]) + "\n", folder, name)
 
 
-def solved(deck: Deck, folder: Path, forces: Iterable[tuple[int, int]]) -> list[dict[int, FloatArray]]:
-    """Displacements (3,) [mm] of all nodes under 1 N at each node and direction, by CalculiX."""
+def solved(deck: Deck, folder: Path, forces: Iterable[tuple[int, Point]]) -> list[dict[int, FloatArray]]:
+    """Displacements (3,) [mm] of all nodes under a force [N] at each of some nodes, by CalculiX."""
     lines = list(deck.lines)
-    for node, direction in forces:
-        lines += ["*STEP", "*STATIC", "*CLOAD, OP=NEW", f"{node},{direction},1."]
+    for node, force in forces:
+        lines += ["*STEP", "*STATIC", "*CLOAD, OP=NEW"]
+        lines += [f"{node},{axis},{value}" for axis, value in enumerate(force, start=1) if value]
         lines += ["*NODE PRINT, NSET=NALL", "U", "*END STEP"]
     tables = read_tables(run_calculix("\n".join(lines) + "\n", folder, "static"))
     return [{int(row[0]): row[1:] for row in table.rows} for table in tables]
@@ -147,8 +148,8 @@ name = "e"
 [[control]]
 name = "push"
 unit = "N"
-minimum = -100
-maximum = 100
+minimum = -1000
+maximum = 1000
 [[damage]]
 name = "z1"
 [[part]]

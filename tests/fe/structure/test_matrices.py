@@ -18,6 +18,7 @@ from fe.structure.operators import load_and_assemble, load_any
 from fe.structure.solution import natural_frequencies, static_responses
 from tests.calculix_decks import (
     Deck,
+    Point,
     frame,
     frequencies,
     needs_calculix,
@@ -38,12 +39,11 @@ CASES = [
 ]
 
 
-def tables(deck: Deck, forces: list[tuple[int, int]], gauge: tuple[int, int]) -> str:
-    """A load of 1 N for each force, a gauge of 100 mm along x, and the displacements of all free nodes."""
+def tables(deck: Deck, forces: list[tuple[int, Point]], gauge: tuple[int, int]) -> str:
+    """A load for each force, a gauge of 100 mm along x, and the displacements of all free nodes."""
     text = f'[[gauge]]\nname = "g"\nnodes = {list(gauge)}\ndirection = [2, 0, 0]\nlength = 100\n'
-    for number, (node, direction) in enumerate(forces):
-        force = [float(direction == axis) for axis in (1, 2, 3)]
-        text += f'[[load]]\nname = "l{number}"\ncontrol = "push"\nnode = {node}\nforce = {force}\n'
+    for number, (node, force) in enumerate(forces):
+        text += f'[[load]]\nname = "l{number}"\ncontrol = "push"\nnode = {node}\nforce = {[*force]}\n'
     for node in sorted(set(deck.node.values()) - set(deck.held)):
         for axis, name in enumerate("xyz"):
             direction = [float(axis == other) for other in range(3)]
@@ -56,14 +56,15 @@ def tables(deck: Deck, forces: list[tuple[int, int]], gauge: tuple[int, int]) ->
 def test_shells_and_beams_are_calculixs_own(
     build: Callable[..., Deck],
     kind: str,
-    corner: tuple[float, float, float],
-    middle: tuple[float, float, float],
-    gauge: tuple[tuple[float, float, float], tuple[float, float, float]],
+    corner: Point,
+    middle: Point,
+    gauge: tuple[Point, Point],
     tmp_path: Path,
 ) -> None:
     """Displacements, an extension, six frequencies, also in a state of which no matrix was made."""
     deck = build(kind)
-    forces = [(deck.node[corner], 3), (deck.node[corner], 2), (deck.node[middle], 3)]
+    up, across = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
+    forces = [(deck.node[corner], up), (deck.node[corner], across), (deck.node[middle], up)]
     ends = deck.node[gauge[0]], deck.node[gauge[1]]
     file = write_structure(tmp_path, lambda **changes: build(kind, **changes), tables(deck, forces, ends))
     structure = load_any(file)
