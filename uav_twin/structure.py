@@ -40,15 +40,15 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
         terminal.print_json(record)
         return
     console = terminal.console()
-    facts = _facts(record) if "mesh" in record else _facts_of_matrices(record)
-    console.print(console_table(("fact", "value", "unit"), facts, console.width))
+    console.print(console_table(("fact", "value", "unit"), _facts(record), console.width))
     for remark in record["remarks"]:
         console.print(f"Note: {remark}", soft_wrap=True)
     parts = [
         (part["what"], part["name"], part["set"], f"{part['count']:,} {part['of']}", part["note"])
         for part in record["parts"]
     ]
-    console.print(console_table(("part", "name", "set", "holds", "note"), parts, console.width))
+    if parts:
+        console.print(console_table(("part", "name", "set", "holds", "note"), parts, console.width))
     modes_found = [(f"{number}", f"{value:.6g}") for number, value in enumerate(record["frequencies"], 1)]
     if modes_found:
         console.print(console_table(("mode", "frequency [Hz]"), modes_found, console.width))
@@ -72,6 +72,10 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
 
 def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     yield "name", record["name"], ""
+    if "mesh" not in record:
+        yield "matrices", ", ".join(record["matrices"]), f"N, s, {record['length_unit']}"
+        yield "unknowns", f"{record['unknowns']:,} free", ""
+        return
     yield "mesh", f"{record['mesh']}: {record['elements']:,} {record['kind']}, {record['nodes']:,} nodes", ""
     if record["linear_elements"]:
         yield "elements", "linear: far too stiff in bending; take quadratic ones", ""
@@ -84,14 +88,6 @@ def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     for key, title in (("centre_of_gravity", "centre of gravity"), ("lower", "from"), ("upper", "to")):
         unit = record["length_unit"]
         yield title, ", ".join(f"{value:.6g}" for value in record[key]), unit
-
-
-def _facts_of_matrices(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    yield "name", record["name"], ""
-    yield "matrices", ", ".join(record["matrices"]), f"N, s, {record['length_unit']}"
-    yield "unknowns", f"{record['unknowns']:,} free, {record['held']:,} held", ""
-    if record["loose"]:
-        yield "rows left out", f"{record['loose']:,} without stiffness and mass", ""
 
 
 def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, Any]:
@@ -120,7 +116,9 @@ def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, An
         "design_hash": structure.design_hash,
         "unknowns": structure.unknowns,
         "length_unit": design.length_unit,
-        **(_of_mesh(structure) if isinstance(structure, Structure) else _of_matrices(structure)),
+        "remarks": [],
+        "parts": [],
+        **(_of_mesh(structure) if isinstance(structure, Structure) else {"matrices": [*design.files]}),
         "frequencies": frequencies,
         "loads": loads,
     }
@@ -150,53 +148,34 @@ def _of_mesh(structure: "Structure") -> dict[str, Any]:
     }
 
 
-def _of_matrices(structure: "DesignedStructure") -> dict[str, Any]:
-    from fe.structure.matrices import MatrixStructure
-
-    assert isinstance(structure, MatrixStructure)
-    terms = [term for term in structure.stiffness_terms if term.parameter or term.region]
-    return {
-        "matrices": list(structure.design.files),
-        "remarks": [],
-        "held": structure.held,
-        "loose": structure.loose,
-        "parts": [
-            _part("stiffness", str(number), "", int((term.matrix.diagonal() > 0.0).sum()), "unknowns", note)
-            for number, term in enumerate(terms, start=1)
-            for note in [", ".join(filter(None, (term.parameter, term.region)))]
-        ],
-    }
-
-
-def _part(what: str, name: str, chosen: str, count: int, of: str, note: str = "") -> dict[str, Any]:
-    return {"what": what, "name": name, "set": chosen, "count": count, "of": of, "note": note}
-
-
 def _parts(structure: "Structure") -> Iterator[dict[str, Any]]:
     design, mesh = structure.design, structure.mesh
+
+    def part(what: str, name: str, chosen: str, count: int, of: str, note: str = "") -> dict[str, Any]:
+        return {"what": what, "name": name, "set": chosen, "count": count, "of": of, "note": note}
 
     for number, material in enumerate(design.material):
         count = int((structure.material_of == number).sum())
         note = f"scaled by {material.scaled_by}" if material.scaled_by else ""
-        yield _part("material", material.name, material.set, count, "elements", note)
+        yield part("material", material.name, material.set, count, "elements", note)
     for number, damage in enumerate(design.damage):
         count = int((structure.region_of == number).sum())
-        yield _part("damage region", damage.name, damage.set, count, "elements")
+        yield part("damage region", damage.name, damage.set, count, "elements")
     for number, support in enumerate(design.support, start=1):
         count = len(mesh.nodes_of(support.set, f"support[{number}]"))
         notes = [f"holds {', '.join(support.hold)}"] * bool(support.hold) + ["springs"] * bool(
             support.springs
         )
         note = ", ".join(["rigid"] * (support.rigid_about is not None) + notes)
-        yield _part("support", str(number), support.set, count, "nodes", note)
+        yield part("support", str(number), support.set, count, "nodes", note)
     for load in design.load:
         if load.set is not None:
             nodes = mesh.nodes_of(load.set, load.name)
             faces = len(mesh.faces_between(load.set, nodes))
-            yield _part("load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes")
+            yield part("load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes")
     for gauge, place in zip(design.gauge, structure.gauge_places, strict=True):
         moved = f"put onto the surface, {place.moved / mesh.unit:.3g} {mesh.unit_name} away"
-        yield _part("gauge", gauge.name, "", 1, "place", moved if place.moved > 1e-6 * mesh.size else "")
+        yield part("gauge", gauge.name, "", 1, "place", moved if place.moved > 1e-6 * mesh.size else "")
 
 
 @structure_app.command("verify")

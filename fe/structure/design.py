@@ -188,11 +188,6 @@ class Load(Commanded):
             raise ValueError(f"{wanted[given[0]]} is expected beside {given[0]}")
         return self
 
-    @property
-    def place(self) -> Vector | None:
-        """Where it acts, of a force at a point."""
-        return self.point
-
 
 class Damage(Region):
     """Region of the cells of a set."""
@@ -217,11 +212,6 @@ class PointOutput(Named):
         refuse_zero(self.direction, "direction")
         return self
 
-    @property
-    def place(self) -> Vector:
-        """Where it is read."""
-        return self.point
-
 
 class MeshDesign(StructureDesign):
     """A structure from a mesh."""
@@ -245,13 +235,6 @@ class MeshDesign(StructureDesign):
     def files(self) -> tuple[str, ...]:
         """The mesh."""
         return (self.mesh,)
-
-    @property
-    def named_content(self) -> dict[str, Any]:
-        """Without the name of the mesh file: its bytes count."""
-        content = super().named_content
-        del content["mesh"]
-        return content
 
 
 def parse_structure(content: dict[str, Any], source: str = "the structure") -> MeshDesign | MatrixDesign:
@@ -290,8 +273,10 @@ def structure_hash(design: StructureDesign, folder: Path) -> str:
     MeshError
         If one cannot be read.
     """
-    content = json.dumps(design.named_content, sort_keys=True, separators=(",", ":"))
-    digest = hashlib.sha256(content.encode())
+    content = design.model_dump(mode="json")
+    content.pop("mesh", None)  # its bytes count, not its name
+    del content["reduction"]  # the structure is the same
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
     for name in design.files:
         try:
             digest.update((folder / name).read_bytes())

@@ -4,7 +4,7 @@ The matrices are in newtons, seconds and the unit of length that the file names;
 acceleration in m/s^2 are turned into these units.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -19,15 +19,6 @@ Files = Annotated[tuple[FileName, ...], Field(min_length=1)]
 Node = Annotated[int, Field(ge=0)]
 
 
-def _one_of(part: Part, ways: dict[str, tuple[str, ...]]) -> None:
-    """Refuse a table that is not given in one of some ways, each a few keys."""
-    keys = {key for way in ways.values() for key in way}
-    given = {key for key in keys if getattr(part, key) is not None}
-    if given not in [set(way) for way in ways.values()]:
-        raise ValueError(f"either {', or '.join(ways)} is expected")
-    refuse_zero(getattr(part, "direction", None), "direction")
-
-
 class MatrixSupport(Part):
     """Motions of nodes that are held: `rx`, `ry`, `rz` are the components 4, 5 and 6."""
 
@@ -35,7 +26,23 @@ class MatrixSupport(Part):
     hold: Annotated[tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...], Field(min_length=1)]
 
 
-class StiffnessPart(Part):
+class _Given(Part):
+    """A table that is given in one of several ways, each a few keys."""
+
+    ways: ClassVar[tuple[tuple[str, ...], ...]]
+
+    @model_validator(mode="after")
+    def _given_in_one_way(self) -> "_Given":
+        given = {key for way in self.ways for key in way if getattr(self, key) is not None}
+        if given not in map(set, self.ways):
+            ways = ", or ".join(" and ".join(way) for way in self.ways)
+            raise ValueError(f"either {ways} is expected")
+        for key in given & {"force", "acceleration", "direction"}:
+            refuse_zero(getattr(self, key), key)
+        return self
+
+
+class StiffnessPart(_Given):
     """Share of the stiffness that a parameter scales, a region may lose, or both.
 
     Either its own `matrix`, or that of the whole structure, `changed` by making the part's modulus `times`
@@ -44,21 +51,14 @@ class StiffnessPart(Part):
 
     matrix: FileName | None = None
     changed: FileName | None = None
-    times: float | None = Field(default=None, ge=0.0, le=10.0)
+    times: float | None = Field(default=None, ge=0.0, lt=1.0)
     scaled_by: Name | None = None
     damage: Name | None = None
 
-    @model_validator(mode="after")
-    def _says_what_it_is(self) -> "StiffnessPart":
-        _one_of(self, {"matrix": ("matrix",), "changed with times": ("changed", "times")})
-        if self.times == 1.0:
-            raise ValueError("times must not be 1: the matrix would not differ from that of the whole")
-        if self.scaled_by is None and self.damage is None:
-            raise ValueError("scaled_by, damage or both are expected")
-        return self
+    ways = (("matrix",), ("changed", "times"))
 
 
-class MatrixLoad(Commanded):
+class MatrixLoad(_Given, Commanded):
     """A load: a `vector` of its own, a `force` [N] at a node, or an `acceleration` [m/s^2] of all mass."""
 
     vector: FileName | None = None
@@ -66,33 +66,19 @@ class MatrixLoad(Commanded):
     force: Vector | None = None
     acceleration: Vector | None = None
 
-    @model_validator(mode="after")
-    def _one_kind_of_load(self) -> "MatrixLoad":
-        ways: dict[str, tuple[str, ...]] = {"vector": ("vector",), "node with force": ("node", "force")}
-        _one_of(self, ways | {"acceleration": ("acceleration",)})
-        refuse_zero(self.force, "force")
-        refuse_zero(self.acceleration, "acceleration")
-        return self
-
-    @property
-    def place(self) -> int | None:
-        """Where it acts, of a force at a node."""
-        return self.node
+    ways = (("vector",), ("node", "force"), ("acceleration",))
 
 
-class MatrixMass(ChosenMass):
+class MatrixMass(_Given, ChosenMass):
     """Mass at a `node`, or times the `matrix` of 1 kg."""
 
     node: Node | None = None
     matrix: FileName | None = None
 
-    @model_validator(mode="after")
-    def _is_somewhere(self) -> "MatrixMass":
-        _one_of(self, {"node": ("node",), "matrix": ("matrix",)})
-        return self
+    ways = (("node",), ("matrix",))
 
 
-class Extension(Named):
+class Extension(_Given, Named):
     """Strain: a `vector` of its own, or how far two nodes move apart along a direction, over a length."""
 
     vector: FileName | None = None
@@ -100,40 +86,17 @@ class Extension(Named):
     direction: Vector | None = None
     length: float | None = Field(default=None, gt=0.0)
 
-    @model_validator(mode="after")
-    def _one_kind_of_gauge(self) -> "Extension":
-        _one_of(
-            self, {"vector": ("vector",), "nodes, direction and length": ("nodes", "direction", "length")}
-        )
-        return self
-
-    @property
-    def ends(self) -> tuple[int, ...]:
-        """Nodes that are read."""
-        return self.nodes or ()
+    ways = (("vector",), ("nodes", "direction", "length"))
 
 
-class NodeOutput(Named):
+class NodeOutput(_Given, Named):
     """Displacement, or acceleration: a `vector` of its own, or of a node along a direction."""
 
     vector: FileName | None = None
     node: Node | None = None
     direction: Vector | None = None
 
-    @model_validator(mode="after")
-    def _is_somewhere(self) -> "NodeOutput":
-        _one_of(self, {"vector": ("vector",), "node with direction": ("node", "direction")})
-        return self
-
-    @property
-    def place(self) -> int | None:
-        """Where it is read, at a node."""
-        return self.node
-
-    @property
-    def ends(self) -> tuple[int, ...]:
-        """Nodes that are read."""
-        return () if self.node is None else (self.node,)
+    ways = (("vector",), ("node", "direction"))
 
 
 class MatrixDesign(StructureDesign):
@@ -172,11 +135,13 @@ class MatrixDesign(StructureDesign):
     @property
     def files(self) -> tuple[str, ...]:
         """Every file that is named, once, in the order of the tables."""
-        named = [*self.stiffness_matrix, *self.mass_matrix, self.unknowns]
-        for table in (self.part, self.load, self.mass, self.gauge, self.displacement, self.acceleration):
-            for part in table:
-                named += [getattr(part, key, None) for key in ("matrix", "changed", "vector")]
-        return tuple(dict.fromkeys(file_of(name)[0] for name in named if name is not None))
+        tables = (self.part, self.load, self.mass, self.gauge, self.displacement, self.acceleration)
+        own = (getattr(part, key, None) for table in tables for part in table for key in _FILES)
+        named = filter(None, (*self.stiffness_matrix, *self.mass_matrix, self.unknowns, *own))
+        return tuple(dict.fromkeys(file_of(name)[0] for name in named))
+
+
+_FILES = ("matrix", "changed", "vector")
 
 
 def file_of(name: str) -> tuple[str, str]:

@@ -1,7 +1,7 @@
 """The tables that every structure file has, whether its structure comes from a mesh or from matrices."""
 
 import itertools
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -159,13 +159,6 @@ class StructureDesign(Part):
     def files(self) -> tuple[str, ...]:
         """Names of the files that it is made of, seen from its own."""
         raise NotImplementedError
-
-    @property
-    def named_content(self) -> dict[str, Any]:
-        """What the hash of the structure is made of, beside the bytes of its files."""
-        content = self.model_dump(mode="json")
-        del content["reduction"]  # the structure is the same
-        return content
 
     @field_validator("name", "mesh", check_fields=False)
     @classmethod

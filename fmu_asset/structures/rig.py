@@ -77,7 +77,8 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
 
 def _meet(load: Load | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
     """Return whether a load is 1 N at the place of an output and along it."""
-    if load.place is None or load.force is None or load.place != output.place or output.direction is None:
+    place, read = (getattr(part, "point", getattr(part, "node", None)) for part in (load, output))
+    if place is None or load.force is None or place != read or output.direction is None:
         return False
     direction = np.asarray(output.direction) / np.linalg.norm(output.direction)
     return bool(np.abs(np.asarray(load.force) - direction).max() < 1e-9)

@@ -163,8 +163,8 @@ def test_every_command_takes_it(file: Path, tmp_path: Path) -> None:
     """Info, reduce and fmu as of a mesh; FMPy finds nothing; what needs a mesh says so."""
     info = command_line.command("structure", "info", file, "--modes", "2")
     assert info.returncode == 0, info.stderr
-    assert "725 free, 0 held" in info.stdout
-    assert "e, z1" in info.stdout
+    assert "725 free" in info.stdout
+    assert "whole.sti, whole.mas, whole.dof" in info.stdout
     assert command_line.command("structure", "reduce", file, "--states", "2").returncode == 0
     for kind in ("python", "compiled"):
         target = tmp_path / f"{kind}.fmu"

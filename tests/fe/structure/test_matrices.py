@@ -363,14 +363,16 @@ REFUSED = [
     ),
     (
         {"acceleration = [10, 0, 0]": "node = 9"},
-        r"load\[2\]: either vector, or node with force, or acceleration",
+        r"load\[2\]: either vector, or node and force, or acceleration",
     ),
-    ({"length = 20": ""}, r"gauge\[1\]: either vector, or nodes, direction and length is expected"),
-    ({"direction = [-3, 0, 0]": ""}, r"displacement\[1\]: either vector, or node with direction"),
+    ({"length = 20": ""}, r"gauge\[1\]: either vector, or nodes and direction and length is expected"),
+    ({"direction = [-3, 0, 0]": ""}, r"displacement\[1\]: either vector, or node and direction"),
     ({"node = 7\nmass": "mass"}, r"mass\[1\]: either node, or matrix"),
-    ({'matrix = "middle.mtx"': 'changed = "m.mtx"'}, r"part\[1\]: either matrix, or changed with times"),
-    ({'matrix = "middle.mtx"': 'changed = "m.mtx"\ntimes = 1'}, "times must not be 1"),
-    ({'scaled_by = "e"\ndamage = "z1"': ""}, "scaled_by, damage or both are expected"),
+    ({'matrix = "middle.mtx"': 'changed = "m.mtx"'}, r"part\[1\]: either matrix, or changed and times"),
+    (
+        {'matrix = "middle.mtx"': 'changed = "m.mtx"\ntimes = 1'},
+        r"part\[1\]\.times: input should be less than 1",
+    ),
     (
         {'damage = "z1"': 'damage = "z2"'},
         r"part\[1\] is of the region 'z2', but no \[\[damage\]\] has that name",
