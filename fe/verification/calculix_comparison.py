@@ -13,14 +13,17 @@ from fe.full.statics import Factorisation, static_outputs
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState, Losses
 
-from .calculix_input import INTEGRATION_POINTS, CalculixModel
 from .calculix_job import read_frequencies, read_tables, run_calculix
+from .calculix_models import gauge_cells, wing_deck
 
 FloatArray = NDArray[np.float64]
 
 TEST_FORCE = 10.0
 """Upward force of the static test and before the ring-down [N]."""
 # Rows and columns in which CalculiX prints a strain tensor.
+_LINE = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
+INTEGRATION_POINTS = np.array([(x, y, z) for z in _LINE for y in _LINE for x in _LINE])
+"""Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
 _PRINTED = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
@@ -79,10 +82,15 @@ def static_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    model = CalculixModel(operators, young_modulus_factor, stiffness_loss)
+    deck = wing_deck(
+        operators, DigitalState(young_modulus_factor=young_modulus_factor, stiffness_loss=stiffness_loss)
+    )
     turn = operators.wing_mesh.design.lift.load_factor
     loads = {"tip force": operators.load(0.0, TEST_FORCE), "lift": operators.load(turn)}
-    tables = read_tables(run_calculix(model.static_steps(tuple(loads.values())), folder, "static"))
+    steps = deck.static_steps(
+        map(deck.force_lines, loads.values()), ("*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E")
+    )
+    tables = read_tables(run_calculix(steps, folder, "static"))
     nodes, probes, strains = (
         [table.rows for table in tables if table.set_name == name] for name in ("NALL", "NPROBES", "EGAUGES")
     )
@@ -94,7 +102,7 @@ def static_agreement(
         ours = static_outputs(operators, factors.solve(load))
         field = operators.full_displacement(ours.displacement)
         theirs = probes[number][:, 1:].ravel()
-        tensor = _strain_tensors(operators, model, ours.displacement)
+        tensor = _strain_tensors(operators, ours.displacement)
         printed = strains[number][:, 2:].reshape(*tensor.shape[:2], 6)
         found.append(
             StaticAgreement(
@@ -109,9 +117,9 @@ def static_agreement(
     return found[0], found[1]
 
 
-def _strain_tensors(operators: AffineOperators, model: CalculixModel, free: FloatArray) -> FloatArray:
+def _strain_tensors(operators: AffineOperators, free: FloatArray) -> FloatArray:
     """Strain tensor (cells, 27, 6) in CalculiX's order at the integration points of the gauges' cells."""
-    body, cells = operators.discretisation, model.gauge_cells
+    body, cells = operators.discretisation, gauge_cells(operators)
     gradients, _ = global_gradients(body.corners[cells], INTEGRATION_POINTS)
     displacement = operators.full_displacement(free).ravel()[body.cell_dofs[cells]]
     voigt = np.einsum("nqij,nj->nqi", strain_matrix(gradients), displacement)
@@ -145,8 +153,9 @@ def modal_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    model = _model(operators, state)
-    theirs = read_frequencies(run_calculix(model.frequency_step(count), folder, "modes"))
+    theirs = read_frequencies(
+        run_calculix(wing_deck(operators, state).frequency_step(count), folder, "modes")
+    )
     ours = eigenmodes(
         operators,
         state.young_modulus_factor,
@@ -158,18 +167,6 @@ def modal_agreement(
     if len(theirs) < count:
         raise CalculixError(f"CalculiX printed {len(theirs)} frequencies instead of {count}.")
     return ModalAgreement(ours, theirs[:count])
-
-
-def _model(operators: AffineOperators, state: DigitalState) -> CalculixModel:
-    return CalculixModel(
-        operators,
-        state.young_modulus_factor,
-        state.stiffness_loss,
-        state.servo_mass,
-        state.pitot_mass,
-        state.damping_alpha,
-        state.damping_beta,
-    )
 
 
 @dataclass(frozen=True)
@@ -258,7 +255,7 @@ def ring_down_agreement(
     for step in range(steps):
         current = integrator.advance(current, increment, (0.0, 0.0))
         ours[step] = integrator.outputs(current)[-1]
-    text = _model(operators, state).ring_down_steps(operators.load(0.0, TEST_FORCE), increment, steps)
+    text = wing_deck(operators, state).ring_down_steps(operators.load(0.0, TEST_FORCE), increment, steps)
     tables = read_tables(run_calculix(text, folder, "ring_down"))
     theirs = np.array([table.rows[0, 2] for table in tables if table.set_name == "NPROBES"])
     if len(theirs) != steps:

@@ -11,7 +11,7 @@ from fe.structure.operators import Structure
 from fe.structure.solution import natural_frequencies, static_responses
 
 from .calculix_job import read_frequencies, read_tables, run_calculix
-from .structure_input import StructureDeck
+from .calculix_models import structure_deck, structure_loads
 
 FloatArray = NDArray[np.float64]
 
@@ -75,10 +75,12 @@ def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> S
     CalculixError
         If CalculiX is not there, fails, or has no such element.
     """
-    deck = StructureDeck(structure)
+    deck = structure_deck(structure)
     loads = []
     if structure.loads:
-        tables = read_tables(run_calculix(deck.static_steps(), folder, "static"))
+        tables = read_tables(
+            run_calculix(deck.static_steps(structure_loads(structure, deck)), folder, "static")
+        )
         fields = [table.rows[:, 1:] for table in tables if table.set_name == "NALL"]
         probes = [table.rows[:, 1:].ravel() for table in tables if table.set_name == "NPROBES"]
         if len(fields) != len(structure.loads):

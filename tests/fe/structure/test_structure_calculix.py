@@ -12,8 +12,8 @@ import pytest
 from fe.runtime.errors import CalculixError
 from fe.structure.operators import Structure, load_and_assemble
 from fe.verification.calculix_job import calculix_program
+from fe.verification.calculix_models import structure_deck
 from fe.verification.structure_comparison import structure_agreement
-from fe.verification.structure_input import StructureDeck
 
 needs_calculix = pytest.mark.skipif(
     calculix_program() is None,
@@ -150,4 +150,4 @@ def test_both_codes_agree(
 
 def test_wedges_cannot_be_compared(box: Callable[..., Any], write: Callable[..., Path]) -> None:
     with pytest.raises(CalculixError, match=r"integrates 6-node wedges \(C3D6\) in another way"):
-        StructureDeck(body(box, write, "wedge"))
+        structure_deck(body(box, write, "wedge"))
