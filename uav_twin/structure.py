@@ -17,7 +17,7 @@ from uav_twin.structure_reduce import reduce
 if TYPE_CHECKING:
     from fe.structure.affine import DesignedStructure
     from fe.structure.operators import Structure
-    from fe.verification.structure_comparison import StructureAgreement
+    from fe.verification.calculix_comparison import StructureAgreement
 
 DISPLACEMENT_LIMIT, STRAIN_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-5, 1e-6
 """Largest differences to CalculiX, each relative to the largest of its kind."""
@@ -191,7 +191,7 @@ def verify(
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
     from fe.runtime.errors import CalculixError
     from fe.verification.calculix_job import calculix_program
-    from fe.verification.structure_comparison import structure_agreement
+    from fe.verification.calculix_comparison import structure_agreement
     from reporting.errors import FileNotWrittenError
 
     if calculix_program() is None:
@@ -214,7 +214,7 @@ def verify(
                 "checks": [
                     dict(zip(("of", "what", "difference", "limit"), row, strict=True)) for row in rows
                 ],
-                "frequencies": {"ours": list(agreement.ours), "calculix": list(agreement.calculix)},
+                "frequencies": {"ours": list(agreement.modes.ours), "calculix": list(agreement.modes.calculix)},
                 "passed": not broken,
             }
         )
@@ -241,7 +241,7 @@ def _differences(agreement: "StructureAgreement") -> Iterator[tuple[str, str, fl
             yield f"load {load.load}", "displacement outputs", load.output, DISPLACEMENT_LIMIT
         if load.strain is not None:
             yield f"load {load.load}", "gauge strains", load.strain, STRAIN_LIMIT
-    yield f"{len(agreement.ours)} modes", "frequencies", agreement.frequency, FREQUENCY_LIMIT
+    yield f"{len(agreement.modes.ours)} modes", "frequencies", agreement.modes.relative, FREQUENCY_LIMIT
 
 
 structure_app.command("reduce")(reduce)
