@@ -182,6 +182,8 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> D
     moves = (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0)
     moves[[row for rows in held for row in rows]] = False
     free = np.flatnonzero(moves)
+    if not len(free):
+        raise MeshError(f"{folder}: the matrices have no row that is free and has stiffness or mass.")
     _check_whole(stiffness[free][:, free], mass[free][:, free], [files.places[row] for row in free])
 
     own = [_point_mass(part, design.unit, files, number) for number, part in enumerate(design.mass, start=1)]
@@ -356,6 +358,6 @@ def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:
     free = int((values < _INDEFINITE + _FREE).sum())
     moved = int(np.abs(scale @ shapes[:, 0]).argmax())
     raise MeshError(
-        f"the stiffness leaves {free or 1} motions free, or nearly; in one {_named(places[moved])} moves "
-        "most. Hold the structure by [[support]], or before its matrices are written."
+        f"motions that the stiffness leaves free, or nearly: {free or 1}; in one {_named(places[moved])} "
+        "moves most. Hold the structure by [[support]], or before its matrices are written."
     )

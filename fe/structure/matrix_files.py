@@ -81,8 +81,11 @@ def read_matrix(folder: Path, name: str) -> StoredMatrix:
         stored = _from_table(path, stored.lines)
     if isinstance(stored, StoredMatrix):
         return stored
-    if stored.ndim != 2 or stored.shape[0] != stored.shape[1]:
-        fail(str(path), f"a square matrix is expected, but one of shape {stored.shape} came.")
+    if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or stored.dtype.kind not in "fiu":
+        fail(
+            str(path),
+            f"a square matrix of real numbers is expected, but {stored.dtype} of shape {stored.shape} came.",
+        )
     return StoredMatrix(sparse.csr_array(stored, dtype=np.float64))
 
 
@@ -133,6 +136,8 @@ def _read(path: Path, chosen: str) -> Any:
             return scipy_io.mmread(path)
         if re.search(r"^DMIG", text, re.MULTILINE):
             return _nastran(path, chosen)
+        if not text.strip():
+            raise ValueError("it is empty")
         return _Table(np.loadtxt(io.StringIO(text.replace(",", " ")), comments=("**", "#", "$"), ndmin=2))
     except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
         fail(str(path), f"the file cannot be read as a matrix: {' '.join(str(error).split())}.")
@@ -171,9 +176,11 @@ def _from_table(path: Path, table: FloatArray) -> Any:
 def _mirrored(
     rows: NDArray[np.int64], columns: NDArray[np.int64], values: FloatArray, size: int
 ) -> sparse.csr_array:
-    """Return a matrix of which one triangle may be left out."""
+    """Return a matrix of which one of each two entries that mirror each other may be left out."""
     matrix = sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
-    if (rows <= columns).all() or (rows >= columns).all():
+    pattern = sparse.coo_array((np.ones(len(rows)), (rows, columns)), (size, size)).tocsr()
+    both = pattern.multiply(pattern.T).tocoo()
+    if (both.row == both.col).all():
         matrix = (matrix + matrix.T - sparse.diags_array(matrix.diagonal())).tocsr()
     return matrix
 
