@@ -190,8 +190,8 @@ def verify(
 ) -> None:
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
     from fe.runtime.errors import CalculixError
-    from fe.verification.calculix_job import calculix_program
     from fe.verification.calculix_comparison import structure_agreement
+    from fe.verification.calculix_job import calculix_program
     from reporting.errors import FileNotWrittenError
 
     if calculix_program() is None:
@@ -214,7 +214,7 @@ def verify(
                 "checks": [
                     dict(zip(("of", "what", "difference", "limit"), row, strict=True)) for row in rows
                 ],
-                "frequencies": {"ours": list(agreement.modes.ours), "calculix": list(agreement.modes.calculix)},
+                "frequencies": {key: getattr(agreement.modes, key).tolist() for key in ("ours", "calculix")},
                 "passed": not broken,
             }
         )

@@ -30,13 +30,13 @@ def located(file: Path) -> Path:
     return file if file.exists() else structure_files().get(str(file), file)
 
 
-def is_structure(design: Path) -> bool:
-    """Return whether a design is that of a structure, which names a mesh or matrices; a wing's does not."""
+def names_structure(design: Path) -> bool:
+    """Return whether a design is that of a structure, and not of a wing."""
     from fe.runtime.errors import DesignFileError
+    from fe.structure.design import is_structure
     from reporting.toml_file import read_toml
 
-    content = read_toml(located(design), DesignFileError, what="wing design")
-    return "mesh" in content or "stiffness_matrix" in content
+    return is_structure(read_toml(located(design), DesignFileError, what="wing design"))
 
 
 def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False) -> "Structure":

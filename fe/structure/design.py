@@ -5,6 +5,7 @@ Places and lengths are in the unit of length of the mesh, which the file names; 
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -235,6 +236,11 @@ class MeshDesign(StructureDesign):
     def files(self) -> tuple[str, ...]:
         """The mesh."""
         return (self.mesh,)
+
+
+def is_structure(content: Mapping[str, Any]) -> bool:
+    """Return whether the content of a file is a structure's: no other model names a mesh or matrices."""
+    return "mesh" in content or "stiffness_matrix" in content
 
 
 def parse_structure(content: dict[str, Any], source: str = "the structure") -> MeshDesign | MatrixDesign:

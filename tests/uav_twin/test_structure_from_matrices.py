@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -179,7 +180,7 @@ def test_every_command_takes_it(file: Path, tmp_path: Path) -> None:
 
 
 @needs_calculix
-def test_a_campaign_tells_its_parameter(file: Path, tmp_path: Path) -> None:
+def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(file: Path, tmp_path: Path) -> None:
     """What CalculiX answers with 0.96 times the modulus, read with noise."""
     strain, corner = calculix(tmp_path, 0.96, 0.0)
     random = np.random.default_rng(7)
@@ -203,6 +204,10 @@ def test_a_campaign_tells_its_parameter(file: Path, tmp_path: Path) -> None:
     found = load_calibration(tmp_path / "out" / "calibration.nc")
     assert isinstance(found, ParameterCalibration)
     assert abs(found.mean("e") - 0.96) < 3.0 * found.standard_deviation("e") < 0.01
+    words = ("--model", file, "--out", tmp_path / "verdict", "--no-report", "--json")
+    done = command_line.command("discrepancy", "run", lab, *words)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["verdict"]["kind"] == "nothing missing"
 
 
 @needs_calculix
