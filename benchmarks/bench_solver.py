@@ -71,11 +71,13 @@ print(json.dumps({
 _CALCULIX = """
 import sys
 from pathlib import Path
-from fe.verification.calculix_input import CalculixModel
+from fe.runtime.state import DigitalState
+from fe.verification.calculix_models import wing_deck
 from fe.wing.design import load_design
 from fe.full.operators import assemble
 operators = assemble(load_design().changed(mesh={"refinement": float(sys.argv[1])}))
-text = CalculixModel(operators).static_steps((operators.load_tip,))
+deck = wing_deck(operators, DigitalState())
+text = deck.static_steps([deck.force_lines(operators.load_tip)])
 Path(sys.argv[2]).write_text(text, encoding="ascii")
 """
 

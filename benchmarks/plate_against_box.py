@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fe.verification.plate_comparison import DAMAGE, compare_with_plate
+from evidence.sandwich_plate.plate_comparison import DAMAGE, compare_with_plate
 from fe.wing.design import load_design
 from reporting.figures import (
     OBSERVED,

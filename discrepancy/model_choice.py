@@ -28,7 +28,7 @@ from discrepancy.sources.from_run import (
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
-from fe.structure.design import load_structure
+from fe.structure.design import is_structure, load_structure
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from fmu_asset.archive.design_record import packed_design_hash
 from fmu_asset.errors import FmuError
@@ -143,7 +143,7 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
         content = read_toml(path, ModelError, what="model")
         if content.get("kind") == "fmu":
             return _fmu(path)
-        if "mesh" in content:  # neither a wing design nor a lumped model has one
+        if is_structure(content):
             return _structure(path, progress)
         if "format" not in content:  # a wing design has none
             return _wing(path, progress)

@@ -1,1 +1,1 @@
-"""Where numbers come from that are shipped: what repeats how they were found, and is not shipped itself."""
+"""What shipped numbers rest on: how they were found, a second model beside the first; not shipped itself."""

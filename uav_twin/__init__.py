@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from fe.full.operators import assemble
     from fe.full.statics import solve_static
     from fe.reduction.model_cache import reduced_model, reduced_structure
-    from fe.structure.operators import load_and_assemble as assemble_structure
+    from fe.structure.operators import load_any as assemble_structure
     from fe.structure.solution import natural_frequencies, static_responses
     from fe.wing.design import load_design
     from fmu_asset.door.session import FmiAsset
@@ -101,7 +101,7 @@ _HOMES = {
     "WatchfulEstimator": "twin_master.learning.monitor",
     "apply_verdict": "discrepancy.application",
     "assemble": "fe.full.operators",
-    "assemble_structure": "fe.structure.operators:load_and_assemble",
+    "assemble_structure": "fe.structure.operators:load_any",
     "build_fmu": "fmu_asset.packing.structure_fmu",
     "calibrate": "calibration.wing.three_steps:calibrate_wing",
     "eigenmodes": "fe.full.modes",

@@ -10,7 +10,7 @@ from reporting import terminal
 from uav_twin.fmu_bind import bind
 from uav_twin.fmu_check import check
 from uav_twin.fmu_simulate import simulate
-from uav_twin.structure_arguments import is_structure
+from uav_twin.structure_arguments import names_structure
 from uav_twin.structure_fmu import fmu as build_structure
 
 _SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
@@ -67,7 +67,7 @@ def build(
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes."""
-    if script is None and calibration is None and design is not None and is_structure(design):
+    if script is None and calibration is None and design is not None and names_structure(design):
         if patch is not None or activate or interface != "co-simulation" or windows:
             raise typer.BadParameter(
                 "--patch, --activate, --interface and --windows are for wings; the design is a structure."

@@ -9,21 +9,22 @@ import typer
 
 from reporting import terminal
 from uav_twin.console_table import console_table
-from uav_twin.structure_arguments import File, MemoryLimit, assembled
+from uav_twin.structure_arguments import File, MemoryLimit, assembled, assembled_of_any
 from uav_twin.structure_field import field
 from uav_twin.structure_fmu import fmu
 from uav_twin.structure_reduce import reduce
 
 if TYPE_CHECKING:
+    from fe.structure.affine import DesignedStructure
     from fe.structure.operators import Structure
-    from fe.verification.structure_comparison import StructureAgreement
+    from fe.verification.calculix_comparison import StructureAgreement
 
 DISPLACEMENT_LIMIT, STRAIN_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-5, 1e-6
 """Largest differences to CalculiX, each relative to the largest of its kind."""
 
 structure_app = typer.Typer(
     no_args_is_help=True,
-    help="Look at a structure from a mesh, verify its model against CalculiX, reduce it, pack it.",
+    help="Look at a structure from a mesh or matrices, verify it against CalculiX, reduce it, pack it.",
 )
 
 Modes = Annotated[int, typer.Option(min=1, max=50, help="Number of modes.")]
@@ -32,7 +33,7 @@ Modes = Annotated[int, typer.Option(min=1, max=50, help="Number of modes.")]
 @structure_app.command("info")
 def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: terminal.Json = False) -> None:
     """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it."""
-    structure = assembled(file, memory_limit)
+    structure = assembled_of_any(file, memory_limit)
     with terminal.progress().stage("Solving the loads and the modes"):
         record = structure_record(structure, modes)
     if json:
@@ -46,7 +47,8 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
         (part["what"], part["name"], part["set"], f"{part['count']:,} {part['of']}", part["note"])
         for part in record["parts"]
     ]
-    console.print(console_table(("part", "name", "set", "holds", "note"), parts, console.width))
+    if parts:
+        console.print(console_table(("part", "name", "set", "holds", "note"), parts, console.width))
     modes_found = [(f"{number}", f"{value:.6g}") for number, value in enumerate(record["frequencies"], 1)]
     if modes_found:
         console.print(console_table(("mode", "frequency [Hz]"), modes_found, console.width))
@@ -70,6 +72,10 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
 
 def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     yield "name", record["name"], ""
+    if "mesh" not in record:
+        yield "matrices", ", ".join(record["matrices"]), f"N, s, {record['length_unit']}"
+        yield "unknowns", f"{record['unknowns']:,} free", ""
+        return
     yield "mesh", f"{record['mesh']}: {record['elements']:,} {record['kind']}, {record['nodes']:,} nodes", ""
     if record["linear_elements"]:
         yield "elements", "linear: far too stiff in bending; take quadratic ones", ""
@@ -84,17 +90,16 @@ def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         yield title, ", ".join(f"{value:.6g}" for value in record[key]), unit
 
 
-def structure_record(structure: "Structure", modes: int) -> dict[str, Any]:
+def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, Any]:
     """Return what is known of a structure without damage, at nominal values, by name.
 
     Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in SI units.
     """
-    from fe.structure.memory import upper_estimate
-    from fe.structure.solution import natural_frequencies, static_responses, weighed
+    from fe.structure.operators import Structure
+    from fe.structure.solution import natural_frequencies, static_responses
 
-    mesh, design = structure.mesh, structure.design
-    mass, centre = weighed(structure)
-    frequencies = natural_frequencies(structure, modes)[0].tolist() if mass > 0.0 else []
+    design, heavy = structure.design, structure.mass().diagonal().any()
+    frequencies = natural_frequencies(structure, modes)[0].tolist() if heavy else []
     loads = [
         {
             "name": name,
@@ -108,25 +113,38 @@ def structure_record(structure: "Structure", modes: int) -> dict[str, Any]:
     ]
     return {
         "name": design.name,
-        "mesh": design.mesh,
-        "remarks": list(mesh.remarks),
         "design_hash": structure.design_hash,
+        "unknowns": structure.unknowns,
+        "length_unit": design.length_unit,
+        "remarks": [],
+        "parts": [],
+        **(_of_mesh(structure) if isinstance(structure, Structure) else {"matrices": [*design.files]}),
+        "frequencies": frequencies,
+        "loads": loads,
+    }
+
+
+def _of_mesh(structure: "Structure") -> dict[str, Any]:
+    from fe.structure.memory import upper_estimate
+    from fe.structure.solution import weighed
+
+    mesh = structure.mesh
+    mass, centre = weighed(structure)
+    return {
+        "mesh": structure.design.mesh,
+        "remarks": list(mesh.remarks),
         "kind": mesh.kind.name,
         "linear_elements": not mesh.kind.edges,
         "elements": len(mesh.cells),
         "nodes": len(mesh.points),
         "loose_nodes": [int(number) for number in mesh.loose],
-        "unknowns": structure.unknowns,
         "held": mesh.unknowns - structure.unknowns,
         "memory": upper_estimate(mesh),
         "mass": mass,
-        "length_unit": mesh.unit_name,
         "centre_of_gravity": [float(value) / mesh.unit for value in centre],
         "lower": [float(value) / mesh.unit for value in mesh.points.min(axis=0)],
         "upper": [float(value) / mesh.unit for value in mesh.points.max(axis=0)],
         "parts": list(_parts(structure)),
-        "frequencies": frequencies,
-        "loads": loads,
     }
 
 
@@ -172,8 +190,8 @@ def verify(
 ) -> None:
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
     from fe.runtime.errors import CalculixError
+    from fe.verification.calculix_comparison import structure_agreement
     from fe.verification.calculix_job import calculix_program
-    from fe.verification.structure_comparison import structure_agreement
     from reporting.errors import FileNotWrittenError
 
     if calculix_program() is None:
@@ -196,7 +214,7 @@ def verify(
                 "checks": [
                     dict(zip(("of", "what", "difference", "limit"), row, strict=True)) for row in rows
                 ],
-                "frequencies": {"ours": list(agreement.ours), "calculix": list(agreement.calculix)},
+                "frequencies": {key: getattr(agreement.modes, key).tolist() for key in ("ours", "calculix")},
                 "passed": not broken,
             }
         )
@@ -223,7 +241,7 @@ def _differences(agreement: "StructureAgreement") -> Iterator[tuple[str, str, fl
             yield f"load {load.load}", "displacement outputs", load.output, DISPLACEMENT_LIMIT
         if load.strain is not None:
             yield f"load {load.load}", "gauge strains", load.strain, STRAIN_LIMIT
-    yield f"{len(agreement.ours)} modes", "frequencies", agreement.frequency, FREQUENCY_LIMIT
+    yield f"{len(agreement.modes.ours)} modes", "frequencies", agreement.modes.relative, FREQUENCY_LIMIT
 
 
 structure_app.command("reduce")(reduce)

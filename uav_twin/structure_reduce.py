@@ -8,7 +8,7 @@ import typer
 
 from reporting import terminal
 from uav_twin.console_table import console_table
-from uav_twin.structure_arguments import File, MemoryLimit, assembled, reduced
+from uav_twin.structure_arguments import File, MemoryLimit, assembled_of_any, reduced
 
 if TYPE_CHECKING:
     from fe.reduction.structure_errors import MeasuredErrors
@@ -28,7 +28,7 @@ def reduce(
 
     model, errors = reduced(file, memory_limit), None
     if states:
-        structure = assembled(file, memory_limit)
+        structure = assembled_of_any(file, memory_limit)
         with terminal.progress().stage("Comparing it with the full model"):
             errors = measured_errors(structure, model, states)
     if json:

@@ -78,6 +78,18 @@ def verify(
     with tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch:
         jobs = (out or Path(scratch)) / "calculix"
         checks = all_checks(wing_design, jobs, terminal.progress(), quick=quick)
+    print_checks(checks)
+    if calculix_program() is None:
+        terminal.console().print(
+            "CalculiX is not installed (apt-get install calculix-ccx): its checks are left out."
+        )
+    if out is not None:
+        terminal.console().print(f"Wrote {write_record(out, wing_design, checks)}", soft_wrap=True)
+    end_with(checks)
+
+
+def print_checks(checks: Sequence[Check]) -> None:
+    """Print every check beside its limit."""
     console = terminal.console()
     rows = []
     for check in checks:
@@ -86,10 +98,10 @@ def verify(
         found = f"{check.value:.3g}" + (f" {check.note}" if check.note else "")
         rows.append((check.group, check.name, found, limit, verdict))
     console.print(console_table(("check", "figure", "found", "limit", "verdict"), rows, console.width))
-    if calculix_program() is None:
-        console.print("CalculiX is not installed (apt-get install calculix-ccx): its checks are left out.")
-    if out is not None:
-        console.print(f"Wrote {write_record(out, wing_design, checks)}", soft_wrap=True)
+
+
+def end_with(checks: Sequence[Check]) -> None:
+    """End with 1, and say which limits are broken, if any is."""
     broken = [check for check in checks if not check.passed]
     if broken:
         names = "; ".join(f"{check.group}, {check.name}" for check in broken)
@@ -139,7 +151,6 @@ def all_checks(design: "WingDesign", jobs: Path, progress: "Progress", *, quick:
     with progress.stage("Meshing the wing"):
         mesh = assemble(design.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else design)
     run("Balances of the wing", balance_checks(mesh))
-    run("The sandwich plate beside the box", plate_checks(mesh, limited=not quick))
     refinements = QUICK_REFINEMENTS if quick else REFINEMENTS
     run("Convergence of the mesh", convergence_checks(design, refinements, limited=not quick))
     if calculix_program() is not None:
@@ -226,72 +237,6 @@ def convergence_checks(
         note = f"({1e6 * own[-1]:.0f} microstrain, {order(own)})"
         yield Check(group, f"gauge {gauge}", float(value), None, note)
     yield Check(group, "unknowns of the finest mesh", rows[-1].unknowns)
-
-
-def plate_checks(operators: "AffineOperators", *, limited: bool = True) -> Iterator[Check]:
-    """Yield the closed forms of the sandwich plate, and its differences to the box of the same design.
-
-    Gauges whose patch comes near an edge of a defect count in the rms of all gauges; they are told apart,
-    without a limit of their own, because strain jumps there. The rms of the others has a tighter limit.
-
-    Parameters
-    ----------
-    operators : AffineOperators
-        The box.
-    limited : bool
-        Hold the differences to their limits, which are made for the mesh of the design.
-    """
-    import numpy as np
-
-    from fe.verification.plate_comparison import DAMAGE, compare_with_plate
-    from fe.verification.plate_known_answers import (
-        cantilever_strip,
-        square_plate_deflection,
-        square_plate_frequency,
-    )
-
-    for name, closed_form in (
-        ("square plate, deflection", square_plate_deflection),
-        ("square plate, first frequency", square_plate_frequency),
-        ("strip, tip deflection", cantilever_strip),
-    ):
-        yield Check("sandwich plate", name, abs(closed_form(8).relative_error), 1e-3)
-    for straight, group in ((False, "plate against box"), (True, "plate of the box's section")):
-        found = compare_with_plate(operators.wing_mesh.design, operators, straight_section=straight)
-        for name, unit in (("tip_stiffness", "N/m"), ("first_bending", "Hz"), ("second_bending", "Hz")):
-            note = f"({getattr(found.plate, name):.5g}, {getattr(found.box, name):.5g} {unit})"
-            limit = 0.01 if limited else None
-            yield Check(group, name.replace("_", " "), abs(found.relative(name)), limit, note)
-        slopes = f"({found.plate.tip_stiffness_slope:.4f}, {found.box.tip_stiffness_slope:.4f})"
-        limit = 0.02 if limited else None
-        yield Check(group, "d ln k / d ln e", abs(found.tip_stiffness_slope), limit, slopes)
-        for name, difference in (
-            ("gauges", found.strain),
-            ("d ln strain / d ln e", found.strain_slope),
-            *(
-                (f"strain ratio, {name} = {DAMAGE:g}", difference)
-                for name, difference in zip(operators.regions, found.damage_ratio, strict=True)
-            ),
-        ):
-            for kind, gauges, limit in (
-                ("rms", np.arange(len(difference)), 0.03),
-                ("rms off the edges", np.flatnonzero(~found.at_edges), 0.02),
-            ):
-                if len(gauges):
-                    rms = float(np.sqrt(np.mean(difference[gauges] ** 2)))
-                    worst = gauges[np.abs(difference[gauges]).argmax()]
-                    note = f"({len(gauges)} gauges, largest {abs(difference[worst]):.2g}, gauge {worst + 1})"
-                    yield Check(group, f"{name}, {kind}", rms, limit if limited else None, note)
-            at_edges = np.flatnonzero(found.at_edges)
-            if len(at_edges):
-                each = (f"{gauge + 1}: {100 * difference[gauge]:+.1f} %" for gauge in at_edges)
-                note = f"({', '.join(each)})"
-                largest = float(np.abs(difference[at_edges]).max())
-                yield Check(group, f"{name}, largest at the edges", largest, None, note)
-        ratio = found.plate.frequency[3:] / found.box.frequency[3:] - 1.0
-        note = f"({', '.join(f'{100 * value:+.1f} %' for value in ratio)})"
-        yield Check(group, f"frequencies 4 to {3 + len(ratio)}", float(np.abs(ratio).max()), None, note)
-        yield Check(group, "unknowns, over those of the box", found.plate.unknowns / found.box.unknowns)
 
 
 def calculix_checks(operators: "AffineOperators", jobs: Path) -> Iterator[Check]:

@@ -21,7 +21,7 @@ from .fields import FieldBasis, WingFields, field_basis
 
 if TYPE_CHECKING:
     from fe.full.operators import AffineOperators
-    from fe.structure.operators import Structure
+    from fe.structure.affine import DesignedStructure
     from fe.wing.design import WingDesign
     from reporting.progress import Progress
 
@@ -219,10 +219,10 @@ def reduced_structure(
     settings, design_hash, path = _place(file, settings)
 
     def build_structure() -> ReducedModel:
-        from fe.structure.operators import load_and_assemble
+        from fe.structure.operators import load_any
 
         with (progress or SilentProgress()).stage("Reading the mesh and assembling"):
-            structure = load_and_assemble(file, memory_limit)
+            structure = load_any(file, memory_limit)
         return reduced(structure, settings, progress)
 
     return built_once(
@@ -241,10 +241,10 @@ def check_structure(file: Path | str) -> None:
     FiniteElementError
         If the structure cannot be read or modelled.
     """
-    from fe.structure.operators import load_and_assemble
+    from fe.structure.operators import load_any
 
     if not _place(Path(file))[2].is_file():
-        load_and_assemble(file)
+        load_any(file)
 
 
 def _place(file: Path, settings: "StructureSettings | None" = None) -> tuple["StructureSettings", str, Path]:
@@ -255,12 +255,14 @@ def _place(file: Path, settings: "StructureSettings | None" = None) -> tuple["St
 
     design = load_structure(file)
     settings = settings or StructureSettings.of(design)
-    design_hash = structure_hash(design, file.parent / design.mesh)
+    design_hash = structure_hash(design, file.parent)
     return settings, design_hash, entry("structure", design_hash, settings)
 
 
 def reduced(
-    structure: "Structure", settings: "StructureSettings | None" = None, progress: "Progress | None" = None
+    structure: "DesignedStructure",
+    settings: "StructureSettings | None" = None,
+    progress: "Progress | None" = None,
 ) -> ReducedModel:
     """Reduce an assembled structure in one thread, without the cache; see `reduced_structure`."""
     from threadpoolctl import threadpool_limits

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fe.runtime.state import wing_names
-from fe.structure.design import ReductionLimits, StructureDesign
+from fe.structure.tables import ReductionLimits, StructureDesign
 
 FloatArray = npt.NDArray[np.float64]
 Range = tuple[float, float]

@@ -7,6 +7,7 @@ where acceleration fields act on the free masses too.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from scipy import sparse
 from fe.full.affine import affine_sum
 from fe.runtime.errors import InvalidStateError
 from fe.runtime.state import losses_of
+
+from .tables import StructureDesign
 
 FloatArray = NDArray[np.float64]
 Values = Mapping[str, float]
@@ -175,6 +178,39 @@ class AffineStructure:
     def full_displacement(self, free: FloatArray) -> FloatArray:
         """Displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""
         return np.asarray(self.expansion @ free).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class DesignedStructure(AffineStructure):
+    """Affine model of a structure file.
+
+    Attributes
+    ----------
+    design : StructureDesign
+        What was asked for.
+    """
+
+    design: StructureDesign
+
+
+def names_of(design: StructureDesign) -> dict[str, Any]:
+    """Return what a structure file alone says of its affine model: names, nominal values, ranges, damping."""
+    free = tuple(part for part in design.mass if part.free)
+    return {
+        "parameters": {part.name: part.nominal for part in design.parameter},
+        "masses": {part.name: part.mass for part in free},
+        "controls": {part.name: part.nominal for part in design.control},
+        "control_units": {part.name: part.unit for part in design.control},
+        "ranges": {part.name: part.range for part in (*design.parameter, *free, *design.control)}
+        | {part.name: (0.0, part.largest_loss) for part in design.damage},
+        "regions": tuple(part.name for part in design.damage),
+        "loads": {part.name: part.control for part in design.load},
+        "gauges": tuple(part.name for part in design.gauge),
+        "displacements": tuple(part.name for part in design.displacement),
+        "accelerations": tuple(part.name for part in design.acceleration),
+        "damping_alpha": design.damping.alpha,
+        "damping_beta": design.damping.beta,
+    }
 
 
 def _updated(nominal: dict[str, float], changed: Values | None, what: str) -> dict[str, float]:

@@ -1,17 +1,17 @@
-"""A structure as its engineer describes it: a TOML file beside a mesh file, checked.
+"""A structure as its engineer describes it: a TOML file beside a mesh or matrices, checked.
 
 Places and lengths are in the unit of length of the mesh, which the file names; all else is in SI units.
 """
 
 import hashlib
-import itertools
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from fe.full.assembly import rotate_elasticity
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
@@ -20,12 +20,12 @@ from fe.wing.parts import Modulus, Part
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
-from .rosettes import LEAST_SINE, Gauge, Name, Vector, refuse_zero, with_rosettes
+from .matrix_design import MatrixDesign
+from .rosettes import LEAST_SINE, Gauge, Name, Named, Vector, refuse_zero, with_rosettes
+from .tables import MOTIONS, ChosenMass, Commanded, Region, StructureDesign
 
 FloatArray = NDArray[np.float64]
 
-UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
-"""Units of length and their size [m]."""
 SetName = Annotated[str, Field(min_length=1, max_length=200)]
 Poisson = Annotated[float, Field(gt=-1.0, lt=0.5)]
 Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
@@ -47,76 +47,6 @@ class NamedSet(Part):
     def _box_is_a_box(self) -> "NamedSet":
         if any(high < low for low, high in zip(*self.box, strict=True)):
             raise ValueError("box must give its lower corner first, then its upper one")
-        return self
-
-
-class Ranged(Part):
-    """A quantity that can be chosen, and from where to where the reduced model is to hold."""
-
-    name: Name
-    minimum: float | None = None
-    maximum: float | None = None
-
-    usual: ClassVar[tuple[float, float]]
-    """Ends of the range where none are given, as multiples of the nominal value."""
-
-    @property
-    def middle(self) -> float:
-        """Nominal value."""
-        raise NotImplementedError
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """Least and largest value."""
-        low, high = sorted(share * self.middle for share in self.usual)
-        return (
-            low if self.minimum is None else self.minimum,
-            high if self.maximum is None else self.maximum,
-        )
-
-    @model_validator(mode="after")
-    def _range_holds_the_nominal_value(self) -> "Ranged":
-        low, high = self.range
-        if not low <= self.middle <= high:
-            raise ValueError(
-                f"its nominal value {self.middle:g} must lie between minimum {low:g} and maximum {high:g}"
-            )
-        return self
-
-
-class Parameter(Ranged):
-    """Factor on the stiffness of materials, to be calibrated; 1 unless `nominal` says otherwise."""
-
-    nominal: float = Field(default=1.0, gt=0.0, le=1e3)
-    minimum: float | None = Field(default=None, gt=0.0)
-
-    usual = (0.9, 1.1)
-
-    @property
-    def middle(self) -> float:
-        """Nominal value."""
-        return self.nominal
-
-
-class Control(Ranged):
-    """What commands loads; a load is its numbers times the value of its control."""
-
-    unit: str = Field(default="1", pattern=r"^\S+$")
-    nominal: float = 1.0
-
-    usual = (-10.0, 10.0)
-
-    @property
-    def middle(self) -> float:
-        """Nominal value."""
-        return self.nominal
-
-    @model_validator(mode="after")
-    def _is_not_always_zero(self) -> "Control":
-        if not any(self.range):
-            raise ValueError(
-                "with its nominal value 0 it would be 0 always; give the `minimum` and `maximum` it takes"
-            )
         return self
 
 
@@ -193,10 +123,6 @@ class Material(Part):
         return np.asarray(rotate_elasticity(local[None], axes)[0])
 
 
-MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
-"""Of a rigid set: along the axes, then about them."""
-
-
 class Support(Part):
     """Nodes of a set: directions that are held, or springs [N/m], shared equally among the nodes.
 
@@ -231,7 +157,7 @@ class Support(Part):
         return self
 
 
-class Load(Part):
+class Load(Commanded):
     """A load, constant or times the value of a control.
 
     Either a `force` [N] on a set (shared by area where it holds faces, else equally among its nodes) or at a
@@ -239,8 +165,6 @@ class Load(Part):
     mass: (0, 0, -9.81) is gravity along -z.
     """
 
-    name: Name
-    control: Name | None = None
     set: SetName | None = None
     point: Vector | None = None
     force: Vector | None = None
@@ -266,34 +190,21 @@ class Load(Part):
         return self
 
 
-class Damage(Part):
-    """Region whose cells may lose stiffness, up to `largest_loss`; `name` is that of its loss."""
+class Damage(Region):
+    """Region of the cells of a set."""
 
-    name: Name
     set: SetName
-    largest_loss: float = Field(default=0.8, gt=0.0, le=0.95)
 
 
-class PointMass(Ranged):
-    """Mass [kg] at a point of the structure; `free` where it is to be calibrated or chosen later."""
+class PointMass(ChosenMass):
+    """Mass at a point of the structure."""
 
     point: Vector
-    mass: float = Field(ge=0.0, lt=1e6)
-    free: bool = False
-    minimum: float | None = Field(default=None, ge=0.0)
-
-    usual = (0.5, 1.5)
-
-    @property
-    def middle(self) -> float:
-        """Nominal value."""
-        return self.mass
 
 
-class PointOutput(Part):
+class PointOutput(Named):
     """Displacement, or acceleration, of a point along a direction."""
 
-    name: Name
     point: Vector
     direction: Vector
 
@@ -303,35 +214,11 @@ class PointOutput(Part):
         return self
 
 
-class Damping(Part):
-    """Rayleigh damping V = alpha M + beta K."""
+class MeshDesign(StructureDesign):
+    """A structure from a mesh."""
 
-    alpha: float = Field(default=0.0, ge=0.0, description="1/s")
-    beta: float = Field(default=0.0, ge=0.0, description="s")
-
-
-class ReductionLimits(Part):
-    """How well the reduced model is to hold, and how many full solutions it may take."""
-
-    tolerance: float = Field(default=6e-4, ge=1e-5, le=0.1, description="of the largest output")
-    most_solutions: int = Field(default=401, ge=1, le=2000)
-
-
-class StructureDesign(Part):
-    """A structure: all that decides its model beside the mesh file. Make it with `load_structure`.
-
-    Raises
-    ------
-    InvalidDesignError
-        From `parse_structure` and `load_structure`, with one sentence that names the place.
-    """
-
-    name: str = Field(min_length=1)
     mesh: str = Field(min_length=1)
-    length_unit: Literal["m", "cm", "mm", "um", "in", "ft"]
     set: tuple[NamedSet, ...] = ()
-    parameter: tuple[Parameter, ...] = ()
-    control: tuple[Control, ...] = ()
     material: tuple[Material, ...] = Field(min_length=1)
     support: tuple[Support, ...] = Field(min_length=1)
     load: tuple[Load, ...] = ()
@@ -340,76 +227,37 @@ class StructureDesign(Part):
     gauge: tuple[Gauge, ...] = ()
     displacement: tuple[PointOutput, ...] = ()
     acceleration: tuple[PointOutput, ...] = ()
-    damping: Damping = Damping()
-    reduction: ReductionLimits = ReductionLimits()
 
-    @field_validator("name", "mesh")
-    @classmethod
-    def _one_line(cls, text: str) -> str:
-        if not text.isprintable():
-            raise ValueError("one line of text is expected, without line breaks or other control characters")
-        return text
-
-    @model_validator(mode="after")
-    def _names_fit_together(self) -> "StructureDesign":
-        # What a state, a control or an output is called by must be one thing.
-        for keys in (
-            ("parameter", "damage", "mass", "control"),
-            ("gauge", "displacement", "acceleration"),
-            ("load",),
-            ("material",),
-            ("set",),
-        ):
-            named = [
-                (f"{key}[{number}]", part.name)
-                for key in keys
-                for number, part in enumerate(getattr(self, key), start=1)
-            ]
-            for (first, one), (second, two) in itertools.combinations(named, 2):
-                if one == two:
-                    raise ValueError(
-                        f"{first} and {second} are both named {one!r}; give each a name of its own"
-                    )
-        parameters = [part.name for part in self.parameter]
-        for number, part in enumerate(self.material, start=1):
-            if part.scaled_by is not None and part.scaled_by not in parameters:
-                raise ValueError(
-                    f"material[{number}] is scaled by {part.scaled_by!r}, but no [[parameter]] has that name"
-                )
-        for name in parameters:
-            if not any(part.scaled_by == name for part in self.material):
-                raise ValueError(f"the parameter {name!r} scales no material")
-        controls = [part.name for part in self.control]
-        for number, load in enumerate(self.load, start=1):
-            if load.control is not None and load.control not in controls:
-                raise ValueError(
-                    f"load[{number}] is tied to the control {load.control!r}, but no [[control]] has that "
-                    "name"
-                )
-        for name in controls:
-            if not any(load.control == name for load in self.load):
-                raise ValueError(f"the control {name!r} commands no load")
-        return self
+    what = "mesh"
+    scaled_table = "material"
+    own_names = ("material", "set")
 
     @property
-    def unit(self) -> float:
-        """Metres in the unit of length."""
-        return UNITS[self.length_unit]
+    def files(self) -> tuple[str, ...]:
+        """The mesh."""
+        return (self.mesh,)
 
 
-def parse_structure(content: dict[str, Any], source: str = "the structure") -> StructureDesign:
-    """Check the content of a structure file.
+def is_structure(content: Mapping[str, Any]) -> bool:
+    """Return whether the content of a file is a structure's: no other model names a mesh or matrices."""
+    return "mesh" in content or "stiffness_matrix" in content
+
+
+def parse_structure(content: dict[str, Any], source: str = "the structure") -> MeshDesign | MatrixDesign:
+    """Check the content of a structure file, of matrices where it names a stiffness matrix, else of a mesh.
 
     Raises
     ------
     InvalidDesignError
         One sentence that names `source`, the place, what came and what was expected.
     """
+    if "stiffness_matrix" in content:
+        return checked(MatrixDesign, content, source, InvalidDesignError, what="a structure from matrices")
     content = with_rosettes(content, source, InvalidDesignError)
-    return checked(StructureDesign, content, source, InvalidDesignError, what="a structure")
+    return checked(MeshDesign, content, source, InvalidDesignError, what="a structure")
 
 
-def load_structure(path: Path | str) -> StructureDesign:
+def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
     """Read a structure file; its mesh file is read by `fe.structure.mesh_file.read_mesh`.
 
     Raises
@@ -423,20 +271,23 @@ def load_structure(path: Path | str) -> StructureDesign:
     return parse_structure(read_toml(file, DesignFileError, what="structure file"), source=str(file))
 
 
-def structure_hash(design: StructureDesign, mesh_file: Path) -> str:
-    """SHA-256 of the design and of the bytes of its mesh file, 64 hexadecimal digits.
+def structure_hash(design: StructureDesign, folder: Path) -> str:
+    """SHA-256 of the design and of the bytes of its files in a folder, 64 hexadecimal digits.
 
     Raises
     ------
     MeshError
-        If the mesh file cannot be read.
+        If one cannot be read.
     """
     content = design.model_dump(mode="json")
-    del content["mesh"]  # its bytes count, not its name
+    content.pop("mesh", None)  # its bytes count, not its name
     del content["reduction"]  # the structure is the same
     digest = hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
-    try:
-        digest.update(mesh_file.read_bytes())
-    except OSError as error:
-        raise MeshError(f"The mesh file {mesh_file} cannot be read: {error.strerror}.") from None
+    for name in design.files:
+        try:
+            digest.update((folder / name).read_bytes())
+        except OSError as error:
+            raise MeshError(
+                f"The {design.what} file {folder / name} cannot be read: {error.strerror}."
+            ) from None
     return digest.hexdigest()

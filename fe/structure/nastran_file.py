@@ -71,7 +71,7 @@ def read_nastran(path: Path) -> FileMesh:
     """
     deck = Deck(path, words_of("nastran"))
     points = _Points()
-    for card in _cards((path,)):
+    for card in cards((path,)):
         word = card.word
         if word == "GRID":
             if points.grids.setdefault(card.whole(0), card).fields != card.fields:
@@ -142,7 +142,8 @@ class _Points:
         return self._found[number]
 
 
-def _cards(files: tuple[Path, ...]) -> Iterator[_Card]:
+def cards(files: tuple[Path, ...]) -> Iterator[_Card]:
+    """Yield the words of the bulk data of the last of files that include one another."""
     lines = read_text(files[-1], MeshError, what="mesh file", otherwise="latin-1").splitlines()
     start = next((number for number, line in enumerate(lines, start=1) if _BEGIN.match(line)), 0)
     card: _Card | None = None
@@ -153,7 +154,7 @@ def _cards(files: tuple[Path, ...]) -> Iterator[_Card]:
         if not text:
             continue
         if text.strip().upper().startswith("INCLUDE"):
-            yield from _cards(included(where, files, text.strip()[7:].strip(" '\"")))
+            yield from cards(included(where, files, text.strip()[7:].strip(" '\"")))
             continue
         head, *fields, end = _fields(where, text)
         if not head or head[0] in "+*":

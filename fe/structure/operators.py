@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.runtime.errors import MeshError
+from fe.runtime.errors import InvalidDesignError, MeshError
 
-from .affine import AffineStructure, LoadTerm, StiffnessTerm
-from .design import StructureDesign, load_structure, structure_hash
+from .affine import DesignedStructure, LoadTerm, StiffnessTerm, names_of
+from .design import MeshDesign, load_structure, structure_hash
 from .elements import BATCH, Rule, mass_blocks, stiffness_blocks
 from .gauges import GaugePlace, gauge_rows
 from .loads import point_shares, surface_load
 from .location import Locator
+from .matrices import assemble_matrices
+from .matrix_design import MatrixDesign
 from .memory import check_memory
 from .mesh import StructureMesh
 from .mesh_file import read_mesh
@@ -28,12 +30,12 @@ _TRIPLETS = 4_000_000  # entries of element arrays that are summed at once, of 1
 
 
 @dataclass(frozen=True)
-class Structure(AffineStructure):
+class Structure(DesignedStructure):
     """Finite element model of a structure.
 
     Attributes
     ----------
-    design : StructureDesign
+    design : MeshDesign
         What was asked for.
     mesh : StructureMesh
         Its mesh.
@@ -51,7 +53,7 @@ class Structure(AffineStructure):
         Share of each node in the mass of the structure with its fixed point masses.
     """
 
-    design: StructureDesign
+    design: MeshDesign
     mesh: StructureMesh
     material_of: IntArray
     region_of: IntArray
@@ -61,7 +63,7 @@ class Structure(AffineStructure):
     nodal_mass: FloatArray
 
 
-def structure_mesh(design: StructureDesign, file: Path) -> StructureMesh:
+def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     """Read the mesh of the design in `file`, which may name it relative to itself, with the design's sets.
 
     Raises
@@ -111,7 +113,7 @@ def cells_by_set(mesh: StructureMesh, parts: tuple[tuple[str, str, str], ...], w
     return owner
 
 
-def _materials(design: StructureDesign, mesh: StructureMesh) -> IntArray:
+def _materials(design: MeshDesign, mesh: StructureMesh) -> IntArray:
     parts = tuple((f"material[{n}]", part.name, part.set) for n, part in enumerate(design.material, 1))
     owner = cells_by_set(mesh, parts, "material")
     bare = np.flatnonzero(owner < 0)
@@ -184,14 +186,27 @@ def load_and_assemble(
     """
     file = Path(file)
     design = load_structure(file)
+    if isinstance(design, MatrixDesign):
+        raise InvalidDesignError(
+            f"{file} is a structure from matrices: without a mesh there is no field to draw, and nothing "
+            "that CalculiX could solve."
+        )
     mesh = structure_mesh(design, file)
     check_memory(mesh, memory_limit)
-    digest = structure_hash(design, file.parent / design.mesh)
+    digest = structure_hash(design, file.parent)
     return assemble(design, mesh, digest, mass_as_stiffness=mass_as_stiffness)
 
 
+def load_any(file: Path | str, memory_limit: float | None = None) -> DesignedStructure:
+    """Read a structure file with its mesh or matrices; parameters and errors as of `load_and_assemble`."""
+    design, folder = load_structure(file), Path(file).parent
+    if isinstance(design, MatrixDesign):
+        return assemble_matrices(design, folder, structure_hash(design, folder))
+    return load_and_assemble(file, memory_limit)
+
+
 def assemble(
-    design: StructureDesign, mesh: StructureMesh, design_hash: str, *, mass_as_stiffness: bool = False
+    design: MeshDesign, mesh: StructureMesh, design_hash: str, *, mass_as_stiffness: bool = False
 ) -> Structure:
     """Assemble the affine operators of a design on its mesh, see `load_and_assemble`."""
     material_of = _materials(design, mesh)
@@ -218,28 +233,16 @@ def assemble(
 
     gauges, places = gauge_rows(mesh, locator, design.gauge)
     return Structure(
-        parameters={part.name: part.nominal for part in design.parameter},
-        masses={part.name: part.mass for part in free},
-        controls={part.name: part.nominal for part in design.control},
-        control_units={part.name: part.unit for part in design.control},
-        ranges={part.name: part.range for part in (*design.parameter, *free, *design.control)}
-        | {part.name: (0.0, part.largest_loss) for part in design.damage},
-        regions=tuple(part.name for part in design.damage),
+        **names_of(design),
         stiffness_terms=_stiffness_terms(design, mesh, material_of, region_of, held),
         mass_terms=tuple(
             (restriction @ sparse.kron(term, sparse.eye_array(3)) @ expansion).tocsr() for term in mass_terms
         ),
-        loads={part.name: part.control for part in design.load},
         load_terms=tuple(_load_terms(design, mesh, locator, restriction, nodal_mass, weights)),
-        gauges=tuple(part.name for part in design.gauge),
-        displacements=tuple(part.name for part in design.displacement),
-        accelerations=tuple(part.name for part in design.acceleration),
         gauge_output=(gauges @ expansion).tocsr(),
         displacement_output=_point_rows(design, mesh, locator, "displacement") @ expansion,
         acceleration_output=_point_rows(design, mesh, locator, "acceleration") @ expansion,
         expansion=expansion,
-        damping_alpha=design.damping.alpha,
-        damping_beta=design.damping.beta,
         design_hash=design_hash,
         design=design,
         mesh=mesh,
@@ -253,7 +256,7 @@ def assemble(
 
 
 def _load_terms(
-    design: StructureDesign,
+    design: MeshDesign,
     mesh: StructureMesh,
     locator: Locator,
     restriction: sparse.csr_array,
@@ -280,7 +283,7 @@ def _outer(weights: FloatArray) -> sparse.csr_array:
 
 
 def _structure_mass(
-    design: StructureDesign, mesh: StructureMesh, material_of: IntArray, rule: Rule
+    design: MeshDesign, mesh: StructureMesh, material_of: IntArray, rule: Rule
 ) -> sparse.csr_array:
     """Mass (nodes, nodes) [kg] of one component, without point masses."""
     total = sparse.csr_array((len(mesh.points), len(mesh.points)))
@@ -295,7 +298,7 @@ def _structure_mass(
 
 
 def _stiffness_terms(
-    design: StructureDesign,
+    design: MeshDesign,
     mesh: StructureMesh,
     material_of: IntArray,
     region_of: IntArray,
@@ -326,7 +329,7 @@ def _stiffness_terms(
     return tuple(StiffnessTerm(found[pair].tocsr(), *pair) for pair in pairs)
 
 
-def _point_rows(design: StructureDesign, mesh: StructureMesh, locator: Locator, key: str) -> sparse.csr_array:
+def _point_rows(design: MeshDesign, mesh: StructureMesh, locator: Locator, key: str) -> sparse.csr_array:
     """Rows (m, full) of the displacements of points along directions."""
     rows = [sparse.csr_array((0, mesh.unknowns))]
     for number, part in enumerate(getattr(design, key), start=1):

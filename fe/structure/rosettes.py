@@ -20,13 +20,18 @@ def refuse_zero(vector: Vector | None, key: str) -> None:
         raise ValueError(f"{key} must point somewhere, but is (0, 0, 0)")
 
 
-class Gauge(Part):
+class Named(Part):
+    """Something that is chosen or read by its name."""
+
+    name: Name
+
+
+class Gauge(Named):
     """Strain gauge on the surface: mean strain along `direction`, positive in tension.
 
     The mean is over `length` along the direction and `width` across it.
     """
 
-    name: Name
     point: Vector
     direction: Vector
     length: float = Field(default=0.0, ge=0.0)

@@ -9,8 +9,9 @@ from scipy import sparse
 
 from fe.runtime.errors import MeshError
 
-from .design import MOTIONS, StructureDesign, Support
+from .design import MeshDesign, Support
 from .mesh import StructureMesh
+from .tables import MOTIONS
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -96,7 +97,7 @@ def _unknowns(nodes: IntArray) -> IntArray:
     return np.asarray(3 * nodes[:, None] + np.arange(3)).ravel()
 
 
-def supported(design: StructureDesign, mesh: StructureMesh) -> SupportedUnknowns:
+def supported(design: MeshDesign, mesh: StructureMesh) -> SupportedUnknowns:
     """Collect the supports of a design.
 
     Raises

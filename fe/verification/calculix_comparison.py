@@ -1,7 +1,9 @@
-"""The wing against CalculiX on the identical mesh: statics, modes and a ring-down."""
+"""Structures and the wing against CalculiX on the identical mesh: statics, modes and a ring-down."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +14,142 @@ from fe.full.operators import AffineOperators
 from fe.full.statics import Factorisation, static_outputs
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState, Losses
+from fe.structure.operators import Structure
+from fe.structure.solution import natural_frequencies, static_responses
 
-from .calculix_input import INTEGRATION_POINTS, CalculixModel
+from .calculix_deck import CalculixDeck
 from .calculix_job import read_frequencies, read_tables, run_calculix
+from .calculix_models import gauge_cells, structure_deck, structure_loads, wing_deck
 
 FloatArray = NDArray[np.float64]
 
 TEST_FORCE = 10.0
 """Upward force of the static test and before the ring-down [N]."""
+_LINE = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
+INTEGRATION_POINTS = np.array([(x, y, z) for z in _LINE for y in _LINE for x in _LINE])
+"""Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
 # Rows and columns in which CalculiX prints a strain tensor.
 _PRINTED = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+
+
+class _Printed(NamedTuple):
+    """What CalculiX printed of a static step: nodes (nodes, 3) and probes (m,), strains at cells (n, 6)."""
+
+    field: FloatArray
+    probes: FloatArray
+    strain: FloatArray
+
+
+def _statics(
+    deck: CalculixDeck, loads: Iterable[Iterable[str]], folder: Path, prints: Iterable[str] = ()
+) -> list[_Printed]:
+    steps = [[*load] for load in loads]
+    tables = read_tables(run_calculix(deck.static_steps(steps, [*prints]), folder, "static"))
+    nodes, probes, strains = (
+        [table.rows for table in tables if table.set_name == name] for name in ("NALL", "NPROBES", "EGAUGES")
+    )
+    if len(nodes) != len(steps):
+        raise CalculixError(f"CalculiX printed {len(nodes)} static solutions instead of {len(steps)}.")
+    nothing = [np.zeros((0, 8))] * len(steps)
+    return [
+        _Printed(field[:, 1:], probe[:, 1:].ravel(), strain[:, 2:])
+        for field, probe, strain in zip(nodes, probes or nothing, strains or nothing, strict=True)
+    ]
+
+
+def _frequencies(deck: CalculixDeck, count: int, folder: Path) -> FloatArray:
+    found = read_frequencies(run_calculix(deck.frequency_step(count), folder, "modes"))
+    if len(found) < count:
+        raise CalculixError(f"CalculiX printed {len(found)} frequencies instead of {count}.")
+    return found[:count]
+
+
+def _relative(theirs: FloatArray, ours: FloatArray) -> float:
+    return float(np.abs(theirs - ours).max() / np.abs(ours).max())
+
+
+@dataclass(frozen=True)
+class ModalAgreement:
+    """Frequencies (m,) [Hz] of both codes."""
+
+    ours: FloatArray
+    calculix: FloatArray
+
+    @property
+    def relative(self) -> float:
+        """Largest relative difference."""
+        return float(np.abs(self.calculix / self.ours - 1.0).max())
+
+
+@dataclass(frozen=True)
+class LoadAgreement:
+    """Differences under one load, relative to the largest of their kind under that load.
+
+    Attributes
+    ----------
+    load : str
+        Its name.
+    field : float
+        Nodal displacements.
+    strain, output : float or None
+        Strains of the gauges and displacement outputs; None where there are none.
+    """
+
+    load: str
+    field: float
+    strain: float | None
+    output: float | None
+
+
+@dataclass(frozen=True)
+class StructureAgreement:
+    """A structure and CalculiX.
+
+    Attributes
+    ----------
+    loads : tuple of LoadAgreement
+        One for each load.
+    modes : ModalAgreement
+        Lowest frequencies.
+    """
+
+    loads: tuple[LoadAgreement, ...]
+    modes: ModalAgreement
+
+
+def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> StructureAgreement:
+    """Solve every load and the lowest modes by both codes, undamaged and with nominal values.
+
+    Parameters
+    ----------
+    structure : Structure
+        The model; assembled with `mass_as_stiffness`, for frequencies that can be compared.
+    folder : Path
+        Where CalculiX works.
+    modes : int
+        Number of modes.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX is not there, fails, or has no such element.
+    """
+    deck = structure_deck(structure)
+    loads = []
+    printed = _statics(deck, structure_loads(structure, deck), folder) if structure.loads else []
+    for (name, ours), theirs in zip(static_responses(structure).items(), printed, strict=True):
+        strain, output = np.split(theirs.probes[: len(ours.strain) + len(ours.output)], [len(ours.strain)])
+        loads.append(
+            LoadAgreement(
+                name,
+                _relative(theirs.field, structure.full_displacement(ours.displacement)),
+                _relative(strain, ours.strain) if len(ours.strain) else None,
+                _relative(output, ours.output) if len(ours.output) else None,
+            )
+        )
+    found = ModalAgreement(natural_frequencies(structure, modes)[0], _frequencies(deck, modes, folder))
+    return StructureAgreement(tuple(loads), found)
 
 
 @dataclass(frozen=True)
@@ -79,57 +206,40 @@ def static_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    model = CalculixModel(operators, young_modulus_factor, stiffness_loss)
+    deck = wing_deck(
+        operators, DigitalState(young_modulus_factor=young_modulus_factor, stiffness_loss=stiffness_loss)
+    )
     turn = operators.wing_mesh.design.lift.load_factor
     loads = {"tip force": operators.load(0.0, TEST_FORCE), "lift": operators.load(turn)}
-    tables = read_tables(run_calculix(model.static_steps(tuple(loads.values())), folder, "static"))
-    nodes, probes, strains = (
-        [table.rows for table in tables if table.set_name == name] for name in ("NALL", "NPROBES", "EGAUGES")
+    printed = _statics(
+        deck, map(deck.force_lines, loads.values()), folder, ("*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E")
     )
-    if not len(nodes) == len(probes) == len(strains) == len(loads):
-        raise CalculixError(f"CalculiX printed {len(nodes)} static solutions instead of {len(loads)}.")
     factors = Factorisation(operators.stiffness(young_modulus_factor, stiffness_loss))
     found = []
-    for number, (name, load) in enumerate(loads.items()):
+    for (name, load), theirs in zip(loads.items(), printed, strict=True):
         ours = static_outputs(operators, factors.solve(load))
-        field = operators.full_displacement(ours.displacement)
-        theirs = probes[number][:, 1:].ravel()
-        tensor = _strain_tensors(operators, model, ours.displacement)
-        printed = strains[number][:, 2:].reshape(*tensor.shape[:2], 6)
+        tensor = _strain_tensors(operators, ours.displacement)
         found.append(
             StaticAgreement(
                 load=name,
-                load_point=abs(theirs[0] / ours.load_point_displacement - 1.0),
-                tip=abs(theirs[1] / ours.tip_displacement - 1.0),
-                field=float(np.abs(nodes[number][:, 1:] - field).max() / np.abs(field).max()),
-                gauge=float(np.abs(theirs[2 : 2 + len(ours.strain)] / ours.strain - 1.0).max()),
-                tensor=float(np.abs(printed - tensor).max() / np.abs(tensor).max()),
+                load_point=abs(theirs.probes[0] / ours.load_point_displacement - 1.0),
+                tip=abs(theirs.probes[1] / ours.tip_displacement - 1.0),
+                field=_relative(theirs.field, operators.full_displacement(ours.displacement)),
+                gauge=float(np.abs(theirs.probes[2 : 2 + len(ours.strain)] / ours.strain - 1.0).max()),
+                tensor=_relative(theirs.strain.reshape(tensor.shape), tensor),
             )
         )
     return found[0], found[1]
 
 
-def _strain_tensors(operators: AffineOperators, model: CalculixModel, free: FloatArray) -> FloatArray:
+def _strain_tensors(operators: AffineOperators, free: FloatArray) -> FloatArray:
     """Strain tensor (cells, 27, 6) in CalculiX's order at the integration points of the gauges' cells."""
-    body, cells = operators.discretisation, model.gauge_cells
+    body, cells = operators.discretisation, gauge_cells(operators)
     gradients, _ = global_gradients(body.corners[cells], INTEGRATION_POINTS)
     displacement = operators.full_displacement(free).ravel()[body.cell_dofs[cells]]
     voigt = np.einsum("nqij,nj->nqi", strain_matrix(gradients), displacement)
     voigt[..., 3:] *= 0.5  # engineering to tensor shear
     return np.asarray(voigt[..., [_VOIGT.index(place) for place in _PRINTED]])
-
-
-@dataclass(frozen=True)
-class ModalAgreement:
-    """Frequencies (m,) [Hz] of both codes."""
-
-    ours: FloatArray
-    calculix: FloatArray
-
-    @property
-    def relative(self) -> float:
-        """Largest relative difference."""
-        return float(np.abs(self.calculix / self.ours - 1.0).max())
 
 
 def modal_agreement(
@@ -145,8 +255,6 @@ def modal_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    model = _model(operators, state)
-    theirs = read_frequencies(run_calculix(model.frequency_step(count), folder, "modes"))
     ours = eigenmodes(
         operators,
         state.young_modulus_factor,
@@ -155,21 +263,7 @@ def modal_agreement(
         state.pitot_mass,
         count,
     ).frequency
-    if len(theirs) < count:
-        raise CalculixError(f"CalculiX printed {len(theirs)} frequencies instead of {count}.")
-    return ModalAgreement(ours, theirs[:count])
-
-
-def _model(operators: AffineOperators, state: DigitalState) -> CalculixModel:
-    return CalculixModel(
-        operators,
-        state.young_modulus_factor,
-        state.stiffness_loss,
-        state.servo_mass,
-        state.pitot_mass,
-        state.damping_alpha,
-        state.damping_beta,
-    )
+    return ModalAgreement(ours, _frequencies(wing_deck(operators, state), count, folder))
 
 
 @dataclass(frozen=True)
@@ -258,7 +352,7 @@ def ring_down_agreement(
     for step in range(steps):
         current = integrator.advance(current, increment, (0.0, 0.0))
         ours[step] = integrator.outputs(current)[-1]
-    text = _model(operators, state).ring_down_steps(operators.load(0.0, TEST_FORCE), increment, steps)
+    text = wing_deck(operators, state).ring_down_steps(operators.load(0.0, TEST_FORCE), increment, steps)
     tables = read_tables(run_calculix(text, folder, "ring_down"))
     theirs = np.array([table.rows[0, 2] for table in tables if table.set_name == "NPROBES"])
     if len(theirs) != steps:

@@ -2,7 +2,7 @@
 
 import json
 
-from fe.structure.design import StructureDesign
+from fe.structure.tables import StructureDesign
 from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.errors import BindingError
 from reporting.toml_file import parse_toml

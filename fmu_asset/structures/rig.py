@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 
-from fe.structure.design import Load, PointOutput, StructureDesign
+from fe.structure.design import Load, MeshDesign, PointOutput
+from fe.structure.matrix_design import MatrixDesign, MatrixLoad, NodeOutput
 from fmu_asset.errors import FmuBuildError
 
 
-def rig_text(design: StructureDesign, fmu: str) -> str:
+def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
     """Return the model file of a structure's FMU: forces, outputs, ports and parameters as its file has them.
 
     A control in N is a force, and one of the name load_factor the load factor of flights, which stand for any
@@ -16,7 +17,7 @@ def rig_text(design: StructureDesign, fmu: str) -> str:
 
     Parameters
     ----------
-    design : StructureDesign
+    design : MeshDesign or MatrixDesign
         The structure.
     fmu : str
         Path of its FMU, seen from the folder of the file.
@@ -74,9 +75,10 @@ def rig_text(design: StructureDesign, fmu: str) -> str:
     return "\n".join(tables)
 
 
-def _meet(load: Load, output: PointOutput) -> bool:
-    """Return whether a load is 1 N at the point of an output and along it."""
-    if load.point is None or load.force is None or load.point != output.point:
+def _meet(load: Load | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
+    """Return whether a load is 1 N at the place of an output and along it."""
+    place, read = (getattr(part, "point", getattr(part, "node", None)) for part in (load, output))
+    if place is None or load.force is None or place != read or output.direction is None:
         return False
     direction = np.asarray(output.direction) / np.linalg.norm(output.direction)
     return bool(np.abs(np.asarray(load.force) - direction).max() < 1e-9)

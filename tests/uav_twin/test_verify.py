@@ -75,18 +75,6 @@ def test_every_check_of_the_elements_and_of_a_coarse_wing_is_kept() -> None:
     assert [check.name for check in checks if not check.passed] == []
 
 
-def test_the_plate_is_checked_beside_the_box() -> None:
-    operators = assemble(load_design().changed(mesh={"refinement": 0.25}))
-    checks = {(check.group, check.name): check for check in verify.plate_checks(operators)}
-    closed = [check for (group, _), check in checks.items() if group == "sandwich plate"]
-    assert len(closed) == 3
-    assert all(check.passed and check.limit is not None for check in closed)
-    names = [name for group, name in checks if group == "plate against box"]
-    assert {"tip stiffness", "first bending", "second bending", "gauges, rms"} <= set(names)
-    assert checks["plate against box", "unknowns, over those of the box"].value < 0.6
-    assert all(check.limit is not None for (_, name), check in checks.items() if "rms" in name)
-
-
 def test_convergence_names_every_gauge() -> None:
     # Three coarse meshes: the names and the kind of figures, not their size.
     design = load_design().changed(mesh={"refinement": 0.25})

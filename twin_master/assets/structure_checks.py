@@ -12,7 +12,7 @@ from twin_master.scenario.modes import ROLE
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
-    from fe.structure.design import StructureDesign
+    from fe.structure.tables import StructureDesign
 
 
 def frequencies_observed(scenario: Scenario) -> int:
@@ -93,7 +93,7 @@ def check_parameter(scenario: Scenario, design: "StructureDesign", believed: Pat
     known = [part.name for part in design.parameter]
     known += [part.name for part in design.mass if part.free]
     ranges = {part.name: part.range for part in (*design.parameter, *design.mass)}
-    found = "" if believed is None else structure_hash(design, believed.parent / design.mesh)
+    found = "" if believed is None else structure_hash(design, believed.parent)
     where = f"the structure {design.name}"
     check_calibration(calibration, known, where, ranges=ranges, design_hash=found)
     if calibration.parameter not in known:

@@ -41,7 +41,7 @@ from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
-    from fe.structure.design import StructureDesign
+    from fe.structure.tables import StructureDesign
     from fmu_asset.door.binding import Binding
     from fmu_asset.door.session import FmiAsset
 
@@ -53,30 +53,33 @@ FIELD_NAME = "structure.vtu"
 
 
 class StructureFiles(FileSection):
-    """A table that names a structure file, and with it the mesh beside that."""
+    """A table that names a structure file, and with it the mesh or the matrices beside that."""
 
     def all_files(self) -> dict[str, Path]:
-        """Return all files by the places of their copies, the mesh among them.
+        """Return all files by the places of their copies, those that the structure names among them.
 
         Raises
         ------
         InvalidDesignError
             The structure file cannot be read or is wrong.
         MissionInputError
-            Its mesh does not lie beside it.
+            One of its files does not lie beside it.
         """
         from fe.structure.design import load_structure
 
         found = super().all_files()
         copy = self.copies()["structure"]
         file = found[copy]
-        mesh = PurePosixPath(load_structure(file).mesh)
-        if mesh.is_absolute() or ".." in mesh.parts:
-            raise MissionInputError(
-                f"the mesh {mesh} of {file} does not lie beside it, and a run keeps copies of both: move the "
-                "mesh into the folder of the structure file, and name it without its folder."
-            )
-        return found | {f"{PurePosixPath(copy).parent}/{mesh}": file.parent / mesh}
+        design = load_structure(file)
+        for inner in map(PurePosixPath, design.files):
+            if inner.is_absolute() or ".." in inner.parts:
+                raise MissionInputError(
+                    f"the {design.what} {inner} of {file} does not lie beside it, and a run keeps copies of "
+                    f"both: move the {design.what} into the folder of the structure file, and name it without"
+                    " its folder."
+                )
+            found[f"{PurePosixPath(copy).parent}/{inner}"] = file.parent / inner
+        return found
 
 
 class StructureSection(StructureFiles, FmuSection):
@@ -383,17 +386,21 @@ class StructureSource:
 
 
 def _write_field(path: Path, file: Path, values: Mapping[str, float]) -> bool:
-    """Solve the full structure under values by name and write its field beside `path`.
+    """Solve the full structure under values by name and write its field beside `path`, if it has a mesh.
 
     Raises
     ------
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
+    from fe.structure.design import load_structure
     from fe.structure.field import write_structure_vtu
+    from fe.structure.matrix_design import MatrixDesign
     from fe.structure.operators import load_and_assemble
     from reporting.files import write_error
 
+    if isinstance(load_structure(file), MatrixDesign):
+        return False
     target = path.with_name(FIELD_NAME)
     try:
         write_structure_vtu(target, load_and_assemble(file), values)

@@ -10,8 +10,8 @@ from fe.full.operators import AffineOperators, assemble
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
 from fe.verification.calculix_comparison import modal_agreement, ring_down_agreement, static_agreement
-from fe.verification.calculix_input import CalculixModel
 from fe.verification.calculix_job import calculix_program, read_frequencies, read_tables, run_calculix
+from fe.verification.calculix_models import wing_deck
 from fe.wing.design import WingDesign
 
 needs_calculix = pytest.mark.skipif(
@@ -84,7 +84,7 @@ def test_calculix_that_is_not_there_is_one_sentence(monkeypatch: pytest.MonkeyPa
 
 
 def test_every_cell_has_its_nodes_material_and_axes(coarse_operators: AffineOperators) -> None:
-    lines = list(CalculixModel(coarse_operators, stiffness_loss=DAMAGED).definition())
+    lines = list(wing_deck(coarse_operators, DigitalState(stiffness_loss=DAMAGED)).definition())
     cells = len(coarse_operators.wing_mesh.cells)
     assert sum(line.startswith("*SOLID SECTION, ELSET=E") for line in lines) == cells
     assert sum(line.startswith("*ORIENTATION") for line in lines) == cells

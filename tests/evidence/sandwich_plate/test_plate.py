@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fe.verification.plate import (
+from evidence.sandwich_plate.plate import (
     FIELDS,
     A,
     B,
@@ -18,8 +18,8 @@ from fe.verification.plate import (
     surface_strain,
     tensor_mesh,
 )
-from fe.verification.plate_frame import strip_stiffness
-from fe.verification.plate_known_answers import (
+from evidence.sandwich_plate.plate_frame import strip_stiffness
+from evidence.sandwich_plate.plate_known_answers import (
     FlatSandwich,
     cantilever_strip,
     square_plate_deflection,

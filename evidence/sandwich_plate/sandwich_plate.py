@@ -2,7 +2,7 @@
 
 Skins are the faces, at the section's height; webs, ribs and the leading-edge wall are solid cores where they
 stand. Between them there is no core: the deflection runs straight from web to web along the chord, and the
-skins bend on their own only as the beams of a frame (`fe.verification.plate_frame`). Every number is the
+skins bend on their own only as the beams of a frame (`plate_frame`). Every number is the
 design's own. The operators are affine as those of the box, K(e, z) = e K_skin + (1 - z1) K_1 + ...
 + K_0, with the same three root unknowns last.
 """

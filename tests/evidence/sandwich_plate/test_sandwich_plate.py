@@ -3,19 +3,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fe.full.operators import assemble
-from fe.full.statics import Factorisation
-from fe.full.turn_load import STANDARD_GRAVITY
-from fe.verification.known_answers import wing_balance
-from fe.verification.plate import FIELDS, A, B, U, V, W
-from fe.verification.plate_comparison import (
+from evidence.sandwich_plate.__main__ import main, plate_checks
+from evidence.sandwich_plate.plate import FIELDS, A, B, U, V, W
+from evidence.sandwich_plate.plate_comparison import (
     compare_with_plate,
     gauges_at_edges,
     plate_bending_shapes,
     wing_results,
 )
-from fe.verification.plate_layout import PlateLayout
-from fe.verification.sandwich_plate import assemble_plate
+from evidence.sandwich_plate.plate_layout import PlateLayout
+from evidence.sandwich_plate.sandwich_plate import assemble_plate
+from fe.full.operators import assemble
+from fe.full.statics import Factorisation
+from fe.full.turn_load import STANDARD_GRAVITY
+from fe.verification.known_answers import wing_balance
+from tests import command_line
 
 
 @pytest.fixture(scope="module")
@@ -331,3 +333,21 @@ def test_the_plate_follows_the_design(coarse_design, plate):
     assert stiffness(assemble_plate(thicker)) / stiffness(plate) == pytest.approx(
         stiffness(assemble(thicker)) / stiffness(assemble(coarse_design)), rel=0.02
     )
+
+
+def test_the_plate_is_checked_beside_the_box(coarse_operators):
+    checks = {(check.group, check.name): check for check in plate_checks(coarse_operators)}
+    closed = [check for (group, _), check in checks.items() if group == "sandwich plate"]
+    assert len(closed) == 3
+    assert all(check.passed and check.limit is not None for check in closed)
+    names = [name for group, name in checks if group == "plate against box"]
+    assert {"tip stiffness", "first bending", "second bending", "gauges, rms"} <= set(names)
+    assert checks["plate against box", "unknowns, over those of the box"].value < 0.6
+    assert all(check.limit is not None for (_, name), check in checks.items() if "rms" in name)
+
+
+def test_the_command_prints_every_check_and_its_verdict(monkeypatch, capsys):
+    assert command_line.call(monkeypatch, "--quick", main=main) == 0
+    text = capsys.readouterr().out
+    assert text.count("kept") == 3  # the closed forms; the differences have limits on the mesh of the design
+    assert "plate of the box's section" in text

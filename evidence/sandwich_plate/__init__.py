@@ -1,0 +1,1 @@
+"""A second idealisation of the wing, a shear-flexible sandwich plate, beside the box."""

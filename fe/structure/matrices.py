@@ -1,0 +1,363 @@
+"""From matrices and a structure file to affine operators, and what is said of matrices that are no structure.
+
+Unknowns stay in the unit of length of the matrices, so that these are taken as they are; rows that read a
+displacement, and masses and accelerations, are turned into SI units.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from fe.full.cholesky import Cholesky
+from fe.full.modes import lowest_eigenpairs
+from fe.full.statics import Factorisation
+from fe.runtime.errors import MeshError, SolutionError
+
+from .affine import DesignedStructure, LoadTerm, StiffnessTerm, names_of
+from .design import unit_vector
+from .matrix_design import Extension, MatrixDesign, MatrixMass, NodeOutput
+from .matrix_files import Place, read_matrix, read_unknowns, read_vector
+from .rosettes import Vector
+from .tables import MOTIONS
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Shares = Mapping[int, tuple[float, ...]]
+
+READ: Shares = {
+    1: (1.0,), 2: (0.5,) * 2, 3: (1 / 6, 2 / 3, 1 / 6), 4: (0.25,) * 4, 8: (0.25,) * 4 + (0.0,) * 4,
+}  # fmt: skip
+"""Shares of the rows that carry one name in its displacement: CalculiX expands a node of a shell into two or
+three through the thickness and one of a beam into four or eight (found by what version 2.20 prints)."""
+PUSHED: Shares = {**READ, 3: (-0.5, 2.0, -0.5)}
+"""Shares of these rows in a force on the node, as CalculiX shares it."""
+
+_ROUNDING = 1e-12
+"""Entries of a difference of matrices below this share of the diagonal are rounding."""
+_UNSYMMETRIC = 1e-9
+_INDEFINITE = 1e-3
+"""How far below zero, as a share of the whole, a part may come: matrices in files are rounded."""
+_FREE = 1e-10
+"""A motion with less stiffness than this share of its diagonal is free."""
+_MOST_FREE = 7  # motions that are looked at
+
+
+def _named(place: Place) -> str:
+    return f"node {place[0]}, component {place[1]}"
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """Matrices and vectors by name, and node and component of each of their n rows.
+
+    Attributes
+    ----------
+    folder : Path
+        Where the files are.
+    places : list of (int, int)
+        Node and component of each row.
+    """
+
+    folder: Path
+    places: list[Place]
+
+    @cached_property
+    def rows(self) -> dict[Place, list[int]]:
+        """Rows of each node's component."""
+        found: dict[Place, list[int]] = {}
+        for row, place in enumerate(self.places):
+            found.setdefault(place, []).append(row)
+        return found
+
+    def rows_of(self, place: Place, where: str) -> list[int]:
+        """Rows of a node's component; raises `MeshError` where the matrices have none."""
+        if place not in self.rows:
+            node, component = place
+            own = ", ".join(str(other) for number, other in sorted(self.rows) if number == node)
+            raise MeshError(
+                f"{where}: node {node} has no component {component} in the matrices, which know "
+                f"{f'its components {own}' if own else 'no such node'}; what is held or tied when they are "
+                "written is not among them: name another node."
+            )
+        return self.rows[place]
+
+    def at(self, place: Place, where: str, shares: Shares = READ) -> FloatArray:
+        """Vector (n,) of 1 at a node's component, shared among the rows of that name.
+
+        Raises
+        ------
+        MeshError
+            If the matrices have no such row, or so many that it is not known how they share.
+        """
+        own, found = self.rows_of(place, where), np.zeros(len(self.places))
+        if len(own) not in shares:
+            raise MeshError(
+                f"{where}: node {place[0]} has {len(own)} rows of component {place[1]}, and how these share "
+                "what acts on the node is not known; name another node, or give a vector."
+            )
+        found[own] = shares[len(own)]
+        return found
+
+    def along(self, node: int, direction: Vector, where: str, shares: Shares = READ) -> FloatArray:
+        """Vector (n,) of a direction (3,) at a node."""
+        parts = [x * self.at((node, axis), where, shares) for axis, x in enumerate(direction, start=1) if x]
+        return np.asarray(np.sum(parts, axis=0))
+
+    def everywhere(self, field: Vector, where: str) -> FloatArray:
+        """Vector (n,) of a shift of all nodes; raises `MeshError` where turns may look like shifts."""
+        if len(self.rows) < len(self.places):
+            raise MeshError(
+                f"{where}: several rows of the matrices carry one name, as those of expanded shells and "
+                "beams do, and rows that turn cannot be told from rows that shift; give the load as a vector."
+            )
+        return np.array([[*field, 0.0, 0.0, 0.0][component - 1] for _, component in self.places])
+
+    def vector(self, name: str, where: str, shares: Shares = READ) -> FloatArray:
+        """Vector (n,) of a file."""
+        return read_vector(self.folder, name, lambda place: self.at(place, where, shares), len(self.places))
+
+    def matrix(self, name: str, where: str, *, partial: bool = False) -> sparse.csr_array:
+        """Symmetric matrix (n, n) of a file, its rows in the order of the places.
+
+        A `partial` one may end before them, as a table does whose last rows are zero.
+
+        Raises
+        ------
+        MeshError
+            If it cannot be read, has other rows, is not finite or not symmetric.
+        """
+        matrix, own = read_matrix(self.folder, name)
+        size, place = len(self.places), f"{where}: {self.folder / name}"
+        if own is not None:
+            chosen = np.array([self.rows_of(each, place)[0] for each in own])
+            entries = matrix.tocoo()
+            row, column = chosen[entries.row], chosen[entries.col]
+            matrix = sparse.coo_array((entries.data, (row, column)), (size, size)).tocsr()
+        if partial and matrix.shape[0] < size:
+            matrix.resize((size, size))
+        if matrix.shape[0] != size:
+            raise MeshError(
+                f"{place} has {matrix.shape[0]} rows, but there are {size} unknowns; matrices and unknowns "
+                "must be of the same run."
+            )
+        largest = abs(matrix).max() if matrix.nnz else 0.0
+        if not np.isfinite(largest):
+            raise MeshError(f"{place} holds a number that is not finite.")
+        skew = abs(matrix - matrix.T).tocoo()
+        if skew.nnz and skew.max() > _UNSYMMETRIC * largest:
+            worst = int(skew.data.argmax())
+            first, second = (_named(self.places[int(axis[worst])]) for axis in skew.coords)
+            raise MeshError(
+                f"{place} is not symmetric: its entries between {first} and {second} differ by "
+                f"{skew.data[worst]:.3g}; friction, follower loads and gyroscopic terms cannot be taken."
+            )
+        return sparse.csr_array(0.5 * (matrix + matrix.T))
+
+
+def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> DesignedStructure:
+    """Make the affine operators of a structure from matrices.
+
+    Raises
+    ------
+    MeshError
+        If a file cannot be read, does not fit the others, lacks what the design names, or is no structure's:
+        unsymmetric, indefinite, not held, or with mass that nothing holds.
+    """
+    files = Matrices(folder, _places(design, folder))
+    stiffness, mass = (
+        sum(files.matrix(name, key) for name in getattr(design, key))
+        for key in ("stiffness_matrix", "mass_matrix")
+    )
+    held = [
+        files.rows_of((node, MOTIONS.index(motion) + 1), f"support[{number}]")
+        for number, part in enumerate(design.support, start=1)
+        for node in part.nodes
+        for motion in part.hold
+    ]
+    moves = (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0)
+    moves[[row for rows in held for row in rows]] = False
+    free = np.flatnonzero(moves)
+    if not len(free):
+        raise MeshError(f"{folder}: the matrices have no row that is free and has stiffness or mass.")
+    _check_whole(stiffness[free][:, free], mass[free][:, free], [files.places[row] for row in free])
+
+    own = [_point_mass(part, design.unit, files, number) for number, part in enumerate(design.mass, start=1)]
+    masses: dict[str | None, sparse.csr_array] = {None: mass}
+    for part, matrix in zip(design.mass, own, strict=True):
+        if part.free:
+            masses[part.name] = matrix
+        else:
+            masses[None] = masses[None] + part.mass * matrix
+    gauges, displacements, accelerations = (
+        sparse.csr_array(np.array([*_rows(design, files, key)]).reshape(-1, len(files.places))[:, free])
+        for key in ("gauge", "displacement", "acceleration")
+    )
+    loads = _load_terms(design, files, masses)
+    return DesignedStructure(
+        **names_of(design),
+        stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, free)),
+        mass_terms=tuple(term[free][:, free] for term in masses.values()),
+        load_terms=tuple(replace(term, vector=term.vector[free]) for term in loads),
+        gauge_output=gauges,
+        displacement_output=displacements,
+        acceleration_output=accelerations,
+        expansion=design.unit * _expansion(files)[:, free],
+        design_hash=design_hash,
+        design=design,
+    )
+
+
+def _places(design: MatrixDesign, folder: Path) -> list[Place]:
+    if design.unknowns is not None:
+        return read_unknowns(folder / design.unknowns)
+    found: set[Place] = set()
+    for name in design.stiffness_matrix:
+        own = read_matrix(folder, name).places
+        if own is None:
+            raise MeshError(
+                f"{folder / name} does not say which node and component each row is; name a file with a line "
+                "for each row, such as `97.3`, by the key unknowns."
+            )
+        found.update(own)
+    return sorted(found)
+
+
+def _point_mass(part: MatrixMass, unit: float, files: Matrices, number: int) -> sparse.csr_array:
+    """Return the mass matrix (n, n) of 1 kg, in the unit of the matrices."""
+    where = f"mass[{number}]"
+    if part.matrix is not None:
+        return files.matrix(part.matrix, where, partial=True)
+    assert part.node is not None
+    known = [axis for axis in (1, 2, 3) if (part.node, axis) in files.rows] or [1]
+    column = sparse.csr_array(np.array([files.at((part.node, axis), where) for axis in known]).T)
+    return sparse.csr_array(unit * (column @ column.T))
+
+
+def _load_terms(
+    design: MatrixDesign, files: Matrices, masses: dict[str | None, sparse.csr_array]
+) -> Iterator[LoadTerm]:
+    """Yield the parts of every load on all rows; an acceleration acts on 1 kg of each free mass as well."""
+    for number, load in enumerate(design.load, start=1):
+        where = f"load[{number}]"
+        if load.vector is not None:
+            yield LoadTerm(load.name, files.vector(load.vector, where, PUSHED))
+        elif load.node is not None and load.force is not None:
+            yield LoadTerm(load.name, files.along(load.node, load.force, where, PUSHED))
+        elif load.acceleration is not None:
+            field = files.everywhere(load.acceleration, where) / design.unit
+            for name, term in masses.items():
+                yield LoadTerm(load.name, np.asarray(term @ field), name)
+
+
+def _rows(design: MatrixDesign, files: Matrices, key: str) -> Iterator[FloatArray]:
+    """Yield the rows (n,) of outputs, displacements and accelerations in metres."""
+    parts: tuple[Extension | NodeOutput, ...] = getattr(design, key)
+    for number, part in enumerate(parts, start=1):
+        where, scale = f"{key}[{number}] ({part.name})", 1.0 if key == "gauge" else design.unit
+        if part.vector is not None:
+            yield scale * files.vector(part.vector, where)
+            continue
+        assert part.direction is not None
+        direction = tuple(unit_vector(part.direction))
+        if isinstance(part, Extension):
+            first, last = (files.along(node, direction, where) for node in part.nodes or ())
+            yield (last - first) / (part.length or 1.0)
+        elif part.node is not None:
+            yield scale * files.along(part.node, direction, where)
+
+
+def _expansion(files: Matrices) -> sparse.csr_array:
+    """Return the displacements of all nodes (3 nodes, n), zero where the matrices do not tell them."""
+    nodes = {node: number for number, node in enumerate(sorted({node for node, _ in files.places}))}
+    found = sparse.lil_array((3 * len(nodes), len(files.places)))
+    for (node, component), own in files.rows.items():
+        if component <= 3 and len(own) in READ:
+            found[3 * nodes[node] + component - 1, own] = READ[len(own)]
+    return found.tocsr()
+
+
+def _stiffness_terms(
+    design: MatrixDesign, files: Matrices, whole: sparse.csr_array, free: IntArray
+) -> Iterator[StiffnessTerm]:
+    """Yield the parts, then what they leave of the whole; each at least semidefinite."""
+    rest, nominal = whole, {part.name: part.nominal for part in design.parameter}
+    for number, part in enumerate(design.part, start=1):
+        where = f"part[{number}]"
+        if part.matrix is not None:
+            own = files.matrix(part.matrix, where, partial=True)
+        else:
+            assert part.changed is not None
+            assert part.times is not None
+            own = (whole - files.matrix(part.changed, where)) / (1.0 - part.times)
+        rest = rest - own
+        inside = _part_of(
+            whole, own, free, f"{where} takes stiffness away somewhere; its file is of another run or part"
+        )
+        if not inside.nnz:
+            raise MeshError(f"{where} has no stiffness: its matrix changes nothing that is free.")
+        yield StiffnessTerm(inside / nominal.get(part.scaled_by or "", 1.0), part.scaled_by, part.damage)
+    left = _part_of(
+        whole, rest, free, "the parts are together stiffer than the whole; two parts must not overlap"
+    )
+    if left.nnz:
+        yield StiffnessTerm(left)
+
+
+def _part_of(
+    whole: sparse.csr_array, part: sparse.csr_array, free: IntArray, sentence: str
+) -> sparse.csr_array:
+    """Return the free rows of a part without what is rounding of the whole; refuse an indefinite one."""
+    found, size = part.tocoo(), np.sqrt(np.abs(whole.diagonal()))
+    kept = np.abs(found.data) > _ROUNDING * size[found.row] * size[found.col]
+    entries = (found.data[kept], (found.row[kept], found.col[kept]))
+    inside = sparse.coo_array(entries, found.shape).tocsr()[free][:, free]
+    _check_definite(inside + _INDEFINITE * whole[free][:, free], sentence)
+    return inside
+
+
+def _check_definite(matrix: sparse.csr_array, sentence: str) -> None:
+    try:
+        Cholesky(sparse.csr_array(matrix))
+    except SolutionError:
+        raise MeshError(f"{sentence}.") from None
+
+
+def _check_whole(stiffness: sparse.csr_array, mass: sparse.csr_array, places: list[Place]) -> None:
+    """Refuse a stiffness that leaves motions free or is indefinite, and mass that is unheld or indefinite."""
+    diagonal, heavy = stiffness.diagonal(), mass.diagonal()
+    for bad, what in (
+        (diagonal < 0.0, "a negative stiffness on its own: the matrix is no structure's at rest"),
+        ((diagonal == 0.0) & (heavy != 0.0), "mass but no stiffness: hold it, or give it stiffness"),
+        (heavy < 0.0, "a negative mass"),
+    ):
+        if bad.any():
+            more = f" ({int(bad.sum())} rows are like it)" if bad.sum() > 1 else ""
+            raise MeshError(f"{_named(places[int(bad.argmax())])} has {what}{more}.")
+    try:
+        Factorisation(stiffness).solve(np.random.default_rng(16).standard_normal(len(places)))
+    except SolutionError:
+        _refuse_singular(stiffness, places)
+    floor = np.where(heavy > 0.0, heavy, heavy.mean() or 1.0)
+    sentence = "the mass matrix is indefinite: some motion of the structure has negative mass"
+    _check_definite(mass + sparse.diags_array(1e-6 * floor), sentence)
+
+
+def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:
+    """Say which motions a stiffness that cannot be solved with leaves free, or that it is indefinite."""
+    scale, identity = sparse.diags_array(1.0 / np.sqrt(stiffness.diagonal())), sparse.eye_array(len(places))
+    lifted = sparse.csr_array(scale @ stiffness @ scale + _INDEFINITE * identity)
+    _check_definite(
+        lifted, "the stiffness is indefinite: some motion of the structure has negative stiffness"
+    )
+    values, shapes = lowest_eigenpairs(lifted, identity, min(_MOST_FREE, len(places) - 1))
+    free = int((values < _INDEFINITE + _FREE).sum())
+    moved = int(np.abs(scale @ shapes[:, 0]).argmax())
+    raise MeshError(
+        f"motions that the stiffness leaves free, or nearly: {free or 1}; in one {_named(places[moved])} "
+        "moves most. Hold the structure by [[support]], or before its matrices are written."
+    )

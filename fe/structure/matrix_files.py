@@ -1,0 +1,222 @@
+"""Matrices and vectors of finite element codes, read from their files.
+
+What stands in a file tells its format: MatrixMarket; archives of NumPy and SciPy (`.npz`, `.npy`); DMIG of
+Nastran; tables of `row column value` (CalculiX' `.sti` and `.mas`, Abaqus' COORDINATE) or of `node component
+node component value` (Abaqus' MATRIX INPUT). Those that name nodes bring their own unknowns.
+"""
+
+import io
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import io as scipy_io
+from scipy import sparse
+
+from fe.runtime.errors import MeshError
+from reporting.text_file import read_text
+
+from .deck import fail
+from .matrix_design import file_of
+from .nastran_file import cards
+
+FloatArray = NDArray[np.float64]
+Place = tuple[int, int]
+"""Node and component: 1, 2, 3 along x, y, z, then 4, 5, 6 about them."""
+
+_PLACE = re.compile(r"\s*(\d+)\s*[.,;\s]\s*([1-6])\s*")
+_SQUARE, _REAL = (1, 6), (1, 2)  # forms and types of Nastran
+
+
+class _Table(NamedTuple):
+    """The numbers of a text file, line by line."""
+
+    lines: FloatArray
+
+
+class StoredMatrix(NamedTuple):
+    """A matrix as it was stored, and the unknown of each row where the file says it."""
+
+    matrix: sparse.csr_array
+    places: list[Place] | None = None
+
+
+def read_unknowns(path: Path) -> list[Place]:
+    """Read the node and component of each row, a line each: `97.3`, `97 3` or `97,3`.
+
+    Raises
+    ------
+    MeshError
+        If it cannot be read, or a line is no such pair.
+    """
+    found = []
+    for number, line in enumerate(read_text(path, MeshError, what="file of unknowns").splitlines(), start=1):
+        match = _PLACE.fullmatch(line)
+        if match is not None:
+            found.append((int(match[1]), int(match[2])))
+        elif line.strip():
+            fail(
+                f"{path}, line {number}",
+                f"a node and its component from 1 to 6 are expected, but {line!r} came.",
+            )
+    return found
+
+
+def read_matrix(folder: Path, name: str) -> StoredMatrix:
+    """Read the matrix that `FILE` or `FILE:MATRIX` names, both triangles of it.
+
+    Raises
+    ------
+    MeshError
+        If it cannot be read, or holds no such matrix.
+    """
+    file, chosen = file_of(name)
+    path = folder / file
+    stored = _read(path, chosen)
+    if isinstance(stored, _Table):
+        stored = _from_table(path, stored.lines)
+    if isinstance(stored, StoredMatrix):
+        return stored
+    if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or stored.dtype.kind not in "fiu":
+        fail(
+            str(path),
+            f"a square matrix of real numbers is expected, but {stored.dtype} of shape {stored.shape} came.",
+        )
+    return StoredMatrix(sparse.csr_array(stored, dtype=np.float64))
+
+
+def read_vector(folder: Path, name: str, named: Callable[[Place], FloatArray], size: int) -> FloatArray:
+    """Read a vector (n,): as many numbers as there are unknowns, or lines of node, component and value.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the file is.
+    name : str
+        `FILE` or `FILE:ARRAY`.
+    named : callable
+        Return the vector (n,) that 1 at a node's component stands for.
+    size : int
+        Number n of unknowns.
+
+    Raises
+    ------
+    MeshError
+        If it cannot be read or has another length.
+    """
+    file, chosen = file_of(name)
+    found = _read(folder / file, chosen)
+    if isinstance(found, _Table):
+        found = found.lines
+        if found.shape[1] == 3:
+            parts = [value * named((int(node), int(component))) for node, component, value in found]
+            return np.asarray(np.sum(parts, axis=0))
+    if isinstance(found, StoredMatrix):
+        found = found.matrix
+    values = np.asarray(found.todense() if sparse.issparse(found) else found, dtype=np.float64)
+    if values.size != size or max(values.shape) != size:
+        fail(
+            str(folder / file),
+            f"a vector of {size} numbers, or lines of node, component and value, are expected, but an array "
+            f"of shape {values.shape} came.",
+        )
+    return values.ravel()
+
+
+def _read(path: Path, chosen: str) -> Any:
+    try:
+        if path.suffix in (".npz", ".npy"):
+            return _archived(path, chosen)
+        text = read_text(path, MeshError, what="matrix file", otherwise="latin-1")
+        if text.startswith("%%MatrixMarket"):
+            return scipy_io.mmread(path)
+        if re.search(r"^DMIG", text, re.MULTILINE):
+            return _nastran(path, chosen)
+        if not text.strip():
+            raise ValueError("it is empty")
+        return _Table(np.loadtxt(io.StringIO(text.replace(",", " ")), comments=("**", "#", "$"), ndmin=2))
+    except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        fail(str(path), f"the file cannot be read as a matrix: {' '.join(str(error).split())}.")
+
+
+def _archived(path: Path, chosen: str) -> Any:
+    if path.suffix == ".npy":
+        return np.load(path, allow_pickle=False)
+    with np.load(path, allow_pickle=False) as archive:
+        if "format" in archive:
+            return sparse.load_npz(path)
+        names = list(archive)
+        if chosen not in names and (chosen or len(names) != 1):
+            fail(str(path), f"one of its arrays is expected, as FILE:ARRAY; it has {', '.join(names)}.")
+        return archive[chosen or names[0]]
+
+
+def _from_table(path: Path, table: FloatArray) -> Any:
+    """Return the matrix of a table with the rows `row column value` or `node component ... value`."""
+    width = table.shape[1]
+    if width not in (3, 5) or not table.size or not np.array_equal(table[:, :-1], np.rint(table[:, :-1])):
+        fail(
+            str(path),
+            "lines of row, column and value, or of node, component, node, component and value, are expected, "
+            f"but {table.shape[0]} lines of {width} numbers came.",
+        )
+    whole = table[:, :-1].astype(np.int64)
+    if width == 3:
+        size = int(whole.max())
+        if whole.min() < 1:
+            fail(str(path), "rows and columns are counted from 1, but there is a smaller one.")
+        return _mirrored(whole[:, 0] - 1, whole[:, 1] - 1, table[:, 2], size)
+    return _by_place(whole[:, :2], whole[:, 2:], table[:, 4])
+
+
+def _mirrored(
+    rows: NDArray[np.int64], columns: NDArray[np.int64], values: FloatArray, size: int
+) -> sparse.csr_array:
+    """Return a matrix of which one of each two entries that mirror each other may be left out."""
+    matrix = sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
+    pattern = sparse.coo_array((np.ones(len(rows)), (rows, columns)), (size, size)).tocsr()
+    both = pattern.multiply(pattern.T).tocoo()
+    if (both.row == both.col).all():
+        matrix = (matrix + matrix.T - sparse.diags_array(matrix.diagonal())).tocsr()
+    return matrix
+
+
+def _by_place(rows: NDArray[np.int64], columns: NDArray[np.int64], values: FloatArray) -> StoredMatrix:
+    """Return a matrix whose rows and columns (n, 2) are nodes with their components."""
+    places, number = np.unique(np.concatenate((rows, columns)), axis=0, return_inverse=True)
+    row, column = number.reshape(2, -1)
+    matrix = _mirrored(row, column, values, len(places))
+    return StoredMatrix(matrix, [(node, component) for node, component in places.tolist()])
+
+
+def _nastran(path: Path, chosen: str) -> StoredMatrix:
+    """Read a real square matrix from the DMIG of the bulk data."""
+    kind: dict[str, int] = {}
+    entries: dict[str, list[tuple[float, ...]]] = {}
+    for card in cards((path,)):
+        if card.word != "DMIG":
+            continue
+        name = card.fields[0].upper()
+        if name not in kind:  # the first of a name is its head
+            kind[name] = card.whole(2)
+            if card.whole(3) not in _REAL:
+                fail(card.where, f"a real matrix is expected, but {name} is complex.")
+            entries[name] = []
+            continue
+        column = (card.whole(1), max(card.whole(2), 1))
+        for first in range(4, len(card.fields), 4):
+            if card.fields[first]:
+                row = (card.whole(first), max(card.whole(first + 1), 1))
+                entries[name].append((*row, *column, *card.reals(first + 2, 1)))
+    wanted = chosen.upper() or (next(iter(kind)) if len(kind) == 1 else "")
+    if wanted not in entries or not entries[wanted]:
+        fail(str(path), f"one of its matrices is expected, as FILE:MATRIX; it has {', '.join(kind)}.")
+    table = np.array(entries[wanted])
+    places = table[:, :4].astype(np.int64)
+    if kind[wanted] not in _SQUARE:
+        fail(str(path), f"a square or symmetric matrix is expected, but {wanted} is of form {kind[wanted]}.")
+    return _by_place(places[:, :2], places[:, 2:], table[:, 4])

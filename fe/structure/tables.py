@@ -1,0 +1,208 @@
+"""The tables that every structure file has, whether its structure comes from a mesh or from matrices."""
+
+import itertools
+from typing import ClassVar, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from fe.runtime.state import MOST_REGIONS
+from fe.wing.parts import Part
+
+from .rosettes import Name, Named
+
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
+"""Units of length and their size [m]."""
+MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
+"""Of a rigid set: along the axes, then about them."""
+
+
+class Ranged(Named):
+    """A quantity that can be chosen, and from where to where the reduced model is to hold."""
+
+    minimum: float | None = None
+    maximum: float | None = None
+
+    usual: ClassVar[tuple[float, float]]
+    """Ends of the range where none are given, as multiples of the nominal value."""
+
+    @property
+    def middle(self) -> float:
+        """Nominal value."""
+        raise NotImplementedError
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Least and largest value."""
+        low, high = sorted(share * self.middle for share in self.usual)
+        return (
+            low if self.minimum is None else self.minimum,
+            high if self.maximum is None else self.maximum,
+        )
+
+    @model_validator(mode="after")
+    def _range_holds_the_nominal_value(self) -> "Ranged":
+        low, high = self.range
+        if not low <= self.middle <= high:
+            raise ValueError(
+                f"its nominal value {self.middle:g} must lie between minimum {low:g} and maximum {high:g}"
+            )
+        return self
+
+
+class Parameter(Ranged):
+    """Factor on the stiffness of materials, to be calibrated; 1 unless `nominal` says otherwise."""
+
+    nominal: float = Field(default=1.0, gt=0.0, le=1e3)
+    minimum: float | None = Field(default=None, gt=0.0)
+
+    usual = (0.9, 1.1)
+
+    @property
+    def middle(self) -> float:
+        """Nominal value."""
+        return self.nominal
+
+
+class Control(Ranged):
+    """What commands loads; a load is its numbers times the value of its control."""
+
+    unit: str = Field(default="1", pattern=r"^\S+$")
+    nominal: float = 1.0
+
+    usual = (-10.0, 10.0)
+
+    @property
+    def middle(self) -> float:
+        """Nominal value."""
+        return self.nominal
+
+    @model_validator(mode="after")
+    def _is_not_always_zero(self) -> "Control":
+        if not any(self.range):
+            raise ValueError(
+                "with its nominal value 0 it would be 0 always; give the `minimum` and `maximum` it takes"
+            )
+        return self
+
+
+class Commanded(Named):
+    """A load, constant or times the value of a control."""
+
+    control: Name | None = None
+
+
+class Region(Named):
+    """Region that may lose stiffness, up to `largest_loss`; `name` is that of its loss."""
+
+    largest_loss: float = Field(default=0.8, gt=0.0, le=0.95)
+
+
+class ChosenMass(Ranged):
+    """Mass [kg]; `free` where it is to be calibrated or chosen later."""
+
+    mass: float = Field(ge=0.0, lt=1e6)
+    free: bool = False
+    minimum: float | None = Field(default=None, ge=0.0)
+
+    usual = (0.5, 1.5)
+
+    @property
+    def middle(self) -> float:
+        """Nominal value."""
+        return self.mass
+
+
+class Damping(Part):
+    """Rayleigh damping V = alpha M + beta K."""
+
+    alpha: float = Field(default=0.0, ge=0.0, description="1/s")
+    beta: float = Field(default=0.0, ge=0.0, description="s")
+
+
+class ReductionLimits(Part):
+    """How well the reduced model is to hold, and how many full solutions it may take."""
+
+    tolerance: float = Field(default=6e-4, ge=1e-5, le=0.1, description="of the largest output")
+    most_solutions: int = Field(default=401, ge=1, le=2000)
+
+
+class StructureDesign(Part):
+    """A structure: all that decides its model beside the files that it names. Read it with `load_structure`.
+
+    Raises
+    ------
+    InvalidDesignError
+        From `parse_structure` and `load_structure`, with one sentence that names the place.
+    """
+
+    name: str = Field(min_length=1)
+    length_unit: Literal["m", "cm", "mm", "um", "in", "ft"]
+    parameter: tuple[Parameter, ...] = ()
+    control: tuple[Control, ...] = ()
+    load: tuple[Commanded, ...] = ()
+    damage: tuple[Region, ...] = Field(default=(), max_length=MOST_REGIONS)
+    mass: tuple[ChosenMass, ...] = ()
+    gauge: tuple[Named, ...] = ()
+    displacement: tuple[Named, ...] = ()
+    acceleration: tuple[Named, ...] = ()
+    damping: Damping = Damping()
+    reduction: ReductionLimits = ReductionLimits()
+
+    what: ClassVar[str]
+    """What its files hold."""
+    scaled_table: ClassVar[str]
+    """Name of the tables that a parameter may scale."""
+    own_names: ClassVar[tuple[str, ...]] = ()
+    """Further tables whose names must differ from one another."""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the files that it is made of, seen from its own."""
+        raise NotImplementedError
+
+    @field_validator("name", "mesh", check_fields=False)
+    @classmethod
+    def _one_line(cls, text: str) -> str:
+        if not text.isprintable():
+            raise ValueError("one line of text is expected, without line breaks or other control characters")
+        return text
+
+    @model_validator(mode="after")
+    def _names_fit_together(self) -> "StructureDesign":
+        # What a state, a control or an output is called by must be one thing.
+        for keys in (
+            ("parameter", "damage", "mass", "control"),
+            ("gauge", "displacement", "acceleration"),
+            ("load",),
+            *((key,) for key in self.own_names),
+        ):
+            named = [
+                (f"{key}[{number}]", part.name)
+                for key in keys
+                for number, part in enumerate(getattr(self, key), start=1)
+            ]
+            for (first, one), (second, two) in itertools.combinations(named, 2):
+                if one == two:
+                    raise ValueError(
+                        f"{first} and {second} are both named {one!r}; give each a name of its own"
+                    )
+        table = self.scaled_table
+        self._check_ties(table, "scaled_by", "parameter", "is scaled by", f"scales no {table}")
+        self._check_ties("load", "control", "control", "is tied to the control", "commands no load")
+        return self
+
+    def _check_ties(self, table: str, key: str, other: str, tied: str, untied: str) -> None:
+        """Refuse what is tied to a name of another table that is not there, and names that tie nothing."""
+        known = [part.name for part in getattr(self, other)]
+        came = [getattr(part, key) for part in getattr(self, table)]
+        for number, name in enumerate(came, start=1):
+            if name is not None and name not in known:
+                raise ValueError(f"{table}[{number}] {tied} {name!r}, but no [[{other}]] has that name")
+        for name in known:
+            if name not in came:
+                raise ValueError(f"the {other} {name!r} {untied}")
+
+    @property
+    def unit(self) -> float:
+        """Metres in the unit of length."""
+        return UNITS[self.length_unit]
