@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from benchmarks.open_rigs.campaigns import drawn, write
 from discrepancy.campaign.reading import read_campaign
@@ -15,10 +16,12 @@ from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import library
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
+from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.force import MissingForce, missing_force
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.shares import ForceShare, ForceShares, order_of
+from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
@@ -34,8 +37,80 @@ from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness
 from tests.discrepancy.models.test_fmu import write as write_rig
 
-CART, CART_IN_AIR, SERVO, STORES = 0, 5, 12, 14
-"""Campaigns of seed 1: friction on a rail, drag, a cubic spring in a closed loop, Torricelli's outflow."""
+FloatArray = NDArray[np.float64]
+
+CART, CART_IN_AIR, SHAKEN, SERVO, STORES = 0, 5, 8, 12, 14
+"""Campaigns of seed 1: friction on a rail, drag, one on a support, a cubic spring in a loop, an outflow."""
+DRIVE = """format = 1
+name = "positioning drive"
+mass = 95.0
+free = true
+damping = { matrix = 200.0 }
+[[input]]
+name = "force"
+vector = 1.0
+quantity = "force"
+[[output]]
+name = "position"
+vector = 1.0
+[[port]]
+name = "carriage"
+vector = 1.0
+[[parameter]]
+name = "mass"
+terms = "mass"
+deviation = 0.1
+low = 0.3
+high = 3.0
+[[parameter]]
+name = "viscous friction"
+terms = "damping"
+deviation = 0.2
+low = 0.3
+high = 3.0
+"""
+DRIVEN = """format = 1
+name = "drive"
+[[channel]]
+name = "position"
+quantity = "displacement"
+unit = "m"
+output = "position"
+noise = { standard_deviation = 2e-6 }
+[[input]]
+name = "force"
+quantity = "force"
+unit = "N"
+hold = "zero_order"
+offset_deviation = 5.0
+[[trial]]
+name = "there and back"
+kind = "driven"
+file = "run.csv"
+begins = "still"
+"""
+
+
+def write_drive(folder: Path) -> None:
+    """Write six seconds of a carriage of 95.1 kg with friction of 20.4 N under a loop of 1 kHz."""
+    time, parts = 1e-3 * np.arange(6000.0), 8
+    turn = time % 5.0
+    s = np.clip(np.where(turn < 2.5, (turn - 0.3) / 1.2, 1.0 - (turn - 2.8) / 1.2), 0.0, 1.0)
+    wanted = 0.22 * (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5)
+    x = v = 0.0
+    rows = []
+    for aim in wanted:
+        push = 35.15 * float(np.clip(243.0 * (160.0 * (aim - x) - v), -10.0, 10.0))
+        rows.append((push, x))
+        for _ in range(parts):
+            rubs = 203.5 * v + 20.4 * np.tanh(v / 2e-4) + 1.2 * np.sin(2.0 * np.pi * x / 0.05) - 3.2
+            v += (push - rubs) / 95.1 * 1e-3 / parts
+            x += v * 1e-3 / parts
+    values = np.array(rows) + np.random.default_rng(3).standard_normal((len(time), 2)) * (0.05, 2e-6)
+    table = np.column_stack((time, values))
+    np.savetxt(folder / "run.csv", table, "%.9g", ",", header="time,force,position", comments="")
+    (folder / "model.toml").write_text(DRIVE, "utf-8")
+    (folder / "campaign.toml").write_text(DRIVEN, "utf-8")
 
 
 def problem_of(folder: Path, number: int) -> Problem:
@@ -198,6 +273,49 @@ def seen_force(problem: Problem, effect: Effect | None = None, place: str = "") 
         start = next(item for item in search.screened(search.whole, [effect]) if item[1] == term)[2]
         found = search.followed(search.whole, Candidate((term,)), start)
     return missing_force(search, found or search.whole)
+
+
+@pytest.mark.parametrize("number", [CART, SERVO, SHAKEN, STORES])
+def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path: Path, number: int) -> None:
+    """To first order: a heavier body moves less under the same force, and a reaction shows another part."""
+    problem = problem_of(tmp_path, number)
+    point = problem.start(Candidate())
+    here = seen_trial(problem, 0, point)
+    forces = {0: np.sin(0.7 * np.arange(len(here.fine_time)) / here.parts)}
+
+    def shown(k: int, step: float) -> FloatArray:
+        shared = point.shared.copy()
+        shared[k] += step
+        trial = seen_trial(problem, 0, Point(shared, point.local, point.effect))
+        return trial.readings(trial.pushed(0, forces[0]), forces)
+
+    added = here.pushed(0, forces[0])
+    slopes = {k: item for k, item in enumerate(here.slopes) if item is not None}
+    assert slopes
+    for k, slope in slopes.items():
+        expected = (shown(k, 1e-3) - shown(k, -1e-3)) / 2e-3
+        _, found = here.turned(slope, added, forces)
+        np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path: Path) -> None:
+    """A thousand samples a second by an encoder, at rest half of the time, creeping before it slides."""
+    write_drive(tmp_path)
+    model = load_model(tmp_path / "model.toml")
+    campaign, faults = checked(read_campaign(tmp_path), model)
+    assert not faults
+    problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+    search = ForceSearch(problem)
+    search.locate()
+    effects = [item for item in library() if item.unavailable(problem.setting) is None]
+    found = [search.followed(search.whole, Candidate((term,)), start)
+             for _, term, start in search.screened(search.whole, effects)[:12]]  # fmt: skip
+    best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.evidence)
+    (term,) = best.candidate.terms
+    assert term.effect.identifier == "coulomb_friction"
+    (friction,) = best.candidate.patch(problem.setting, best.effect)
+    assert friction.coefficient == pytest.approx(20.4, rel=0.05)
+    assert np.abs(best.shared).max() < 0.5
 
 
 def chain(kind: ExampleKind, effect: str, place: str, **values: float) -> Problem:
