@@ -9,7 +9,6 @@ from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.report.text import number, unit_text
-from reporting.page import Table, columns, numbers
 from reporting.words import listing
 
 HEADINGS = (
@@ -54,12 +53,10 @@ def neighbours(found: Separability, name: str) -> list[str]:
     return [other for place, other in enumerate(found.identifiers) if near[place] and place != at]
 
 
-def can_decide_table(found: Separability) -> Table:
-    """Return the rows as a table of the page, those that can be tested."""
-    sizes = ("prior median", "detectable from")
-    heads = columns(*(numbers(title) if title in sizes else title for title in HEADINGS))
+def can_decide_rows(found: Separability) -> list[tuple[str, ...]]:
+    """Return the rows of the effects that can be tested, as the page has them."""
     testable = [_row(found, item) for item in found.detectability if not item.reason]
-    return Table(heads, [tuple(cell.replace("_", " ") for cell in row) for row in testable])
+    return [tuple(cell.replace("_", " ") for cell in row) for row in testable]
 
 
 def confused_lines(found: Separability) -> list[str]:

@@ -5,18 +5,12 @@ from matplotlib.figure import Figure
 from discrepancy.judgement.separability import CONFUSED
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.report.content import ReportFigure, ReportInput
-from discrepancy.report.evidence_figures import (
-    confusion_figure,
-    evidence_figure,
-    pit_figure,
-    separability_figure,
-    shares_figure,
-)
+from discrepancy.report.evidence_figures import confusion_figure, pit_figure, separability_figure
 from discrepancy.report.force_figure import missing_force_figure
-from discrepancy.report.law_figures import backbone_figure, force_figure
+from discrepancy.report.law_figures import backbone_figure
 from discrepancy.report.motion_figures import history_figure, spectrum_figure, worst_record
 from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure
-from discrepancy.report.text import WORDS
+from discrepancy.report.text import WORDS, force_sentence, scored
 from discrepancy.report.time_line import time_line_figure
 from discrepancy.workflow import Investigation
 from reporting.figures import to_svg
@@ -41,8 +35,9 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     investigation = content.investigation
     verdict, proof, missing = investigation.verdict, investigation.proof, investigation.missing
     before, after = investigation.before, after_of(investigation)
-    if missing is not None:
-        add("missing_force", missing_force_figure(missing), sentence=missing.sentence)
+    if missing is not None and verdict.force is not None:
+        figure = missing_force_figure(missing, verdict.force)
+        add("missing_force", figure, sentence=force_sentence(verdict.force))
     if before is not None:
         scale = {
             "held_out": _held_out_words(before),
@@ -63,27 +58,16 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
             add("spectrum", spectrum_figure(before, after, worst))
         if (backbone := backbone_figure(before, after)) is not None:
             add("backbone", backbone[0], channel=backbone[1])
-        if missing is None and (force := force_figure(before, after)) is not None:
-            add("restoring_force", force[0], record=force[1])
-    if verdict.hypotheses:
-        add("evidence", evidence_figure(verdict.hypotheses))
     if proof is not None:
-        held, fitted = (
-            (proof.held_out_before, proof.held_out_after),
-            (proof.fitted_before, proof.fitted_after),
-        )
-        pairs = zip(
-            ("model as it was", "with the effect"), held if held[1] is not None else fitted, strict=True
-        )
-        scores = {title: item for title, item in pairs if item is not None and item.pit}
-        where = "Held-out trials." if held[1] is not None else "Fitted trials: none is held out."
+        *pair, trials = scored(proof)
+        shown = zip(("model as it was", "with the effect"), pair, strict=True)
+        scores = {title: item for title, item in shown if item.pit}
+        where = "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
         add("pit", pit_figure(scores) if scores else None, where=where)
     if content.separability is not None:
         add("separability", separability_figure(content.separability), confused=CONFUSED)
     if content.self_calibration is not None:
         add("self_calibration", confusion_figure(content.self_calibration))
-    if verdict.explained is not None:
-        add("shares", shares_figure(verdict.explained), trials=verdict.explained.trials)
     return found
 
 

@@ -6,40 +6,52 @@ from math import isfinite, isnan
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.judgement.when import when_sentence
 from discrepancy.report.content import ReportInput
+from discrepancy.report.kit import add_table
 from discrepancy.report.sizes import definite_unit, size_sentence
 from discrepancy.report.text import (
     NAMING,
     WORDS,
     added_label,
     catalogue_of,
+    effects_text,
     estimate_text,
     formula,
     headline,
     meaning,
+    members_of,
     number,
     p_value_text,
     percent,
     probability_text,
     remainders_sentence,
     residual_sizes,
+    rests_on_force,
     rounded,
+    scored,
+    share_text,
     shares_sentence,
     unit_text,
 )
-from discrepancy.verdict import Proof, Scores, VerdictKind
+from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
-from reporting.page import Page, Table, columns, numbers
+from reporting.page import Page
 from reporting.words import counted, listing
 
 LEAST_SHARE = 0.05
 """Findings in words that explain less of the excess variance are left to the file."""
 SHOWN_FINDINGS = 8
+AT_WHAT = (
+    "velocity_exponent", "displacement_exponent", "reference_velocity", "reference_displacement",
+    "element_count",
+)  # fmt: skip
+"""Numbers of a primitive that say at what another one holds."""
 
 
 def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | None = None) -> None:
-    """Add the verdict: its sentence and size, its `picture`, what is added, in what sizes."""
+    """Add the verdict: effect, size and probability, its sentence, its `picture`, what is added."""
     investigation = content.investigation
     verdict = investigation.verdict
+    page.add_highlights(_opening(investigation))
     page.add_notice(headline(verdict))
     if opening := " ".join(filter(None, (_sizes(content), closing_sentence(investigation)))):
         page.add_paragraph(opening)
@@ -48,15 +60,12 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
     page.add_paragraph(meaning(verdict))
     if shares := shares_sentence(verdict):
         page.add_paragraph(f"{shares} {remainders_sentence(verdict)}".strip())
-    _add_highlights(page, investigation)
     catalogue = catalogue_of(investigation)
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
         names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
         page.add_paragraph(
             f"The nearest in the catalogue is {listing(names)}; this is a resemblance, no name."
         )
-    if not verdict.effects:
-        return
     for effect in {item.identifier: item for item in verdict.effects}.values():
         entry = catalogue.get(effect.identifier)
         if entry is not None:
@@ -64,25 +73,73 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
                 f"{effect.name[0].upper()}{effect.name[1:]}: {formula(entry.equation)}. Its signature: "
                 f"{formula(entry.signature).rstrip('.')}. Source: {entry.reference.rstrip('.')}."
             )
-    rows = []
-    for effect in verdict.effects:
-        for item in (*effect.parameters, *effect.shape):
-            value, interval = estimate_text(item)
-            rows.append(
-                (
-                    effect.name, effect.place or "\N{EN DASH}",
-                    formula(item.description or item.name.replace("_", " ")),
-                    value, interval, unit_text(item.unit),
-                )
-            )  # fmt: skip
-    page.add_table(
-        Table(
-            columns("effect", "place", "parameter", *map(numbers, ("value", "90 % interval")), "unit"), rows
-        ),
-        WORDS["sizes"].get(verdict.kind, WORDS["sizes"]["other"]),
-        title="What is added" if verdict.kind in NAMING else "What could be added",
-    )
+    whose = WORDS["sizes"].get(verdict.kind, WORDS["sizes"]["other"])
+    if members := members_of(verdict):
+        rows = [
+            (str(place) if row is own[0] else "", *row)
+            for place, own in enumerate(map(_parameters, members.values()), start=1)
+            for row in own
+        ]
+        add_table(page, "members", rows, whose=whose)
+    else:
+        name = "added" if verdict.kind in NAMING else "could_be_added"
+        add_table(page, name, _parameters(verdict.effects), whose=whose)
     _add_primitives(page, content)
+
+
+def _parameters(effects: tuple[NamedEffect, ...]) -> list[tuple[str, ...]]:
+    """Return a row for each parameter of effects; one without parameters has a row, too."""
+    rows: list[tuple[str, ...]] = []
+    for effect in effects:
+        head = (effect.name, effect.place or "\N{EN DASH}")
+        own = (*effect.parameters, *effect.shape)
+        for item in own:
+            what = formula(item.description or item.name.replace("_", " "))
+            rows.append((*head, what, *estimate_text(item), unit_text(item.unit)))
+        rows += [] if own else [(*head, "", "", "", "")]
+    return rows
+
+
+def _opening(investigation: Investigation) -> list[tuple[str, str]]:
+    """Return in large print: the effect, its size, its share, its probability."""
+    verdict, proof, force = investigation.verdict, investigation.proof, investigation.verdict.force
+    what = _what(verdict)
+    items = [(what[:1].upper() + what[1:], WORDS["opening"].get(verdict.kind, verdict.kind.value))]
+    if force is not None:
+        items.append((f"{number(force.rms)} {force.unit}", f"missing at {force.port}, rms"))
+        share = next((one for one in (force.held_out, force.fitted) if one is not None and one.tested), None)
+        if share is not None:
+            kind = "fitted" if share is force.fitted else "held-out"
+            of = "its effect on predictions" if share.ahead else "it"
+            items.append((share_text(share), f"of {of} is {force.law}, {kind} trials"))
+    elif verdict.explained is not None:  # at the scale of its share: χ²/dof counts uncertainty as expected
+        before, after = residual_sizes(verdict.explained)
+        told = f"noise deviations, rms on {verdict.explained.trials} trials, before and after"
+        items.append((f"{before} → {after}", told))
+    if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
+        items.append((probability_text(verdict.probability), "probability of the verdict"))
+    judged = [gate for gate in verdict.gates if gate.name not in ("shape", "held-out trials")]
+    judged = [gate for gate in judged if isfinite(gate.statistic)]
+    if proof is None and force is None and judged:  # of gates that compare a p-value, the one that decided
+        gate = next((gate for gate in judged if gate.passed is False), judged[0])
+        told = f"p of the {gate.name}; a fit has at least {number(gate.limit)}"
+        items.append((number(gate.statistic), told))
+    return items
+
+
+def _what(verdict: Verdict) -> str:
+    """Return what is missing, in a few words."""
+    if members := members_of(verdict):
+        return listing(members, "or")
+    words = {
+        VerdictKind.NOTHING_MISSING: "nothing", VerdictKind.DATA_ERROR: "the data",
+        VerdictKind.BELOW_LIMIT: "nothing that could be seen",
+    }  # fmt: skip
+    kept = [
+        item for item in verdict.effects if verdict.kind in NAMING and not (item.shape and verdict.family)
+    ]
+    found = [effects_text(kept), f"an effect of the family {verdict.family}" if verdict.family else ""]
+    return words.get(verdict.kind) or listing(filter(None, found)) or "no name"
 
 
 def _sizes(content: ReportInput) -> str:
@@ -107,13 +164,15 @@ def closing_sentence(investigation: Investigation) -> str:
     """Return how much of the gap is closed and what is left; empty where nothing was added or scored."""
     verdict, proof = investigation.verdict, investigation.proof
     added = "It" if verdict.kind in NAMING else "The best hypothesis, which is no name,"
+    if rests_on_force(verdict):
+        return ""
     if (share := verdict.explained) is not None:
         interval = f"{100.0 * share.low:.0f} to {100.0 * share.high:.0f} %"
         closed = f"{100.0 * share.value:.0f} % of the gap on {share.trials} trials ({interval})"
         return f"{added} closes {closed} and leaves {number(share.left, 2)} noises."
     if proof is None or not added_label(investigation):
         return ""
-    before, after, where = _scored(proof)
+    before, after, where = scored(proof)
     if not (isfinite(before.chi_square_per_dof) and isfinite(after.chi_square_per_dof)):
         return ""
     course = f"{number(before.chi_square_per_dof)} before and {number(after.chi_square_per_dof)} after it"
@@ -121,13 +180,6 @@ def closing_sentence(investigation: Investigation) -> str:
         closed = f"{percent(proof.gap_closed)} % of the gap on {where} trials"
         return f"{added} closes {closed}: χ²/dof is {course}, 1 for noise alone."
     return f"On {where} trials χ²/dof is {course}, 1 for noise alone."
-
-
-def _scored(proof: Proof) -> tuple[Scores, Scores, str]:
-    """Return the scores before and after, and on which trials: those held out, where there are any."""
-    if proof.held_out_before is not None and proof.held_out_after is not None:
-        return proof.held_out_before, proof.held_out_after, "held-out"
-    return proof.fitted_before, proof.fitted_after, "fitted"
 
 
 def _add_primitives(page: Page, content: ReportInput) -> None:
@@ -140,8 +192,7 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
         for item in intervals:
             primitive = effect.patch.primitives[item.primitive]
             unit = definite_unit(item.unit, primitive, found.model, found.campaign) or unit_text(item.unit)
-            if item.parameter in ("velocity_exponent", "displacement_exponent", "reference_velocity",
-                                  "reference_displacement", "element_count"):  # fmt: skip
+            if item.parameter in AT_WHAT:
                 continue
             if isnan(item.low) or item.low == item.high:
                 interval, value = "fixed", f"{item.value:.4g}"
@@ -149,54 +200,10 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
                 form = rounded(item.value, 0.5 * (item.high - item.low))
                 value, interval = form(item.value), f"{form(item.low)} to {form(item.high)}"
             rows.append((item.parameter.replace("_", " "), value, interval, unit))
-    if not rows:
-        return
     marked = "" if content.investigation.verdict.kind in NAMING else (
         f" It is that of {added_label(content.investigation)}, which is not named."
     )  # fmt: skip
-    fmu = f" {content.fmu}" if content.fmu else ""
-    page.add_table(
-        Table(columns("number", *map(numbers, ("value", "90 % interval")), "unit"), rows),
-        f"patch.json holds it in SI units, ready for the model and its FMU.{marked}{fmu}",
-        title="The change of the model",
-    )
-
-
-def _add_highlights(page: Page, investigation: Investigation) -> None:
-    """Add what the sentences above do not say."""
-    verdict, proof = investigation.verdict, investigation.proof
-    items: list[tuple[str, str]] = []
-    said = "probability" in headline(verdict) or verdict.kind is VerdictKind.UNEXPLAINED
-    if not isnan(verdict.probability) and not said:
-        items.append((probability_text(verdict.probability), "probability of the verdict"))
-    if isfinite(verdict.log_bayes_factor) and verdict.hypotheses and verdict.hypotheses[0].effects:
-        items.append((f"{verdict.log_bayes_factor:,.1f} nat", "ln Bayes factor against nothing missing"))
-    if proof is not None:
-        first, second, where = _scored(proof)
-        if verdict.explained is not None:  # at the scale of its share: χ²/dof counts uncertainty as expected
-            before, after = residual_sizes(verdict.explained)
-            items.append(
-                (f"{before} → {after}", f"noise deviations, rms on {where} trials, before and after")
-            )
-        elif not closing_sentence(investigation):
-            items.append(
-                (
-                    f"{number(first.chi_square_per_dof)} → {number(second.chi_square_per_dof)}",
-                    f"χ²/dof on {where} trials, before and after",
-                )
-            )
-    elif judged := [
-        gate
-        for gate in verdict.gates
-        if gate.name not in ("shape", "held-out trials") and isfinite(gate.statistic)
-    ]:
-        # of gates whose statistic is a p-value, the one that decided
-        gate = next((gate for gate in judged if gate.passed is False), judged[0])
-        items.append(
-            (number(gate.statistic), f"p of the {gate.name}; a fit has at least {number(gate.limit)}")
-        )
-    if items:
-        page.add_highlights(items)
+    add_table(page, "change", rows, marked=marked, fmu=f" {content.fmu}" if content.fmu else "")
 
 
 def add_next(page: Page, investigation: Investigation) -> None:
@@ -212,11 +219,7 @@ def add_next(page: Page, investigation: Investigation) -> None:
         (item.description, item.reason, f"{item.information:.2f}", f"{item.cost:g}")
         for item in investigation.verdict.next_experiments
     ]
-    page.add_table(
-        Table(columns("test", "why", numbers("information", "nat"), numbers("cost", "trials")), rows),
-        "Cost is relative to one more trial of a kind that was done already.",
-        title="Proposed tests, best first",
-    )
+    add_table(page, "next", rows)
 
 
 def add_location(page: Page, investigation: Investigation) -> None:
@@ -226,9 +229,13 @@ def add_location(page: Page, investigation: Investigation) -> None:
         page.add_paragraph("The residuals were not searched for patterns.")
         return
     if not location.disagrees:
-        page.add_paragraph(
-            "No global test finds a disagreement between the model as it was and the fitted trials."
-        )
+        told = "No global test finds a disagreement between the model as it was and the fitted trials."
+        if investigation.verdict.kind not in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT):
+            told = (
+                "The residuals of the model as it was do not stand out by themselves, or cannot be judged by "
+                "their size: what is missing shows where effects are fitted, or in the missing force."
+            )
+        page.add_paragraph(told)
     else:
         significant = sum(cell.significant for cell in location.cells)
         page.add_paragraph(
@@ -244,10 +251,4 @@ def add_location(page: Page, investigation: Investigation) -> None:
         (test.name, number(test.statistic, 4), p_value_text(test.p_value), "yes" if test.rejected else "no")
         for test in location.tests
     ]
-    page.add_table(
-        Table(columns("test", numbers("statistic"), numbers("p"), "disagrees"), rows),
-        "Residuals of the model as it was on fitted trials, each against what noise would leave after the "
-        "fit; "
-        "Holm's rule at 1 % over the tests.",
-        title="Global tests",
-    )
+    add_table(page, "tests", rows)

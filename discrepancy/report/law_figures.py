@@ -1,4 +1,4 @@
-"""What law it is: frequency and damping over the amplitude, restoring force."""
+"""What law it is: frequency and damping over the amplitude."""
 
 from collections.abc import Sequence
 
@@ -6,16 +6,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
-from discrepancy.location.backbone import Backbone, RestoringForceSurface, backbones, restoring_force_surface
+from discrepancy.location.backbone import Backbone, backbones
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.report.kit import models, panels, plain_powers
 from discrepancy.report.motion_figures import mode_frequencies
-from reporting.figures import OBSERVED, REFERENCE, publication_style
+from reporting.figures import OBSERVED, publication_style
 
 FloatArray = NDArray[np.float64]
 
@@ -23,7 +22,6 @@ LEAST_POINTS = 4
 """Fewest measured points of a mode whose backbone is drawn."""
 LARGEST_ERROR = 0.25
 """Largest error of a damping ratio, relative to the median ratio, of a point that is drawn."""
-FORCE_BINS = 24
 MOST_MODES = 3
 """Modes that are fitted together in a window."""
 
@@ -185,97 +183,3 @@ def _range(axes: Axes, curves: Sequence[Backbone], name: str, scale: float) -> N
     drawn = axes.get_ylim()
     wide = max(float(high - low), 0.02 * abs(float(np.median(values))))
     axes.set_ylim(max(drawn[0], low - 1.2 * wide), min(drawn[1], high + 1.2 * wide))
-
-
-def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
-    """Draw what the restoring force of the first mode has beside its linear part.
-
-    Measured and predicted signals are filtered and evaluated alike. None where a record is too short or too
-    coarse, or where noise hides what there is to see.
-    """
-    items = _ringdowns(before)
-    frequencies = mode_frequencies(before if after is None else after)
-    if not items or not frequencies:
-        return None
-    channel = _clearest(items, frequencies[0])
-    number = max(
-        (n for n, item in enumerate(items) if channel in item.trial.channels),
-        key=lambda n: float(np.ptp(items[n].prediction[:, items[n].column(channel)])),
-    )
-    item = items[number]
-    column = item.column(channel)
-    values = np.where(item.used[:, column], item.trial.values[:, column], item.prediction[:, column])
-    shown = models(before, after)
-    signals = [values, *(_ringdowns(one.residuals)[number].prediction[:, column] for one in shown)]
-    others = _others(values, item.trial.interval, frequencies[0])
-    edge = round(1.0 / (frequencies[0] * item.trial.interval))  # where the filter has seen one side only
-    try:
-        measured, *predicted = (
-            restoring_force_surface(
-                item.trial.time[edge:-edge],
-                _first_mode(signal, item.trial.interval, frequencies[0], others)[edge:-edge],
-                frequencies[0],
-            )
-            for signal in signals
-        )
-    except (FitError, ValueError):
-        return None
-    rate, top = 2.0 * np.pi * frequencies[0], float(np.abs(measured.displacement).max())
-    line = np.linalg.lstsq(_line(measured), -measured.acceleration, rcond=None)[0]
-
-    def rest(surface: RestoringForceSurface, over: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-        left = 100.0 * (-surface.acceleration - _line(surface) @ line) / (rate**2 * top)
-        x, v = surface.displacement / top, surface.velocity / (rate * top)
-        along, other = (v, x) if over == "velocity" else (x, v)
-        near = np.abs(other) < 0.35 * np.hypot(x, v)
-        return _binned(along[near], left[near])
-
-    plain = True
-    with publication_style():
-        figure, (row,) = panels(1, 2, 2.5, 0.9, 0.17, left=0.09, wspace=0.26)
-        for axes, over, title in zip(
-            row, ("velocity", "displacement"), ("a  while passing through rest", "b  while turning back"),
-            strict=True,
-        ):  # fmt: skip
-            middles, means, errors = rest(measured, over)
-            axes.errorbar(
-                middles, means, errors, fmt="o", ms=2.8, color=OBSERVED, elinewidth=0.7, label="measured"
-            )
-            seen = float(np.nanstd(means)) if np.isfinite(means).any() else 0.0
-            hidden = float(np.nanmedian(errors)) if np.isfinite(errors).any() else 1.0
-            plain = plain and seen < 3.0 * hidden
-            for surface, one in zip(predicted, shown, strict=True):
-                middles, means, _ = rest(surface, over)
-                axes.plot(middles, means, one.dashes, color=one.colour, lw=1.2, label=one.label)
-            axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
-            axes.set_xlabel(f"{over} / largest")
-            axes.set_title(title, loc="left")
-        row[0].set_ylabel("force less linear part, %")
-        row[0].legend(loc="best")
-    return None if plain else (figure, f"{channel} in {item.trial.name}")
-
-
-def _line(surface: RestoringForceSurface) -> FloatArray:
-    """Return the columns (N, 3) of a linear force."""
-    return np.column_stack((surface.displacement, surface.velocity, np.ones_like(surface.velocity)))
-
-
-def _first_mode(signal: FloatArray, interval: float, frequency: float, others: Sequence[float]) -> FloatArray:
-    """Return the signal below the second mode: zero phase, so that no force is turned into another."""
-    if not others:
-        return signal
-    cut = float(np.sqrt(frequency * min(others)))
-    if cut >= 0.45 / interval:
-        return signal
-    return np.asarray(sosfiltfilt(butter(6, cut, fs=1.0 / interval, output="sos"), signal))
-
-
-def _binned(along: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    edges = np.linspace(-1.0, 1.0, FORCE_BINS + 1)
-    place = np.clip(np.digitize(along, edges) - 1, 0, FORCE_BINS - 1)
-    means, errors = np.full(FORCE_BINS, np.nan), np.full(FORCE_BINS, np.nan)
-    for n in range(FORCE_BINS):
-        inside = values[place == n]
-        if len(inside) >= 3:
-            means[n], errors[n] = inside.mean(), inside.std() / np.sqrt(len(inside))
-    return 0.5 * (edges[:-1] + edges[1:]), means, errors

@@ -6,9 +6,9 @@ from discrepancy.report.content import ReportFigure, ReportInput
 from discrepancy.report.findings import add_location, add_next, add_verdict
 from discrepancy.report.grounds import (
     add_data,
+    add_evidence,
     add_gates,
-    add_inclusion,
-    add_not_fitted,
+    add_not_compared,
     add_origin,
     add_parameters,
     add_proof,
@@ -50,7 +50,6 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
 
     page.add_section("Verdict")
     add_verdict(page, content, partial(show, "missing_force"))
-    show("shares")
     if verdict.kind is VerdictKind.DATA_ERROR:
         add_data(page, investigation)
         add_origin(page, origin)
@@ -62,12 +61,11 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
     add_location(page, investigation)
     show("residual_map", "residual_table", "time_line")
     page.add_section("What it looks like")
-    show("history", "backbone", "restoring_force", "spectrum", "load")
+    show("history", "backbone", "spectrum", "load")
     page.add_section("Why this verdict")
     add_gates(page, investigation)
-    show("evidence")
-    add_inclusion(page, investigation)
-    add_not_fitted(page, verdict)
+    add_evidence(page, verdict)
+    add_not_compared(page, verdict)
     add_parameters(page, investigation)
     if investigation.proof is not None:
         page.add_section("Proof on held-out trials")

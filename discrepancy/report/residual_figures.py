@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Channel, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.report.kit import Shown, draw_noise, models, name_cells, panels, scale_of, size_bar, titles
+from discrepancy.report.kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar, titles
 from fe.wing.design import WingDesign
 from reporting.figures import LEVELS, OBSERVED, publication_style
 
@@ -169,25 +169,20 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
             1, len(tables), height, 1.0 - 0.28 / height, below / height, left=0.11,
             right=0.60 if after is None else 0.885, wspace=0.06,
         )  # fmt: skip
+        few = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
         for number, (axes, (_, _, table), title) in enumerate(zip(row, tables, titles(shown), strict=True)):
-            axes.imshow(np.ma.masked_invalid(table), cmap=LEVELS, norm=norm, aspect="auto")
-            name_cells(axes, [""] * len(channels) if number else channels, trials, 40)
+            names = ([""] * len(channels) if number else channels, trials)
+            heat_map(axes, table, names, norm, 40, _cells(table) if few else None)
             axes.set_title(title, loc="left")
-            if len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS:
-                _write_cells(axes, table, norm)
         right = 0.62 if after is None else 0.905
         size_bar(figure, norm, (right, below / height, 0.016, 1.0 - (below + 0.28) / height))
     return figure
 
 
-def _write_cells(axes: Axes, table: FloatArray, norm: Normalize) -> None:
-    for (row, column), value in np.ndenumerate(table):
-        if np.isfinite(value):
-            text = f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
-            dark = float(norm(value)) < 0.6
-            axes.text(
-                column, row, text, ha="center", va="center", fontsize=6.0, color="white" if dark else "black"
-            )
+@np.vectorize
+def _cells(value: float) -> str:
+    """Return what a cell says of a size."""
+    return "" if np.isnan(value) else f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None:
@@ -220,8 +215,7 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
             axes.set_xlabel(label)
             axes.set_ylabel(f"residual, {unit}")
             axes.set_title(f"{'abcd'[number]}  {kind.value}, {quantity.value}", loc="left")
-            if number == 0:
-                axes.legend(loc="best", fontsize=6.8)
+        figure.legend(*cells[0][0].get_legend_handles_labels(), loc="upper right", ncols=3)
     return figure
 
 

@@ -4,19 +4,16 @@ from collections.abc import Sequence
 
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from discrepancy.report.kit import scale_of
+from discrepancy.report.kit import scale_of, size_bar
 from discrepancy.verdict import GapWindow, Moment
 from reporting.figures import LEVELS, OBSERVED, REFERENCE, new_figure, publication_style
 
 MOST_RECORDS = 12
 """Records that are drawn; those with the largest gaps go first."""
 LONGEST_NAME = 26
-_WIDTH = 6.0  # inches: narrower than other figures, so that its letters are larger on a small screen
 
 
 def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
@@ -30,27 +27,20 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     trials = [name for name in sizes if name in largest]
     norm = scale_of([window.size for window in windows])
     both = any(window.with_effect for window in windows)
-    height = 0.42 * len(trials) + 1.15
+    height = 0.34 * len(trials) + 0.9
     with publication_style():
-        figure = new_figure(height, _WIDTH)
+        figure = new_figure(height)
         figure.set_layout_engine("constrained")
         axes = figure.add_subplot()
         for row, name in enumerate(trials):
             own = [window for window in windows if window.trial == name]
             _draw_record(axes, row, own, norm, both=both)
-        axes.set_yticks(range(len(trials)), [_short(name) for name in trials], fontsize=9.0)
+        axes.set_yticks(range(len(trials)), [_short(name) for name in trials])
         axes.set_ylim(len(trials) - 0.4, -0.6)
         axes.tick_params(axis="y", length=0)
-        axes.tick_params(axis="x", labelsize=9.0)
         axes.spines["left"].set_visible(False)
-        axes.set_xlabel("time since the start of the trial, s", fontsize=9.0)
-        bar = figure.colorbar(ScalarMappable(norm, LEVELS), ax=axes, fraction=0.045, pad=0.02, aspect=14)
-        bar.set_label("rms / noise", fontsize=9.0)
-        top = float(norm.vmax or 1.0)
-        bar.ax.yaxis.set_major_locator(LogLocator(10.0, (1.0, 3.0) if top < 50.0 else (1.0,)))
-        bar.ax.yaxis.set_minor_locator(NullLocator())
-        bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        bar.outline.set_linewidth(0.5)
+        axes.set_xlabel("time since the start of the trial, s")
+        size_bar(figure, norm, axes)
     return figure
 
 

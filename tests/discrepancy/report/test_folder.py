@@ -48,7 +48,7 @@ def test_the_folder_of_a_named_effect(drag: Investigation, written: Path) -> Non
     residuals = read_residuals(folder / "residuals.nc")
     assert len(residuals.trials) == len(drag.campaign.trials)
     pictures = {path.name for path in (folder / "figures").iterdir()}
-    assert {"history.svg", "history.png", "evidence.svg", "backbone.svg", "separability.png"} <= pictures
+    assert {"history.svg", "history.png", "missing_force.svg", "backbone.svg", "separability.png"} <= pictures
     assert not list(folder.parent.glob(".*"))  # nothing half-written is left
 
 
