@@ -112,6 +112,9 @@ def _opening(investigation: Investigation) -> list[tuple[str, str]]:
             kind = "fitted" if share is force.fitted else "held-out"
             of = "its effect on predictions" if share.ahead else "it"
             items.append((share_text(share), f"of {of} is {force.law}, {kind} trials"))
+        elif force.ordered_by:
+            share_of = f"what orders it: {100.0 * max(force.orders.values()):.0f} % of its variance"
+            items.append((listing(force.ordered_by), share_of))
     elif verdict.explained is not None:  # at the scale of its share: χ²/dof counts uncertainty as expected
         before, after = residual_sizes(verdict.explained)
         told = f"noise deviations, rms on {verdict.explained.trials} trials, before and after"

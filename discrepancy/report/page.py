@@ -57,7 +57,8 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
     if verdict.next_experiments:
         page.add_section("Next experiment")
         add_next(page, investigation)
-    page.add_section("Where the gap is")
+    nothing = verdict.kind in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
+    page.add_section("What the model leaves" if nothing else "Where the gap is")
     add_location(page, investigation)
     show("residual_map", "residual_table", "time_line")
     page.add_section("What it looks like")
