@@ -1,20 +1,65 @@
-"""The figures of the report with their captions, as far as the data allow them."""
+"""What the report shows, and its figures with their captions, as far as the data allow them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from discrepancy.judgement.separability import CONFUSED
+from discrepancy.files.document import Origin
+from discrepancy.files.patch import PrimitiveInterval
+from discrepancy.judgement.separability import CONFUSED, Separability
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.report.content import ReportFigure, ReportInput
 from discrepancy.report.evidence_figures import confusion_figure, pit_figure, separability_figure
 from discrepancy.report.force_figure import missing_force_figure
-from discrepancy.report.law_figures import backbone_figure
-from discrepancy.report.motion_figures import history_figure, spectrum_figure, worst_record
-from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure
+from discrepancy.report.motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
+from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure, time_line_figure
 from discrepancy.report.text import WORDS, force_sentence, scored
-from discrepancy.report.time_line import time_line_figure
+from discrepancy.self_calibration import SelfCalibration
 from discrepancy.workflow import Investigation
+from fe.wing.design import WingDesign
 from reporting.figures import to_svg
 from reporting.words import listing
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """All that the report shows.
+
+    Attributes
+    ----------
+    investigation : Investigation
+        What came out.
+    origin : Origin
+        What it came from.
+    separability : Separability or None
+        What the campaign can decide.
+    self_calibration : SelfCalibration or None
+        Where it was asked for.
+    design : WingDesign or None
+        Of a wing, for the map.
+    intervals : sequence of sequence of PrimitiveInterval
+        Of the patch, by effect; empty without a patch.
+    fmu : str
+        Name of the patched FMU, or why there is none; empty if none is due.
+    """
+
+    investigation: Investigation
+    origin: Origin
+    separability: Separability | None = None
+    self_calibration: SelfCalibration | None = None
+    design: WingDesign | None = None
+    intervals: Sequence[Sequence[PrimitiveInterval]] = ()
+    fmu: str = ""
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """A figure with its words; `name` is that of its file."""
+
+    name: str
+    figure: Figure
+    title: str
+    caption: str
 
 
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:

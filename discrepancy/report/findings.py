@@ -5,33 +5,10 @@ from math import isfinite, isnan
 
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.judgement.when import when_sentence
-from discrepancy.report.content import ReportInput
+from discrepancy.report import text as words
+from discrepancy.report.figures import ReportInput
 from discrepancy.report.kit import add_table
 from discrepancy.report.sizes import definite_unit, size_sentence
-from discrepancy.report.text import (
-    NAMING,
-    WORDS,
-    added_label,
-    catalogue_of,
-    effects_text,
-    estimate_text,
-    formula,
-    headline,
-    meaning,
-    members_of,
-    number,
-    p_value_text,
-    percent,
-    probability_text,
-    remainders_sentence,
-    residual_sizes,
-    rests_on_force,
-    rounded,
-    scored,
-    share_text,
-    shares_sentence,
-    unit_text,
-)
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page
@@ -52,15 +29,15 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
     investigation = content.investigation
     verdict = investigation.verdict
     page.add_highlights(_opening(investigation))
-    page.add_notice(headline(verdict))
+    page.add_notice(words.headline(verdict))
     if opening := " ".join(filter(None, (_sizes(content), closing_sentence(investigation)))):
         page.add_paragraph(opening)
     if picture is not None:
         picture()
-    page.add_paragraph(meaning(verdict))
-    if shares := shares_sentence(verdict):
-        page.add_paragraph(f"{shares} {remainders_sentence(verdict)}".strip())
-    catalogue = catalogue_of(investigation)
+    page.add_paragraph(words.meaning(verdict))
+    if shares := words.shares_sentence(verdict):
+        page.add_paragraph(f"{shares} {words.remainders_sentence(verdict)}".strip())
+    catalogue = words.catalogue_of(investigation)
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
         names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
         page.add_paragraph(
@@ -70,11 +47,11 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
         entry = catalogue.get(effect.identifier)
         if entry is not None:
             page.add_paragraph(
-                f"{effect.name[0].upper()}{effect.name[1:]}: {formula(entry.equation)}. Its signature: "
-                f"{formula(entry.signature).rstrip('.')}. Source: {entry.reference.rstrip('.')}."
+                f"{effect.name[0].upper()}{effect.name[1:]}: {words.formula(entry.equation)}. Its signature: "
+                f"{words.formula(entry.signature).rstrip('.')}. Source: {entry.reference.rstrip('.')}."
             )
-    whose = WORDS["sizes"].get(verdict.kind, WORDS["sizes"]["other"])
-    if members := members_of(verdict):
+    whose = words.WORDS["sizes"].get(verdict.kind, words.WORDS["sizes"]["other"])
+    if members := words.members_of(verdict):
         rows = [
             (str(place) if row is own[0] else "", *row)
             for place, own in enumerate(map(_parameters, members.values()), start=1)
@@ -82,7 +59,7 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
         ]
         add_table(page, "members", rows, whose=whose)
     else:
-        name = "added" if verdict.kind in NAMING else "could_be_added"
+        name = "added" if verdict.kind in words.NAMING else "could_be_added"
         add_table(page, name, _parameters(verdict.effects), whose=whose)
     _add_primitives(page, content)
 
@@ -94,8 +71,8 @@ def _parameters(effects: tuple[NamedEffect, ...]) -> list[tuple[str, ...]]:
         head = (effect.name, effect.place or "\N{EN DASH}")
         own = (*effect.parameters, *effect.shape)
         for item in own:
-            what = formula(item.description or item.name.replace("_", " "))
-            rows.append((*head, what, *estimate_text(item), unit_text(item.unit)))
+            what = words.formula(item.description or item.name.replace("_", " "))
+            rows.append((*head, what, *words.estimate_text(item), words.unit_text(item.unit)))
         rows += [] if own else [(*head, "", "", "", "")]
     return rows
 
@@ -104,45 +81,44 @@ def _opening(investigation: Investigation) -> list[tuple[str, str]]:
     """Return in large print: the effect, its size, its share, its probability."""
     verdict, proof, force = investigation.verdict, investigation.proof, investigation.verdict.force
     what = _what(verdict)
-    items = [(what[:1].upper() + what[1:], WORDS["opening"].get(verdict.kind, verdict.kind.value))]
+    items = [(what[:1].upper() + what[1:], words.WORDS["opening"].get(verdict.kind, verdict.kind.value))]
     if force is not None:
-        items.append((f"{number(force.rms)} {force.unit}", f"missing at {force.port}, rms"))
+        items.append((f"{words.number(force.rms)} {force.unit}", f"missing at {force.port}, rms"))
         share = next((one for one in (force.held_out, force.fitted) if one is not None and one.tested), None)
         if share is not None:
             kind = "fitted" if share is force.fitted else "held-out"
             of = "its effect on predictions" if share.ahead else "it"
-            items.append((share_text(share), f"of {of} is {force.law}, {kind} trials"))
+            items.append((words.share_text(share), f"of {of} is {force.law}, {kind} trials"))
         elif force.ordered_by:
             share_of = f"what orders it: {100.0 * max(force.orders.values()):.0f} % of its variance"
             items.append((listing(force.ordered_by), share_of))
     elif verdict.explained is not None:  # at the scale of its share: χ²/dof counts uncertainty as expected
-        before, after = residual_sizes(verdict.explained)
+        before, after = words.residual_sizes(verdict.explained)
         told = f"noise deviations, rms on {verdict.explained.trials} trials, before and after"
         items.append((f"{before} → {after}", told))
     if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
-        items.append((probability_text(verdict.probability), "probability of the verdict"))
+        items.append((words.probability_text(verdict.probability), "probability of the verdict"))
     judged = [gate for gate in verdict.gates if gate.name not in ("shape", "held-out trials")]
     judged = [gate for gate in judged if isfinite(gate.statistic)]
     if proof is None and force is None and judged:  # of gates that compare a p-value, the one that decided
         gate = next((gate for gate in judged if gate.passed is False), judged[0])
-        told = f"p of the {gate.name}; a fit has at least {number(gate.limit)}"
-        items.append((number(gate.statistic), told))
+        told = f"p of the {gate.name}; a fit has at least {words.number(gate.limit)}"
+        items.append((words.number(gate.statistic), told))
     return items
 
 
 def _what(verdict: Verdict) -> str:
     """Return what is missing, in a few words."""
-    if members := members_of(verdict):
+    if members := words.members_of(verdict):
         return listing(members, "or")
-    words = {
+    without = {
         VerdictKind.NOTHING_MISSING: "nothing", VerdictKind.DATA_ERROR: "the data",
         VerdictKind.BELOW_LIMIT: "nothing that could be seen",
     }  # fmt: skip
-    kept = [
-        item for item in verdict.effects if verdict.kind in NAMING and not (item.shape and verdict.family)
-    ]
-    found = [effects_text(kept), f"an effect of the family {verdict.family}" if verdict.family else ""]
-    return words.get(verdict.kind) or listing(filter(None, found)) or "no name"
+    named = verdict.effects if verdict.kind in words.NAMING else ()
+    kept = [item for item in named if not (item.shape and verdict.family)]
+    found = [words.effects_text(kept), f"an effect of the family {verdict.family}" if verdict.family else ""]
+    return without.get(verdict.kind) or listing(filter(None, found)) or "no name"
 
 
 def _sizes(content: ReportInput) -> str:
@@ -152,35 +128,36 @@ def _sizes(content: ReportInput) -> str:
         effects = named_effects(found.problem, found.fit)
         if sentence := size_sentence(found, effects, content.intervals):
             return sentence
-    if found.verdict.kind not in NAMING:
+    if found.verdict.kind not in words.NAMING:
         return ""
     parts = []
     for effect in found.verdict.effects:
         for item in effect.parameters:
-            value, interval = estimate_text(item)
-            what = formula(item.description or item.name.replace("_", " "))
-            parts.append(f"{what} {value} {unit_text(item.unit)}".rstrip() + f" ({interval})")
+            value, interval = words.estimate_text(item)
+            what = words.formula(item.description or item.name.replace("_", " "))
+            parts.append(f"{what} {value} {words.unit_text(item.unit)}".rstrip() + f" ({interval})")
     return f"Its size: {'; '.join(parts)}; 90 % intervals in brackets." if parts else ""
 
 
 def closing_sentence(investigation: Investigation) -> str:
     """Return how much of the gap is closed and what is left; empty where nothing was added or scored."""
     verdict, proof = investigation.verdict, investigation.proof
-    added = "It" if verdict.kind in NAMING else "The best hypothesis, which is no name,"
-    if rests_on_force(verdict):
+    added = "It" if verdict.kind in words.NAMING else "The best hypothesis, which is no name,"
+    if words.rests_on_force(verdict):
         return ""
     if (share := verdict.explained) is not None:
         interval = f"{100.0 * share.low:.0f} to {100.0 * share.high:.0f} %"
         closed = f"{100.0 * share.value:.0f} % of the gap on {share.trials} trials ({interval})"
-        return f"{added} closes {closed} and leaves {number(share.left, 2)} noises."
-    if proof is None or not added_label(investigation):
+        return f"{added} closes {closed} and leaves {words.number(share.left, 2)} noises."
+    if proof is None or not words.added_label(investigation):
         return ""
-    before, after, where = scored(proof)
+    before, after, where = words.scored(proof)
     if not (isfinite(before.chi_square_per_dof) and isfinite(after.chi_square_per_dof)):
         return ""
-    course = f"{number(before.chi_square_per_dof)} before and {number(after.chi_square_per_dof)} after it"
+    sizes = [words.number(item.chi_square_per_dof) for item in (before, after)]
+    course = f"{sizes[0]} before and {sizes[1]} after it"
     if proof.gap_closed > 0.0:
-        closed = f"{percent(proof.gap_closed)} % of the gap on {where} trials"
+        closed = f"{words.percent(proof.gap_closed)} % of the gap on {where} trials"
         return f"{added} closes {closed}: χ²/dof is {course}, 1 for noise alone."
     return f"On {where} trials χ²/dof is {course}, 1 for noise alone."
 
@@ -194,17 +171,19 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
     for effect, intervals in zip(effects, content.intervals, strict=True):
         for item in intervals:
             primitive = effect.patch.primitives[item.primitive]
-            unit = definite_unit(item.unit, primitive, found.model, found.campaign) or unit_text(item.unit)
+            unit = definite_unit(item.unit, primitive, found.model, found.campaign)
             if item.parameter in AT_WHAT:
                 continue
             if isnan(item.low) or item.low == item.high:
                 interval, value = "fixed", f"{item.value:.4g}"
             else:
-                form = rounded(item.value, 0.5 * (item.high - item.low))
+                form = words.rounded(item.value, 0.5 * (item.high - item.low))
                 value, interval = form(item.value), f"{form(item.low)} to {form(item.high)}"
-            rows.append((item.parameter.replace("_", " "), value, interval, unit))
-    marked = "" if content.investigation.verdict.kind in NAMING else (
-        f" It is that of {added_label(content.investigation)}, which is not named."
+            rows.append(
+                (item.parameter.replace("_", " "), value, interval, unit or words.unit_text(item.unit))
+            )
+    marked = "" if content.investigation.verdict.kind in words.NAMING else (
+        f" It is that of {words.added_label(content.investigation)}, which is not named."
     )  # fmt: skip
     add_table(page, "change", rows, marked=marked, fmu=f" {content.fmu}" if content.fmu else "")
 
@@ -250,8 +229,9 @@ def add_location(page: Page, investigation: Investigation) -> None:
     findings = [item for item in location.disagreements if item.share >= LEAST_SHARE][:SHOWN_FINDINGS]
     for item in findings:
         page.add_paragraph(f"• {item.sentence}")
+    said = {True: "yes", False: "no"}
     rows = [
-        (test.name, number(test.statistic, 4), p_value_text(test.p_value), "yes" if test.rejected else "no")
+        (test.name, words.number(test.statistic, 4), words.p_value_text(test.p_value), said[test.rejected])
         for test in location.tests
     ]
     add_table(page, "tests", rows)

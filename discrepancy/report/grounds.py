@@ -6,20 +6,10 @@ from math import isfinite, isnan, nan
 from discrepancy.campaign.units import UNITS
 from discrepancy.files.document import Origin
 from discrepancy.judgement.conclusion import calibrated_parameters
+from discrepancy.report import text as words
 from discrepancy.report.check_tables import can_decide_rows, group_lines
-from discrepancy.report.content import ReportInput
+from discrepancy.report.figures import ReportInput
 from discrepancy.report.kit import add_table
-from discrepancy.report.text import (
-    NAMING,
-    added_label,
-    hypothesis_name,
-    number,
-    p_value_text,
-    percent,
-    probability_text,
-    rounded,
-    unit_text,
-)
 from discrepancy.self_calibration import Share, outcomes
 from discrepancy.verdict import Gate, Proof, Scores, Verdict
 from discrepancy.workflow import Investigation
@@ -46,11 +36,11 @@ def _compared(gate: Gate) -> tuple[str, str]:
     if isnan(gate.statistic):
         return "\N{EN DASH}", "\N{EN DASH}"
     if gate.name == "held-out trials":
-        return f"{number(gate.statistic)} deviations", f"at most {number(gate.limit)}"
+        return f"{words.number(gate.statistic)} deviations", f"at most {words.number(gate.limit)}"
     if gate.name == "shape":
-        return f"gain {number(gate.statistic)} nat", f"at most {number(gate.limit)} nat"
-    text = p_value_text(gate.statistic)
-    return f"p {text}" if text.startswith("<") else f"p = {text}", f"p at least {number(gate.limit)}"
+        return f"gain {words.number(gate.statistic)} nat", f"at most {words.number(gate.limit)} nat"
+    text = words.p_value_text(gate.statistic)
+    return f"p {text}" if text.startswith("<") else f"p = {text}", f"p at least {words.number(gate.limit)}"
 
 
 def add_evidence(page: Page, verdict: Verdict) -> None:
@@ -65,12 +55,11 @@ def add_evidence(page: Page, verdict: Verdict) -> None:
         if rank < SHOWN_HYPOTHESES or item is none:
             gain = nan if none is None else item.log_evidence - none.log_evidence
             told = "" if isnan(gain) else f"{gain:+,.1f}".replace("-", "\N{MINUS SIGN}")
-            rows.append(
-                (hypothesis_name(item), role if stands else "", probability_text(item.probability), told)
-            )
+            probability = words.probability_text(item.probability)
+            rows.append((words.hypothesis_name(item), role if stands else "", probability, told))
     inclusion = sorted(verdict.inclusion.items(), key=lambda row: -row[1])
     shown = [(name.replace("_", " "), p) for name, p in inclusion if p >= 1e-3][:6]
-    part = listing(f"{name} {probability_text(p)}" for name, p in shown)
+    part = listing(f"{name} {words.probability_text(p)}" for name, p in shown)
     takes_part = f" Probability that an effect takes part: {part}." if shown[1:] else ""
     add_table(page, "evidence", rows, takes_part=takes_part)
 
@@ -79,7 +68,7 @@ def add_not_compared(page: Page, verdict: Verdict) -> None:
     """Add what was not compared, by the reason."""
     by_reason: dict[str, list[str]] = {}
     for item in verdict.not_fitted:
-        gain = f" ({number(item.gain, 2)} nat)" if isfinite(item.gain) else ""
+        gain = f" ({words.number(item.gain, 2)} nat)" if isfinite(item.gain) else ""
         reason = item.reason.partition(":")[0] if gain else item.reason
         by_reason.setdefault(reason, []).append(item.identifier.replace("_", " ") + gain)
     rows = [(f"{reason[:1].upper()}{reason[1:]}", listing(names)) for reason, names in by_reason.items()]
@@ -100,31 +89,31 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
     stated = zip(layout.parameter_mean.tolist(), layout.parameter_scale.tolist(), strict=True)
     for prior, *found in zip(stated, *(calibrated_parameters(problem, one) for one in fits), strict=True):
         cells = [_beside(*prior), *(_beside(item.mean, item.deviation) for item in found)]
-        rows.append((found[0].name.replace("_", " "), unit_text(found[0].unit), *cells))
+        rows.append((found[0].name.replace("_", " "), words.unit_text(found[0].unit), *cells))
     return rows
 
 
 def _beside(value: float, deviation: float) -> str:
-    show = rounded(value, NINETY * deviation)
+    show = words.rounded(value, NINETY * deviation)
     return f"{show(value)} ± {show(NINETY * deviation)}" if deviation > 0.0 else f"{value:.6g}, exact"
 
 
 def add_parameters(page: Page, investigation: Investigation) -> None:
     """Add the table, where the model has calibrated parameters."""
     rows = parameter_rows(investigation)
-    added = added_label(investigation)
+    added = words.added_label(investigation)
     told = f"without and with {added}" if added else "without any effect"
     add_table(page, "parameters", rows, added=told)
 
 
 _SCORES: dict[str, Callable[[Scores], str]] = {
-    "χ²/dof (1 is noise)": lambda s: number(s.chi_square_per_dof, 4),
-    "its deviation if the model is right": lambda s: number(s.chi_square_deviation, 2),
-    "mean log score, nat per sample (best −1.42)": lambda s: number(s.log_score, 4),
+    "χ²/dof (1 is noise)": lambda s: words.number(s.chi_square_per_dof, 4),
+    "its deviation if the model is right": lambda s: words.number(s.chi_square_deviation, 2),
+    "mean log score, nat per sample (best −1.42)": lambda s: words.number(s.log_score, 4),
     "coverage of 50 % intervals, %": lambda s: f"{100.0 * s.coverage_50:.1f}",
     "coverage of 90 % intervals, %": lambda s: f"{100.0 * s.coverage_90:.1f}",
-    "whiteness, p": lambda s: p_value_text(s.whiteness),
-    "flat histogram of transforms, p": lambda s: p_value_text(s.pit_p_value),
+    "whiteness, p": lambda s: words.p_value_text(s.whiteness),
+    "flat histogram of transforms, p": lambda s: words.p_value_text(s.pit_p_value),
     "samples": lambda s: str(s.sample_count),
 }
 """Rows of the table before and after."""
@@ -132,9 +121,9 @@ _SCORES: dict[str, Callable[[Scores], str]] = {
 
 def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
     """Add scores before and after."""
-    if investigation.verdict.kind not in NAMING:
+    if investigation.verdict.kind not in words.NAMING:
         page.add_notice(
-            f'The model "with the effect" has {added_label(investigation)} here, which is not named: '
+            f'The model "with the effect" has {words.added_label(investigation)} here, which is not named: '
             "the figures "
             "say how well it does, not that it is there."
         )
@@ -150,15 +139,15 @@ def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
     channels = {} if before is None else before.channels
     for name in dict.fromkeys(name for item in scores.values() for name in item.rms):
         factor, unit = UNITS[channels[name].quantity].drawn if name in channels else (1.0, "")
-        sizes = (number(factor * item.rms.get(name, nan)) for item in scores.values())
+        sizes = (words.number(factor * item.rms.get(name, nan)) for item in scores.values())
         rows.append((f"rms of {name}, {unit}", *sizes))
     gain = "Nothing is held out, so that nothing is proved." if proof.held_out_after is None else (
-        f"Gain in log score on held-out trials {number(proof.log_score_gain, 4)} "
-        f"± {number(proof.log_score_gain_error, 2)} nat per sample. "
+        f"Gain in log score on held-out trials {words.number(proof.log_score_gain, 4)} "
+        f"± {words.number(proof.log_score_gain_error, 2)} nat per sample. "
     )  # fmt: skip
-    closed = f"Gap closed: {percent(proof.gap_closed)} %." if isfinite(proof.gap_closed) else proof.gap_reason
-    if investigation.verdict.explained is not None:
-        closed = proof.gap_reason  # the share of the verdict is that of all channels in units of their noise
+    closed = proof.gap_reason  # the share of a verdict that has one is of other units
+    if isfinite(proof.gap_closed) and investigation.verdict.explained is None:
+        closed = f"Gap closed: {words.percent(proof.gap_closed)} %."
     trials = f" Held out: {', '.join(held)}; only their own releases and zeros were adapted." if held else ""
     add_table(page, "proof", rows, *scores, gain=gain, closed=closed, trials=trials)
 

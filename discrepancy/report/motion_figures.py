@@ -1,21 +1,32 @@
-"""Motion before and after: time histories and spectra of residuals."""
+"""Motion before and after: histories, spectra, and frequency and damping over the amplitude."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import welch
 
+from discrepancy.campaign.records import TrialKind
 from discrepancy.campaign.units import UNITS
+from discrepancy.errors import FitError
+from discrepancy.location.backbone import Backbone, backbones
 from discrepancy.location.dependence import predicted_frequencies
-from discrepancy.location.residuals import ResidualSet
-from discrepancy.report.kit import draw_noise, models, panels
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.report.kit import draw_noise, models, panels, plain_powers
 from discrepancy.report.residual_figures import size
 from reporting.figures import OBSERVED, REFERENCE, TRUTH, new_figure, publication_style
 
 FloatArray = NDArray[np.float64]
 
+LEAST_POINTS = 4
+"""Fewest measured points of a mode whose backbone is drawn."""
+LARGEST_ERROR = 0.25
+"""Largest error of a damping ratio, relative to the median ratio, of a point that is drawn."""
+MOST_MODES = 3
+"""Modes that are fitted together in a window."""
 COMPARABLE = 6.0
 """Ratio of residuals before and after up to which they are drawn at one scale."""
 
@@ -145,3 +156,165 @@ def mode_frequencies(residuals: ResidualSet) -> tuple[float, ...]:
     """Return the frequencies [Hz] at which predictions ring, lowest first."""
     items = [item for item in residuals.trials if item.trial.is_dynamic]
     return predicted_frequencies(items) if items else ()
+
+
+# ---------------------------------------------------------------- backbones
+
+
+def _ringdowns(residuals: ResidualSet) -> list[FittedTrial]:
+    return [item for item in residuals.trials if item.trial.kind is TrialKind.RINGDOWN]
+
+
+def _clearest(items: Sequence[FittedTrial], frequency: float) -> str:
+    """Return the channel that shows the first mode best: clear of noise, and by itself."""
+    clear: dict[str, float] = {}
+    pure: dict[str, float] = {}
+    for item in items:
+        at = np.fft.rfftfreq(len(item.trial.time), item.trial.interval)
+        near = (at > frequency / 1.4) & (at < frequency * 1.4)
+        power = np.abs(np.fft.rfft(item.prediction - item.prediction.mean(axis=0), axis=0)) ** 2
+        for column, name in enumerate(item.trial.channels):
+            total = float(power[1:, column].sum())
+            first = float(power[near, column].sum())
+            ratio = float(np.sqrt(first) / item.noise_deviation[column])
+            clear[name] = max(clear.get(name, 0.0), ratio)
+            pure[name] = min(pure.get(name, 1.0), first / total if total > 0.0 else 0.0)
+    # Among those that other modes disturb little, the clearest.
+    limit = 3.0 * min(1.0 - share for share in pure.values()) + 0.02
+    return max((name for name in clear if 1.0 - pure[name] <= limit), key=lambda name: clear[name])
+
+
+def _others(values: FloatArray, interval: float, frequency: float) -> list[float]:
+    """Return the frequencies of peaks above a first mode, down to a millionth of its power."""
+    series = (values - values.mean()) * np.hanning(2 * len(values))[len(values) :]
+    power = np.abs(np.fft.rfft(series)) ** 2
+    at = np.fft.rfftfreq(len(values), interval)
+    found = []
+    for number in np.flatnonzero((at > 1.6 * frequency) & (power > 1e-6 * power.max())):
+        near = (at > at[number] / 1.25) & (at < at[number] * 1.25)
+        if power[number] >= power[near].max() and power[number] > 10.0 * np.median(power[near]):
+            found.append(float(at[number]))
+    return found
+
+
+def _all_frequencies(
+    items: Sequence[FittedTrial], channel: str, frequencies: Sequence[float]
+) -> tuple[float, ...]:
+    """Return the first frequency and the lowest that a channel's records show above it.
+
+    Every mode that rings must be fitted along, or it scatters the first one.
+    """
+    found = [list(frequencies[1:])]
+    for item in items:
+        if channel in item.trial.channels:
+            column = item.column(channel)
+            values = np.where(item.used[:, column], item.trial.values[:, column], item.prediction[:, column])
+            found.append(_others(values, item.trial.interval, frequencies[0]))
+    most = max(found, key=len)
+    return (frequencies[0], *sorted(most)[: MOST_MODES - 1])
+
+
+def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
+    """Draw frequency and damping ratio of the ring-downs over the amplitude, and name the channel.
+
+    None where no record is long enough or no mode rings long enough.
+    """
+    items = _ringdowns(before)
+    frequencies = mode_frequencies(before if after is None else after)
+    if not items or not frequencies:
+        return None
+    channel = _clearest(items, frequencies[0])
+    frequencies = _all_frequencies(items, channel, frequencies)
+    measured = _backbones(items, channel, frequencies, None)
+    curves = [
+        (_backbones(_ringdowns(item.residuals), channel, frequencies, "prediction"), item)
+        for item in models(before, after)
+    ]
+    modes = [n for n in sorted(measured) if sum(len(c.time) for c in measured[n]) >= LEAST_POINTS][:2]
+    if not modes:
+        return None
+    factor, unit = UNITS[before.channels[channel].quantity].drawn
+    with publication_style():
+        figure, cells = panels(
+            len(modes), 2, 2.3 * len(modes) + 0.3, 1.0 - 0.22 / (2.3 * len(modes)), 0.19 / len(modes) + 0.02,
+            left=0.09, hspace=0.4, wspace=0.26,
+        )  # fmt: skip
+        for row, mode in enumerate(modes):
+            for place, (name, label, scale) in enumerate(
+                (("frequency", "frequency, Hz", 1.0), ("damping_ratio", "damping ratio, %", 100.0))
+            ):
+                axes = cells[row][place]
+                for found, shown in curves:
+                    for number, curve in enumerate(found.get(mode, [])):
+                        axes.plot(
+                            factor * curve.amplitude, scale * getattr(curve, name), shown.dashes,
+                            color=shown.colour, lw=1.1, alpha=0.8,
+                            label="_nolegend_" if number else shown.label,
+                        )  # fmt: skip
+                _draw_points(axes, measured[mode], name, factor, scale)
+                axes.set_xscale("log")
+                plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
+                axes.set_ylabel(label)
+                axes.set_title(f"{'abcd'[2 * row + place]}  mode {mode}", loc="left")
+                axes.set_xlabel(f"amplitude of {channel}, {unit}")
+                _range(axes, measured[mode], name, scale)
+                if row == 0 and place == 1:
+                    axes.legend(loc="best")
+    return figure, channel
+
+
+def _backbones(
+    items: Sequence[FittedTrial], channel: str, frequencies: Sequence[float], source: str | None
+) -> dict[int, list[Backbone]]:
+    found: dict[int, list[Backbone]] = {}
+    for item in items:
+        if channel not in item.trial.channels:
+            continue
+        column = item.column(channel)
+        noise = float(item.noise_deviation[column])
+        values = item.prediction[:, column] if source else np.where(
+            item.used[:, column], item.trial.values[:, column], item.prediction[:, column]
+        )  # fmt: skip
+        try:
+            curves = backbones(item.trial.time, values, list(frequencies), noise_deviation=noise)
+        except FitError:
+            continue
+        for curve in curves:
+            clear = _clear(curve)
+            if clear is not None:
+                found.setdefault(curve.mode, []).append(clear)
+    return found
+
+
+def _clear(curve: Backbone) -> Backbone | None:
+    """Return the points of a curve whose errors leave something to be seen."""
+    if not curve.time.size:
+        return None
+    limit = LARGEST_ERROR * max(float(np.median(np.abs(curve.damping_ratio))), 1e-4)
+    keep = curve.damping_ratio_error < limit
+    if not keep.any():
+        return None
+    fields = (
+        "time", "amplitude", "amplitude_error", "frequency", "frequency_error", "damping_ratio",
+        "damping_ratio_error",
+    )  # fmt: skip
+    return Backbone(curve.mode, *(getattr(curve, name)[keep] for name in fields))
+
+
+def _draw_points(axes: Axes, curves: Sequence[Backbone], name: str, factor: float, scale: float) -> None:
+    label = "measured, ± 1 standard error"
+    for curve in curves:
+        axes.errorbar(
+            factor * curve.amplitude, scale * getattr(curve, name), scale * getattr(curve, f"{name}_error"),
+            fmt="o", ms=2.6, color=OBSERVED, elinewidth=0.6, lw=0.0, alpha=0.85, label=label, zorder=3,
+        )  # fmt: skip
+        label = "_nolegend_"
+
+
+def _range(axes: Axes, curves: Sequence[Backbone], name: str, scale: float) -> None:
+    """Show what was measured and its surroundings, whatever a wrong model does."""
+    values = scale * np.concatenate([getattr(curve, name) for curve in curves])
+    low, high = np.quantile(values, (0.02, 0.98))
+    drawn = axes.get_ylim()
+    wide = max(float(high - low), 0.02 * abs(float(np.median(values))))
+    axes.set_ylim(max(drawn[0], low - 1.2 * wide), min(drawn[1], high + 1.2 * wide))

@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from discrepancy.report.content import ReportFigure, ReportInput
+from discrepancy.report.figures import ReportFigure, ReportInput
 from discrepancy.report.findings import add_location, add_next, add_verdict
 from discrepancy.report.grounds import (
     add_data,

@@ -14,8 +14,7 @@ from discrepancy.files.patch import read_patch
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_verdict
 from discrepancy.judgement.separability import Separability
-from discrepancy.report.content import ReportInput
-from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.figures import ReportInput, draw, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder

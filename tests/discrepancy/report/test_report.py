@@ -19,8 +19,7 @@ from discrepancy.report.check_tables import (
     rows_of,
     untested_lines,
 )
-from discrepancy.report.content import ReportInput
-from discrepancy.report.figures import report_figures
+from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.findings import add_verdict, closing_sentence
 from discrepancy.report.grounds import add_gates, parameter_rows
 from discrepancy.report.page import render_report
