@@ -8,7 +8,7 @@ from discrepancy.judgement.when import when_sentence
 from discrepancy.report import text as words
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.kit import add_table
-from discrepancy.report.sizes import definite_unit, size_sentence
+from discrepancy.report.sizes import size_sentence
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page
@@ -17,11 +17,6 @@ from reporting.words import counted, listing
 LEAST_SHARE = 0.05
 """Findings in words that explain less of the excess variance are left to the file."""
 SHOWN_FINDINGS = 8
-AT_WHAT = (
-    "velocity_exponent", "displacement_exponent", "reference_velocity", "reference_displacement",
-    "element_count",
-)  # fmt: skip
-"""Numbers of a primitive that say at what another one holds."""
 
 
 def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | None = None) -> None:
@@ -50,18 +45,20 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
                 f"{effect.name[0].upper()}{effect.name[1:]}: {words.formula(entry.equation)}. Its signature: "
                 f"{words.formula(entry.signature).rstrip('.')}. Source: {entry.reference.rstrip('.')}."
             )
-    whose = words.WORDS["sizes"].get(verdict.kind, words.WORDS["sizes"]["other"])
+    told = {"whose": words.WORDS["sizes"].get(verdict.kind, words.WORDS["sizes"]["other"]), "patch": ""}
+    if content.intervals:
+        of = "" if verdict.kind in words.NAMING else f" of {words.added_label(investigation)}"
+        told["patch"] = f" patch.json holds the change{of} in SI units. {content.fmu}"
     if members := words.members_of(verdict):
         rows = [
             (str(place) if row is own[0] else "", *row)
             for place, own in enumerate(map(_parameters, members.values()), start=1)
             for row in own
         ]
-        add_table(page, "members", rows, whose=whose)
+        add_table(page, "members", rows, **told)
     else:
         name = "added" if verdict.kind in words.NAMING else "could_be_added"
-        add_table(page, name, _parameters(verdict.effects), whose=whose)
-    _add_primitives(page, content)
+        add_table(page, name, _parameters(verdict.effects), **told)
 
 
 def _parameters(effects: tuple[NamedEffect, ...]) -> list[tuple[str, ...]]:
@@ -162,39 +159,9 @@ def closing_sentence(investigation: Investigation) -> str:
     return f"On {where} trials χ²/dof is {course}, 1 for noise alone."
 
 
-def _add_primitives(page: Page, content: ReportInput) -> None:
-    rows = []
-    found = content.investigation
-    if not content.intervals or found.problem is None or found.fit is None:
-        return
-    effects = named_effects(found.problem, found.fit)
-    for effect, intervals in zip(effects, content.intervals, strict=True):
-        for item in intervals:
-            primitive = effect.patch.primitives[item.primitive]
-            unit = definite_unit(item.unit, primitive, found.model, found.campaign)
-            if item.parameter in AT_WHAT:
-                continue
-            if isnan(item.low) or item.low == item.high:
-                interval, value = "fixed", f"{item.value:.4g}"
-            else:
-                form = words.rounded(item.value, 0.5 * (item.high - item.low))
-                value, interval = form(item.value), f"{form(item.low)} to {form(item.high)}"
-            rows.append(
-                (item.parameter.replace("_", " "), value, interval, unit or words.unit_text(item.unit))
-            )
-    marked = "" if content.investigation.verdict.kind in words.NAMING else (
-        f" It is that of {words.added_label(content.investigation)}, which is not named."
-    )  # fmt: skip
-    add_table(page, "change", rows, marked=marked, fmu=f" {content.fmu}" if content.fmu else "")
-
-
 def add_next(page: Page, investigation: Investigation) -> None:
     """Add the proposed experiments."""
-    page.add_paragraph(
-        "What would decide most between the hypotheses that are still open, for its cost. Information is "
-        "the mutual "
-        "information of hypothesis and data, by simulation; ln 2 = 0.69 nat decides between two equals."
-    )
+    page.add_paragraph(words.SAID["next"])
     if sentence := when_sentence(investigation.verdict.windows):
         page.add_paragraph(sentence)
     rows = [
@@ -208,24 +175,14 @@ def add_location(page: Page, investigation: Investigation) -> None:
     """Add where the model as it was disagrees."""
     location = investigation.location
     if location is None:
-        page.add_paragraph("The residuals were not searched for patterns.")
+        page.add_paragraph(words.SAID["not_searched"])
         return
-    if not location.disagrees:
-        told = "No global test finds a disagreement between the model as it was and the fitted trials."
-        if investigation.verdict.kind not in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT):
-            told = (
-                "The residuals of the model as it was do not stand out by themselves, or cannot be judged by "
-                "their size: what is missing shows where effects are fitted, or in the missing force."
-            )
-        page.add_paragraph(told)
-    else:
-        significant = sum(cell.significant for cell in location.cells)
-        page.add_paragraph(
-            f"The model as it was disagrees with the fitted trials; {significant} of "
-            f"{counted(len(location.cells), 'cell')} of the map (channel, trial, and bin of time, amplitude, "
-            f"frequency or load) {'is a discovery' if significant == 1 else 'are discoveries'} at a false "
-            "discovery rate of 5 %."
-        )
+    nothing = investigation.verdict.kind in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
+    significant = sum(cell.significant for cell in location.cells)
+    are = "is a discovery" if significant == 1 else "are discoveries"
+    told = "disagrees" if location.disagrees else "agrees" if nothing else "hidden"
+    cells = counted(len(location.cells), "cell")
+    page.add_paragraph(words.SAID[told].format(significant=significant, cells=cells, are=are))
     findings = [item for item in location.disagreements if item.share >= LEAST_SHARE][:SHOWN_FINDINGS]
     for item in findings:
         page.add_paragraph(f"• {item.sentence}")

@@ -8,14 +8,7 @@ from discrepancy.missing_force.force import MissingForce
 from discrepancy.report.kit import panels
 from discrepancy.report.text import motion_of
 from discrepancy.verdict import ForceAtPort
-from reporting.figures import (
-    BAND_OPACITY,
-    OBSERVED,
-    PREDICTION,
-    REFERENCE,
-    panel_label,
-    publication_style,
-)
+from reporting.figures import BAND_OPACITY, OBSERVED, PREDICTION, REFERENCE, panel_label, publication_style
 
 MOST_DOTS = 3000
 """Dots of a panel; of longer records some are left out evenly."""

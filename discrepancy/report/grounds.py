@@ -122,11 +122,8 @@ _SCORES: dict[str, Callable[[Scores], str]] = {
 def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
     """Add scores before and after."""
     if investigation.verdict.kind not in words.NAMING:
-        page.add_notice(
-            f'The model "with the effect" has {words.added_label(investigation)} here, which is not named: '
-            "the figures "
-            "say how well it does, not that it is there."
-        )
+        label = words.added_label(investigation)
+        page.add_notice(words.SAID["not_named"].format(label=label))
     page.add_paragraph(proof.remaining)
     before = investigation.before
     held = [] if before is None else [item.trial.name for item in before.trials if item.trial.held_out]

@@ -27,8 +27,6 @@ LARGEST_ERROR = 0.25
 """Largest error of a damping ratio, relative to the median ratio, of a point that is drawn."""
 MOST_MODES = 3
 """Modes that are fitted together in a window."""
-COMPARABLE = 6.0
-"""Ratio of residuals before and after up to which they are drawn at one scale."""
 
 
 @dataclass(frozen=True)
@@ -74,22 +72,15 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
         axes.set_title(f"a  {worst.channel} in {item.trial.name}", loc="left")
         axes.legend(ncol=3, loc="upper right")
         axes.margins(x=0.01)
-        sizes = [size(one.residuals.trials[worst.trial], column) for one in shown]
-        alike = sizes[0] < COMPARABLE * sizes[-1]
         for number, ((panel,), one) in enumerate(zip(below, shown, strict=True)):
             each = one.residuals.trials[worst.trial]
             panel.sharex(axes)
             draw_noise(panel, factor * float(each.noise_deviation[column]), 0.3)
             panel.plot(time[used], factor * each.residual[used, column], lw=0.6, color=one.colour)
             panel.set_ylabel(f"residual, {unit}")
-            own = " (own scale)" if number and not alike else ""
-            panel.set_title(f"{'bc'[number]}  residual, {one.label}{own}", loc="left")
+            panel.set_title(f"{'bc'[number]}  residual, {one.label}", loc="left")
             panel.margins(x=0.01)
         below[0][0].legend(loc="upper right")
-        if alike:
-            limits = [limit for (panel,) in below for limit in panel.get_ylim()]
-            for (panel,) in below:
-                panel.set_ylim(min(limits), max(limits))
         figure.axes[-1].set_xlabel("time, s")
         for above in figure.axes[:-1]:
             above.tick_params(labelbottom=False)
@@ -165,66 +156,17 @@ def _ringdowns(residuals: ResidualSet) -> list[FittedTrial]:
     return [item for item in residuals.trials if item.trial.kind is TrialKind.RINGDOWN]
 
 
-def _clearest(items: Sequence[FittedTrial], frequency: float) -> str:
-    """Return the channel that shows the first mode best: clear of noise, and by itself."""
-    clear: dict[str, float] = {}
-    pure: dict[str, float] = {}
-    for item in items:
-        at = np.fft.rfftfreq(len(item.trial.time), item.trial.interval)
-        near = (at > frequency / 1.4) & (at < frequency * 1.4)
-        power = np.abs(np.fft.rfft(item.prediction - item.prediction.mean(axis=0), axis=0)) ** 2
-        for column, name in enumerate(item.trial.channels):
-            total = float(power[1:, column].sum())
-            first = float(power[near, column].sum())
-            ratio = float(np.sqrt(first) / item.noise_deviation[column])
-            clear[name] = max(clear.get(name, 0.0), ratio)
-            pure[name] = min(pure.get(name, 1.0), first / total if total > 0.0 else 0.0)
-    # Among those that other modes disturb little, the clearest.
-    limit = 3.0 * min(1.0 - share for share in pure.values()) + 0.02
-    return max((name for name in clear if 1.0 - pure[name] <= limit), key=lambda name: clear[name])
-
-
-def _others(values: FloatArray, interval: float, frequency: float) -> list[float]:
-    """Return the frequencies of peaks above a first mode, down to a millionth of its power."""
-    series = (values - values.mean()) * np.hanning(2 * len(values))[len(values) :]
-    power = np.abs(np.fft.rfft(series)) ** 2
-    at = np.fft.rfftfreq(len(values), interval)
-    found = []
-    for number in np.flatnonzero((at > 1.6 * frequency) & (power > 1e-6 * power.max())):
-        near = (at > at[number] / 1.25) & (at < at[number] * 1.25)
-        if power[number] >= power[near].max() and power[number] > 10.0 * np.median(power[near]):
-            found.append(float(at[number]))
-    return found
-
-
-def _all_frequencies(
-    items: Sequence[FittedTrial], channel: str, frequencies: Sequence[float]
-) -> tuple[float, ...]:
-    """Return the first frequency and the lowest that a channel's records show above it.
-
-    Every mode that rings must be fitted along, or it scatters the first one.
-    """
-    found = [list(frequencies[1:])]
-    for item in items:
-        if channel in item.trial.channels:
-            column = item.column(channel)
-            values = np.where(item.used[:, column], item.trial.values[:, column], item.prediction[:, column])
-            found.append(_others(values, item.trial.interval, frequencies[0]))
-    most = max(found, key=len)
-    return (frequencies[0], *sorted(most)[: MOST_MODES - 1])
-
-
 def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
     """Draw frequency and damping ratio of the ring-downs over the amplitude, and name the channel.
 
     None where no record is long enough or no mode rings long enough.
     """
     items = _ringdowns(before)
-    frequencies = mode_frequencies(before if after is None else after)
-    if not items or not frequencies:
+    frequencies = mode_frequencies(before if after is None else after)[:MOST_MODES]
+    worst = worst_record(ResidualSet(before.channels, tuple(items)))
+    if worst is None or not frequencies:
         return None
-    channel = _clearest(items, frequencies[0])
-    frequencies = _all_frequencies(items, channel, frequencies)
+    channel = worst.channel
     measured = _backbones(items, channel, frequencies, None)
     curves = [
         (_backbones(_ringdowns(item.residuals), channel, frequencies, "prediction"), item)

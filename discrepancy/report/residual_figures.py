@@ -29,25 +29,31 @@ MOST_CELLS = 12
 _STRAIN = re.compile(r"strain\[(\d+)\]")
 
 
+def _squares(item: FittedTrial, column: int) -> NDArray[np.float64]:
+    """Return the sum of squared residuals of a channel over the noise, and what noise would leave (2,)."""
+    used = item.used[:, column]
+    left = np.sum(item.standardised[used, column] ** 2)
+    return np.array([left, item.expected_variance[used, column].sum()])
+
+
+def _rms(squares: NDArray[np.float64]) -> float:
+    """Return a size over what noise would leave; nan where the fit has absorbed all that there was."""
+    left, expected = squares
+    return float(np.sqrt(left / expected)) if expected >= 0.5 else float("nan")
+
+
 def size(item: FittedTrial, column: int) -> float:
     """Return the rms residual of a channel in a trial over what noise would leave; nan without samples."""
-    used = item.used[:, column]
-    expected = float(item.expected_variance[used, column].sum())
-    if expected < 0.5:  # the fit has absorbed all that there was
-        return float("nan")
-    return float(np.sqrt(np.sum(item.standardised[used, column] ** 2) / expected))
+    return _rms(_squares(item, column))
 
 
 def size_by_channel(residuals: ResidualSet) -> dict[str, float]:
     """Return the rms residual of each channel over what noise would leave, all trials together."""
-    squares: dict[str, list[float]] = {}
+    sums: dict[str, NDArray[np.float64]] = {}
     for item in residuals.trials:
         for column, name in enumerate(item.trial.channels):
-            used = item.used[:, column]
-            row = squares.setdefault(name, [0.0, 0.0])
-            row[0] += float(np.sum(item.standardised[used, column] ** 2))
-            row[1] += float(item.expected_variance[used, column].sum())
-    return {name: float(np.sqrt(s / e)) for name, (s, e) in squares.items() if e > 0.5}
+            sums[name] = sums.get(name, 0.0) + _squares(item, column)
+    return {name: size for name, squares in sums.items() if np.isfinite(size := _rms(squares))}
 
 
 def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
@@ -133,13 +139,9 @@ def _draw_planform(axes: Axes, design: WingDesign) -> None:
 
 
 def _draw_gauges(
-    axes: Axes,
-    channels: Mapping[str, Channel],
-    places: dict[str, tuple[float, float]],
-    sizes: dict[str, float],
-    norm: Normalize,
-    design: WingDesign,
-) -> None:
+    axes: Axes, channels: Mapping[str, Channel], places: dict[str, tuple[float, float]],
+    sizes: dict[str, float], norm: Normalize, design: WingDesign,
+) -> None:  # fmt: skip
     form = design.planform
     for name, (station, fraction) in places.items():
         if name not in sizes:
@@ -151,14 +153,9 @@ def _draw_gauges(
             edgecolors="#333333", linewidths=0.6, zorder=3,
         )  # fmt: skip
         axes.annotate(
-            name,
-            (station, depth),
-            (0.0, -6.5),
-            textcoords="offset points",
-            ha="center",
-            va="top",
+            name, (station, depth), (0.0, -6.5), textcoords="offset points", ha="center", va="top",
             fontsize=6.5,
-        )
+        )  # fmt: skip
 
 
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:

@@ -26,6 +26,9 @@ from reporting.words import counted, listing
 WORDS: dict[str, Any] = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 """What each kind of verdict means, also where the absolute fit could not be judged, and words of figures."""
 
+SAID: dict[str, str] = WORDS["said"]
+"""Paragraphs and remarks."""
+
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
 """Verdicts that say what is missing, if not all of it."""
 

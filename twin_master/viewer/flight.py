@@ -258,11 +258,7 @@ class Flight:
         model, plan = self.knowledge.model, self.knowledge.plan
         seen = self.seen(turn, turn + 1)[0]
         coming = predict(
-            model,
-            seen.filtered,
-            seen.control_index,
-            plan.policy,
-            self.scenario.mission.prediction_steps,
+            model, seen.filtered, seen.control_index, plan.policy, self.scenario.mission.prediction_steps
         )
         found = self._belief(coming.joint, None, coming.control_probability)
         if self._expectation is None:

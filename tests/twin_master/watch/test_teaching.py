@@ -16,8 +16,9 @@ import pytest
 from typer.testing import CliRunner
 
 from discrepancy.catalogue.library import library
-from discrepancy.models.wing import WingModel
-from discrepancy.sources.examples import example_campaign, plan_of
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerStiffness, SensorGain
@@ -127,14 +128,16 @@ def seen(watch: Watch) -> SeenFlight:
 def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(
     base: Watch, recorded: Path, tmp_path: Path
 ) -> None:
-    """Releases of the wing on the ground show a cubic spring, and its patch is believed in flight."""
-    model, effects = WingModel.shipped(), [
-        item for item in library() if item.identifier in ("cubic_stiffness", "coulomb_friction")
-    ]  # fmt: skip
-    hidden = ModelPatch((PowerStiffness("tip", 8.0, 3.0, 0, 0.1),))
-    campaign = example_campaign(model, "ringdown", 3, replace(plan_of(model), duration=1.0), hidden)
-    found = investigate(campaign, model, effects)
-    assert found.verdict.force is not None
+    """Releases on the ground, of the first mode as one mass, show a cubic spring at the tip."""
+    rig = LumpedModel.load("single_mass_rig")
+    tip = rig.description.port[0].model_copy(update={"name": "tip"})
+    rig = LumpedModel(rig.description.model_copy(update={"port": (tip,)}))
+    plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
+    hidden = ModelPatch((PowerStiffness("tip", 2.0, 3.0, 0, 0.02),))
+    campaign = example_campaign(rig, "ringdown", 3, replace(plan, duration=0.5 * plan.duration), hidden)
+    few = [item for item in library() if item.identifier in ("cubic_stiffness", "coulomb_friction")]
+    found = investigate(campaign, rig, few)
+    assert found.verdict.kind is VerdictKind.NAMED
     write_verdict_folder(tmp_path / "verdict", VerdictContent(found, ORIGIN))
     watch = watchful(base, tmp_path / "watch")
     watch.run(CsvFeed(recorded, watch.scenario), lambda _d: None, turns=20)
