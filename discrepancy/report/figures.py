@@ -95,7 +95,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         with_effect = any(item.with_effect for item in verdict.windows)
         left = " The thin bars below are what the hypothesis leaves." if with_effect else ""
         add("time_line", time_line_figure(verdict.windows), left=left)
-        if (worst := worst_record(before)) is not None:
+        if (worst := worst_record(before.trials)) is not None:
             trial = before.trials[worst.trial].trial
             role = "held out" if trial.held_out else "fitted"
             figure = history_figure(before, after, worst)

@@ -37,11 +37,11 @@ class Worst:
     channel: str
 
 
-def worst_record(before: ResidualSet) -> Worst | None:
+def worst_record(items: Sequence[FittedTrial]) -> Worst | None:
     """Return the dynamic record whose residuals exceed the noise most; None without one."""
     found = [
         (found, number, name)
-        for number, item in enumerate(before.trials)
+        for number, item in enumerate(items)
         if item.trial.is_dynamic
         for column, name in enumerate(item.trial.channels)
         if item.used[:, column].any() and np.isfinite(found := size(item, column))
@@ -163,7 +163,7 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     """
     items = _ringdowns(before)
     frequencies = mode_frequencies(before if after is None else after)[:MOST_MODES]
-    worst = worst_record(ResidualSet(before.channels, tuple(items)))
+    worst = worst_record(items)
     if worst is None or not frequencies:
         return None
     channel = worst.channel
