@@ -79,8 +79,8 @@ def test_a_report_opens_with_effect_size_share_and_probability(drag: Investigati
     assert force.held_out is not None
     text = text_of(drag)
     opening = (
-        f"Quadratic aerodynamic damping at {force.port}", f"{number(force.rms)} N", share_text(force.held_out),
-        probability_text(drag.verdict.probability), headline(drag.verdict),
+        f"Quadratic aerodynamic damping at {force.port}", f"{number(force.rms)} N",
+        share_text(force.held_out), probability_text(drag.verdict.probability), headline(drag.verdict),
     )  # fmt: skip
     places = [text.index(f">{words}<") for words in opening]
     assert places == sorted(places)
