@@ -46,10 +46,14 @@ def told_force(problem: Problem, search: Search, fit: CandidateFit, missing: Mis
     least = max(LEAST_ORDER, max(orders.values()) - ALIKE)
     rms, displacement, velocity = (float(np.sqrt(np.mean(item**2))) for item in (force, position, speed))
     shares = _shares(problem, search, fit) if missing.law else (None, None)
+    ports = problem.model.ports()
+    laws = {term.place: term.effect.name for term in fit.candidate.terms if term.place in ports}
+    several = " and ".join(f"{name} at {place}" for place, name in laws.items())
     return ForceAtPort(
         missing.port, port_unit(missing.port, problem.model.inner), rms, displacement, velocity,
         _largest(missing.courses), missing.evidence, missing.correlation_time, orders,
-        tuple(name for name, share in orders.items() if share >= least), missing.law, *shares,
+        tuple(name for name, share in orders.items() if share >= least),
+        several if missing.law and len(laws) > 1 else missing.law, *shares,
     )  # fmt: skip
 
 

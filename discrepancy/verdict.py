@@ -321,9 +321,9 @@ class ForceAtPort:
     ordered_by : tuple of str
         Those that order it, as well as the best one does; empty where none does.
     law : str
-        What was drawn through it; empty: nothing.
+        What was drawn through it, with their places where laws act at several ports; empty: nothing.
     fitted, held_out : ShareOfForce or None
-        What share of it the law is.
+        What share of the force the law is, of those at all ports where laws act at several.
     """
 
     port: str

@@ -45,18 +45,19 @@ def _compared(gate: Gate) -> tuple[str, str]:
 
 def add_evidence(page: Page, verdict: Verdict) -> None:
     """Add the best hypotheses, members of a group first and 'none' always, and what takes part in them."""
-    members = [*verdict.group, " + ".join(sorted(item.identifier for item in verdict.effects))]
+    named = " + ".join(sorted(item.identifier for item in verdict.effects))
+    stands = dict.fromkeys(verdict.group or filter(None, [named]), True)  # each once, the most probable
     role = "member of the group" if verdict.group else verdict.kind.value
-    ranked = [(item, " + ".join(item.identifiers) in members) for item in verdict.hypotheses]
+    ranked = [(item, stands.pop(" + ".join(item.identifiers), False)) for item in verdict.hypotheses]
     ranked.sort(key=lambda row: not row[1])
     none = next((item for item in verdict.hypotheses if not item.effects), None)
     rows = []
-    for rank, (item, stands) in enumerate(ranked):
+    for rank, (item, first) in enumerate(ranked):
         if rank < SHOWN_HYPOTHESES or item is none:
             gain = nan if none is None else item.log_evidence - none.log_evidence
             told = "" if isnan(gain) else f"{gain:+,.1f}".replace("-", "\N{MINUS SIGN}")
             probability = words.probability_text(item.probability)
-            rows.append((words.hypothesis_name(item), role if stands else "", probability, told))
+            rows.append((words.hypothesis_name(item), role if first else "", probability, told))
     inclusion = sorted(verdict.inclusion.items(), key=lambda row: -row[1])
     shown = [(name.replace("_", " "), p) for name, p in inclusion if p >= 1e-3][:6]
     part = listing(f"{name} {words.probability_text(p)}" for name, p in shown)
@@ -69,7 +70,7 @@ def add_not_compared(page: Page, verdict: Verdict) -> None:
     by_reason: dict[str, list[str]] = {}
     for item in verdict.not_fitted:
         gain = f" ({words.number(item.gain, 2)} nat)" if isfinite(item.gain) else ""
-        reason = item.reason.partition(":")[0] if gain else item.reason
+        reason = "screened out" if item.reason.startswith("screened out") else item.reason
         by_reason.setdefault(reason, []).append(item.identifier.replace("_", " ") + gain)
     rows = [(f"{reason[:1].upper()}{reason[1:]}", listing(names)) for reason, names in by_reason.items()]
     add_table(page, "not_compared", rows)
@@ -142,8 +143,9 @@ def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
         f"Gain in log score on held-out trials {words.number(proof.log_score_gain, 4)} "
         f"± {words.number(proof.log_score_gain_error, 2)} nat per sample. "
     )  # fmt: skip
-    closed = proof.gap_reason  # the share of a verdict that has one is of other units
-    if isfinite(proof.gap_closed) and investigation.verdict.explained is None:
+    verdict, closed = investigation.verdict, proof.gap_reason
+    # beside a share of the readings in units of their noise no other one is told
+    if isfinite(proof.gap_closed) and (verdict.explained is None or words.rests_on_force(verdict)):
         closed = f"Gap closed: {words.percent(proof.gap_closed)} %."
     trials = f" Held out: {', '.join(held)}; only their own releases and zeros were adapted." if held else ""
     add_table(page, "proof", rows, *scores, gain=gain, closed=closed, trials=trials)
