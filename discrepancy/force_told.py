@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.force import ForceCourse, MissingForce
@@ -47,13 +48,13 @@ def told_force(problem: Problem, search: Search, fit: CandidateFit, missing: Mis
     rms, displacement, velocity = (float(np.sqrt(np.mean(item**2))) for item in (force, position, speed))
     shares = _shares(problem, search, fit) if missing.law else (None, None)
     ports = problem.model.ports()
-    laws = {term.place: term.effect.name for term in fit.candidate.terms if term.place in ports}
-    several = " and ".join(f"{name} at {place}" for place, name in laws.items())
+    laws = [(term.effect.name, term.place) for term in fit.candidate.terms if term.place in ports]
+    several = missing.law and len({place for _, place in laws}) > 1
     return ForceAtPort(
         missing.port, port_unit(missing.port, problem.model.inner), rms, displacement, velocity,
         _largest(missing.courses), missing.evidence, missing.correlation_time, orders,
         tuple(name for name, share in orders.items() if share >= least),
-        several if missing.law and len(laws) > 1 else missing.law, *shares,
+        " and ".join(f"{name} at {place}" for name, place in laws) if several else missing.law, *shares,
     )  # fmt: skip
 
 
@@ -69,16 +70,19 @@ def _shares(
 ) -> tuple[ShareOfForce | None, ShareOfForce | None]:
     """Return the shares that a hypothesis is of the missing force, in fitted and in held-out trials."""
     force, key = search.force, key_of(fit.candidate)
-    if force is None:
-        force = ForceSearch(problem)
-        force.locate()
-    found = next((item for item in search.forces if key_of(item.candidate) == key), None)
-    found = found or force.followed(force.whole, fit.candidate, fit.point.effect)
-    if found is None:
+    try:
+        if force is None:
+            force = ForceSearch(problem)
+            force.locate()
+        found = next((item for item in search.forces if key_of(item.candidate) == key), None)
+        found = found or force.followed(force.whole, fit.candidate, fit.point.effect)
+        if found is None:
+            return None, None
+        shares = ForceShares(force)
+        outside = _share(shares.of(found, held_out=True)) if shares.has_held_out else None
+        return _share(shares.of(found, held_out=False)), outside
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # a share that cannot be told is left out
         return None, None
-    shares = ForceShares(force)
-    outside = _share(shares.of(found, held_out=True)) if shares.has_held_out else None
-    return _share(shares.of(found, held_out=False)), outside
 
 
 def _share(share: ForceShare) -> ShareOfForce:
