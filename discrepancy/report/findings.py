@@ -85,7 +85,8 @@ def _opening(investigation: Investigation) -> list[tuple[str, str]]:
         if share is not None:
             kind = "fitted" if share is force.fitted else "held-out"
             of = "its effect on predictions" if share.ahead else "it"
-            items.append((words.share_text(share), f"of {of} is {force.law}, {kind} trials"))
+            law = force.law if verdict.kind in words.NAMING else f"{force.law}, which is no name"
+            items.append((words.share_text(share), f"of {of} in {kind} trials is {law}"))
         elif force.ordered_by:
             share_of = f"what orders it: {100.0 * max(force.orders.values()):.0f} % of its variance"
             items.append((listing(force.ordered_by), share_of))

@@ -131,7 +131,7 @@ def effects_text(effects: Iterable[NamedEffect], joint: str = "and") -> str:
 def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
     """Return the members of a group by name, each with its effects; empty for any other verdict."""
     found = {}
-    for group in verdict.group:
+    for group in verdict.group if verdict.kind is VerdictKind.GROUP else ():
         one = next((item for item in verdict.hypotheses if " + ".join(item.identifiers) == group), None)
         effects = tuple(item for item in verdict.effects if item.identifier == group)
         effects = effects if one is None else one.effects
@@ -187,8 +187,7 @@ def share_text(share: ShareOfForce) -> str:
 
 def rests_on_force(verdict: Verdict) -> bool:
     """Whether hypotheses were weighed along the missing force, and not by what simulations of them leave."""
-    stands = verdict.hypotheses[:1]
-    return verdict.force is not None and any(isnan(item.chi_square) for item in stands)
+    return any(isnan(item.chi_square) for item in verdict.hypotheses[:1])
 
 
 def scored(proof: Proof) -> tuple[Scores, Scores, str]:
