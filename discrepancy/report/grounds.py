@@ -54,10 +54,10 @@ def add_evidence(page: Page, verdict: Verdict) -> None:
     rows = []
     for rank, (item, first) in enumerate(ranked):
         if rank < SHOWN_HYPOTHESES or item is none:
-            gain = nan if none is None else item.log_evidence - none.log_evidence
-            told = "" if isnan(gain) else f"{gain:+,.1f}".replace("-", "\N{MINUS SIGN}")
-            probability = words.probability_text(item.probability)
-            rows.append((words.hypothesis_name(item), role if first else "", probability, told))
+            row = words.hypothesis_name(item), role if first else "", words.probability_text(item.probability)
+            over = nan if none is None else item.log_evidence - none.log_evidence
+            told = f"{over:+,.1f}".replace("-", "\N{MINUS SIGN}")
+            rows.append(row if none is None else (*row, told))
     inclusion = sorted(verdict.inclusion.items(), key=lambda row: -row[1])
     shown = [(name.replace("_", " "), p) for name, p in inclusion if p >= 1e-3][:6]
     part = listing(f"{name} {words.probability_text(p)}" for name, p in shown)
