@@ -13,7 +13,7 @@ from discrepancy.report.evidence_figures import confusion_figure, pit_figure, se
 from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.report.motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
 from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure, time_line_figure
-from discrepancy.report.text import WORDS, force_sentence, scored
+from discrepancy.report.text import WORDS, added_label, force_sentence, scored
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
@@ -79,7 +79,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
 
     investigation = content.investigation
     verdict, proof, missing = investigation.verdict, investigation.proof, investigation.missing
-    before, after = investigation.before, after_of(investigation)
+    before, after = investigation.before, investigation.after if added_label(investigation) else None
     if missing is not None and verdict.force is not None:
         figure = missing_force_figure(missing, verdict.force)
         add("missing_force", figure, sentence=force_sentence(verdict.force))
@@ -123,13 +123,6 @@ def _held_out_words(residuals: ResidualSet) -> str:
         return "No trial is held out."
     them = "them" if names[1:] else "it"
     return f"Held out: {listing(names)}; nothing but release and zero was fitted to {them}."
-
-
-def after_of(investigation: Investigation) -> ResidualSet | None:
-    """Return the residuals with the effect where one was added, else None."""
-    if investigation.fit is None or not investigation.fit.candidate.terms:
-        return None
-    return investigation.after
 
 
 def draw(figures: dict[str, ReportFigure]) -> dict[str, bytes]:

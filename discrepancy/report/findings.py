@@ -19,7 +19,7 @@ LEAST_SHARE = 0.05
 SHOWN_FINDINGS = 8
 
 
-def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | None = None) -> None:
+def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] = lambda: None) -> None:
     """Add the verdict: effect, size and probability, its sentence, its `picture`, what is added."""
     investigation = content.investigation
     verdict = investigation.verdict
@@ -27,8 +27,7 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] | 
     page.add_notice(words.headline(verdict))
     if opening := " ".join(filter(None, (_sizes(content), closing_sentence(investigation)))):
         page.add_paragraph(opening)
-    if picture is not None:
-        picture()
+    picture()
     page.add_paragraph(words.meaning(verdict))
     if shares := words.shares_sentence(verdict):
         page.add_paragraph(f"{shares} {words.remainders_sentence(verdict)}".strip())
@@ -96,8 +95,8 @@ def _opening(investigation: Investigation) -> list[tuple[str, str]]:
         items.append((f"{before} → {after}", told))
     if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
         items.append((words.probability_text(verdict.probability), "probability of the verdict"))
-    judged = [gate for gate in verdict.gates if gate.name not in ("shape", "held-out trials")]
-    judged = [gate for gate in judged if isfinite(gate.statistic)]
+    compared = [gate for gate in verdict.gates if isfinite(gate.statistic)]
+    judged = [gate for gate in compared if gate.name not in ("shape", "held-out trials")]
     if proof is None and force is None and judged:  # of gates that compare a p-value, the one that decided
         gate = next((gate for gate in judged if gate.passed is False), judged[0])
         told = f"p of the {gate.name}; a fit has at least {words.number(gate.limit)}"
@@ -141,19 +140,18 @@ def closing_sentence(investigation: Investigation) -> str:
     """Return how much of the gap is closed and what is left; empty where nothing was added or scored."""
     verdict, proof = investigation.verdict, investigation.proof
     added = "It" if verdict.kind in words.NAMING else "The best hypothesis, which is no name,"
-    if words.rests_on_force(verdict):
-        return ""
-    if (share := verdict.explained) is not None:
+    share = None if words.rests_on_force(verdict) else verdict.explained
+    if share is not None:
         interval = f"{100.0 * share.low:.0f} to {100.0 * share.high:.0f} %"
         closed = f"{100.0 * share.value:.0f} % of the gap on {share.trials} trials ({interval})"
         return f"{added} closes {closed} and leaves {words.number(share.left, 2)} noises."
     if proof is None or not words.added_label(investigation):
         return ""
     before, after, where = words.scored(proof)
-    if not (isfinite(before.chi_square_per_dof) and isfinite(after.chi_square_per_dof)):
+    sizes = [item.chi_square_per_dof for item in (before, after)]
+    if not all(map(isfinite, sizes)):
         return ""
-    sizes = [words.number(item.chi_square_per_dof) for item in (before, after)]
-    course = f"{sizes[0]} before and {sizes[1]} after it"
+    course = f"{words.number(sizes[0])} before and {words.number(sizes[1])} after it"
     if proof.gap_closed > 0.0:
         closed = f"{words.percent(proof.gap_closed)} % of the gap on {where} trials"
         return f"{added} closes {closed}: χ²/dof is {course}, 1 for noise alone."
