@@ -257,6 +257,91 @@ class RemainderEstimate:
 
 
 @dataclass(frozen=True)
+class ShareOfForce:
+    """What share of a missing force a law is, in trials that were fitted or in those held out.
+
+    Attributes
+    ----------
+    value, low, high : float
+        1 - mean square of what is left over that of the force without any effect, noise taken from both;
+        90 % interval by a bootstrap of blocks.
+    left, whole : float
+        Root mean squares of what is left and of the force without any effect, in the force's unit.
+    ahead : bool
+        Whether it is one of what the force does to predictions over a twelfth of a record, not of the force.
+    trials : int
+        How many.
+    tested : bool
+        Whether the law has a force there that could be seen.
+    """
+
+    value: Number
+    low: Number
+    high: Number
+    left: Number
+    whole: Number
+    ahead: bool
+    trials: int
+    tested: bool
+
+
+@dataclass(frozen=True)
+class ForceMoment:
+    """A missing force at a moment: trial, time [s], force, displacement [m or rad] and speed of its port."""
+
+    trial: str
+    time: Number
+    force: Number
+    displacement: Number
+    speed: Number
+
+
+@dataclass(frozen=True)
+class ForceAtPort:
+    """The force that the model lacks at a port, as it is seen in the fitted trials.
+
+    Attributes
+    ----------
+    port : str
+        Its name.
+    unit : str
+        Of the force: "N", "N m", or "N or N m" where the model does not say whether the port turns; at a
+        port of a state that of its flow.
+    rms, displacement, speed : float
+        Root mean squares of the force, and of how far and how fast the port moves [m or rad, and its rate];
+        of a port of a state of its integral, and of the state.
+    largest : ForceMoment
+        Where the force is largest.
+    evidence : mapping of str to float
+        By port: of a missing force there over none [nat].
+    correlation_time : float
+        Of the force [s].
+    orders : mapping of str to float
+        Share of the force's variance that its mean at like displacement, velocity, amplitude or time is.
+    ordered_by : tuple of str
+        Those that order it, as well as the best one does; empty where none does.
+    law : str
+        What was drawn through it, with their places where laws act at several ports; empty: nothing.
+    fitted, held_out : ShareOfForce or None
+        What share of the force the law is, of those at all ports where laws act at several.
+    """
+
+    port: str
+    unit: str
+    rms: Number
+    displacement: Number
+    speed: Number
+    largest: ForceMoment
+    evidence: Mapping[str, Number]
+    correlation_time: Number
+    orders: Mapping[str, Number]
+    ordered_by: tuple[str, ...]
+    law: str = ""
+    fitted: ShareOfForce | None = None
+    held_out: ShareOfForce | None = None
+
+
+@dataclass(frozen=True)
 class NotFitted:
     """An effect that was not fitted, and why; `gain` is what a screen promised at most [nat]."""
 
@@ -320,6 +405,8 @@ class Verdict:
         hypothesis leaves.
     parameters : tuple of CalibratedParameter
         Of the model, in the hypothesis that stands for the verdict.
+    force : ForceAtPort or None
+        That is missing; None where none is, or none can be seen.
     """
 
     kind: VerdictKind
@@ -340,3 +427,4 @@ class Verdict:
     not_fitted: tuple[NotFitted, ...] = ()
     windows: tuple[GapWindow, ...] = ()
     parameters: tuple[CalibratedParameter, ...] = ()
+    force: ForceAtPort | None = None

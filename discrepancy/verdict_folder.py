@@ -10,8 +10,7 @@ from discrepancy.files.patch import PATCH_NAME, PATCHED, StoredPatch, fmu_output
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
 from discrepancy.files.verdict import VERDICT_NAME, write_verdict
 from discrepancy.judgement.conclusion import named_effects
-from discrepancy.report.content import ReportInput
-from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.figures import ReportInput, draw, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label
 from discrepancy.self_calibration import SELF_CALIBRATION_NAME, write_self_calibration

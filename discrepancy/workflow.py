@@ -46,6 +46,7 @@ from fe.runtime.patch import ModelPatch
 from reporting.words import be
 
 from .errors import CampaignDataError
+from .force_told import told_force
 from .model_choice import load_model
 from .search_settings import SEARCH
 from .verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
@@ -208,10 +209,11 @@ def investigate(
                 windows += residual_windows(after, seed=seed, with_effect=True)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
-    missing = None
+    missing, force = None, None
     if thorough and verdict.kind not in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT):
         with stage("Seeing the missing force", "force"):
             missing = shown_force(problem, search, fit)
+            force = None if missing is None else told_force(problem, search, fit, missing)
     proof = None
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
@@ -223,7 +225,7 @@ def investigate(
     verdict = replace(
         verdict, sentence=_dated(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
         not_fitted=not_fitted(problem.setting, catalogue, search), windows=windows,
-        parameters=calibrated_parameters(problem, fit),
+        parameters=calibrated_parameters(problem, fit), force=force,
     )  # fmt: skip
     return Investigation(
         campaign,
@@ -376,7 +378,8 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
 
 def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> tuple[NotFitted, ...]:
     """Return the effects of a catalogue that were not fitted, each with the reason."""
-    fitted, rows = search.fitted(), []
+    along = {term.effect.identifier for item in search.forces for term in item.candidate.terms}
+    fitted, rows = search.fitted() | along, []
     for effect in effects:
         unavailable = effect.unavailable(setting)
         if unavailable is not None:
@@ -387,7 +390,7 @@ def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> t
             if effect.identifier in search.problem.refusals and not 0.0 < gain < SEARCH.worth_fitting:
                 why = f"could not be fitted: {search.problem.refusals[effect.identifier]}"
             elif isnan(gain):
-                why = "less promising than others on the beginnings of the records"
+                why = f"less promising than others {'along the missing force' if along else 'at first sight'}"
             rows.append(NotFitted(effect.identifier, why, gain))
     return tuple(rows)
 

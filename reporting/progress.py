@@ -11,7 +11,7 @@ Library code takes a `Progress` and never asks what it is::
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:  # rich takes a while to import, and most code only names what it reports to
     from rich.console import Console
@@ -67,10 +67,8 @@ class _BarStage:
 
     def advance(self, amount: int = 1, detail: str | None = None) -> None:
         """Move the bar."""
-        if detail is None:
-            self._bars.update(self._task, advance=amount)
-        else:
-            self._bars.update(self._task, advance=amount, detail=detail)
+        told: dict[str, Any] = {} if detail is None else {"detail": detail}
+        self._bars.update(self._task, advance=amount, **told)
 
 
 class _LineStage:

@@ -15,6 +15,8 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
+from reporting.record_json import plain
+
 STACK = (
     "uav-twin", "numpy", "scipy", "scikit-fem", "pymor", "numba", "fmpy", "pythonfmu", "xarray", "h5netcdf",
     "h5py", "pydantic", "matplotlib",
@@ -22,15 +24,8 @@ STACK = (
 """Distributions whose version can change a figure of a result."""
 
 SOURCE_PACKAGES = (
-    "calibration",
-    "discrepancy",
-    "fe",
-    "fmu_asset",
-    "reporting",
-    "scenarios",
-    "twin_master",
-    "uav_twin",
-)
+    "calibration", "discrepancy", "fe", "fmu_asset", "reporting", "scenarios", "twin_master", "uav_twin",
+)  # fmt: skip
 """Packages of this project."""
 
 _SOURCE_SUFFIXES = frozenset({".py", ".toml", ".css"})
@@ -59,12 +54,8 @@ class Provenance:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain dictionaries, ready for JSON."""
-        return {
-            "seed": self.seed,
-            "versions": dict(self.versions),
-            "source_hashes": dict(self.source_hashes),
-            "input_hashes": dict(self.input_hashes),
-        }
+        found: dict[str, Any] = plain(self)
+        return found
 
 
 def collect_provenance(

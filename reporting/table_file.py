@@ -173,11 +173,7 @@ class TextTable:
 
 
 def read_table(
-    path: Path | str,
-    errors: TableErrors,
-    *,
-    name: str | None = None,
-    header: Sequence[str] | None = None,
+    path: Path | str, errors: TableErrors, *, name: str | None = None, header: Sequence[str] | None = None
 ) -> TextTable:
     """Read a table of comma-separated text.
 

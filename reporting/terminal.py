@@ -6,7 +6,6 @@ progress, and takes no option for them: `with_common_options` gives every comman
 
 import functools
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -70,17 +69,9 @@ def progress() -> "Progress":
 
 def print_json(record: Mapping[str, Any]) -> None:
     """Print a record as JSON text; a number that is not finite becomes null."""
-    typer.echo(json.dumps(_plain(record), indent=1, ensure_ascii=False, allow_nan=False, default=str))
+    from reporting.record_json import plain
 
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    typer.echo(json.dumps(plain(record), indent=1, ensure_ascii=False, allow_nan=False, default=str))
 
 
 def with_common_options(application: typer.Typer) -> Callable[..., None]:
@@ -98,36 +89,21 @@ def with_common_options(application: typer.Typer) -> Callable[..., None]:
     return command
 
 
-def _set_quiet(value: bool) -> None:
-    loudness.quiet |= value
-    _refuse_both()
+def _option(name: str, told: str) -> Any:
+    """Return the option that makes commands `name`."""
 
+    def louder(value: bool) -> None:
+        setattr(loudness, name, getattr(loudness, name) or value)
+        if loudness.quiet and loudness.verbose:
+            raise typer.BadParameter("--quiet and --verbose exclude each other.")
 
-def _set_verbose(value: bool) -> None:
-    loudness.verbose |= value
-    _refuse_both()
-
-
-def _refuse_both() -> None:
-    if loudness.quiet and loudness.verbose:
-        raise typer.BadParameter("--quiet and --verbose exclude each other.")
+    return typer.Option(f"--{name}", f"-{name[0]}", callback=louder, help=told)
 
 
 def _common_options(
-    quiet: Annotated[
-        bool,
-        typer.Option(
-            "--quiet", "-q", callback=_set_quiet, help="Print nothing but errors, and what --json asks for."
-        ),
-    ] = False,
+    quiet: Annotated[bool, _option("quiet", "Print nothing but errors, and what --json asks for.")] = False,
     verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose",
-            "-v",
-            callback=_set_verbose,
-            help="Show stages as lines with their times, and the traceback of an error.",
-        ),
+        bool, _option("verbose", "Show stages as lines with their times, and the traceback of an error.")
     ] = False,
 ) -> None:
     """Carry the options that every command has."""

@@ -22,11 +22,7 @@ LONGEST_ARRAY = 90
 
 
 def read_toml(
-    path: Path | str,
-    error: type[Exception],
-    *,
-    what: str = "file",
-    parse_float: Callable[[str], Any] = float,
+    path: Path | str, error: type[Exception], *, what: str = "file", parse_float: Callable[[str], Any] = float
 ) -> dict[str, Any]:
     """Return the content of a TOML file.
 
@@ -52,11 +48,7 @@ def read_toml(
 
 
 def parse_toml(
-    content: bytes | str,
-    source: str,
-    error: type[Exception],
-    *,
-    parse_float: Callable[[str], Any] = float,
+    content: bytes | str, source: str, error: type[Exception], *, parse_float: Callable[[str], Any] = float
 ) -> dict[str, Any]:
     """Return the content of TOML that was read elsewhere; `source` names it in the sentence of `error`."""
     text = decoded(content, source, error) if isinstance(content, bytes) else content

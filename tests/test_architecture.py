@@ -53,8 +53,8 @@ ROOMS = {
     ),
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",
-        "files", "search_settings", "fits", "missing_force", "search", "judgement", "checks", "sources",
-        "model_choice", "workflow", "parameters", "application", "self_calibration", "report",
+        "files", "search_settings", "fits", "missing_force", "search", "judgement", "force_told", "checks",
+        "sources", "model_choice", "workflow", "parameters", "application", "self_calibration", "report",
         "verdict_folder",
     ),
 }  # fmt: skip

@@ -18,6 +18,11 @@ from twin_master.errors import NotResumableError, RunFolderError, RunFolderExist
 
 CONFIG_NAME = "config.json"
 FIELD_NAME = "wing.vtu"
+TEACHING = "teaching"
+"""Folder of the verdicts of a watch."""
+VERDICT, PATCH, PICTURE = "verdict.json", "patch.json", "figures/missing_force.svg"
+"""In the folder of a verdict: what it says, the patch where it names one, and the force that the model lacks
+where motion was observed."""
 KIND = "uav-twin run"
 """Value of `kind` in `config.json`, by which a run folder is known."""
 HARMLESS_PACKAGES = frozenset({"discrepancy", "reporting", "scenarios", "uav_twin", "matplotlib"})

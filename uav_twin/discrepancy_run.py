@@ -274,9 +274,11 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
     from discrepancy.report.sizes import size_sentence
     from discrepancy.report.text import (
         estimate_text,
+        force_sentence,
         headline,
         probability_text,
         remainders_sentence,
+        rests_on_force,
         shares_sentence,
         unit_text,
     )
@@ -290,7 +292,8 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
         stored = read_patch(patch_file)
         if sizes := size_sentence(found, stored.effects, [effect.intervals for effect in stored.effects]):
             console.print(sizes, soft_wrap=True)
-    for sentence in (shares_sentence(verdict), remainders_sentence(verdict)):
+    force = force_sentence(verdict.force) if verdict.force else ""
+    for sentence in (force, shares_sentence(verdict), remainders_sentence(verdict)):
         if sentence:
             console.print(sentence, soft_wrap=True)
     when = when_sentence(verdict.windows)
@@ -312,7 +315,8 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
         ]  # fmt: skip
         console.print(console_table(headings, rows, console.width))
     if proof is not None:
-        _show_proof(proof, verdict.explained, found.campaign, console)
+        explained = None if rests_on_force(verdict) else verdict.explained
+        _show_proof(proof, explained, found.campaign, console)
     for experiment in verdict.next_experiments[:SHOWN_EXPERIMENTS]:
         console.print(f"Next: {experiment.description} ({experiment.information:.2f} nat)", soft_wrap=True)
     for fault in found.faults:

@@ -105,7 +105,7 @@ def assemble(
     data_hash : str
         SHA-256 of all that was read.
     """
-    remarks: list[str] = []
+    remarks = _unused(section, tables)
     trials = tuple(
         _trial(trial, raw, tables[trial.file], section, remarks)
         for trial, raw in zip(section.trial, printed["trial"], strict=True)
@@ -130,6 +130,21 @@ def assemble(
         events=tuple(_events(section, trials)),
         remarks=(*section.remarks, *(remark for remark in remarks if remark not in section.remarks)),
     )
+
+
+def _unused(section: CampaignSection, tables: Mapping[str, TextTable]) -> list[str]:
+    """Return a remark on each column that no channel and no input has."""
+    known = {*INPUT_COLUMNS, *(item.table_column for item in (*section.channel, *section.input))}
+    files: dict[str, list[str]] = {}
+    for name in dict.fromkeys(trial.file for trial in section.trial):
+        for column in tables[name].columns:
+            if column not in known:
+                files.setdefault(column, []).append(name)
+    return [
+        f"{where[0]}{f' and {len(where) - 1} more' if where[1:] else ''}: no channel has the column "
+        f"{column!r}, which is left out; if that is not meant, check its spelling."
+        for column, where in files.items()
+    ]
 
 
 def _events(section: CampaignSection, trials: tuple[Trial, ...]) -> Iterator[Event]:
@@ -173,14 +188,6 @@ def _trial(
     time, start = _times(section, table, user)
     zeros = np.zeros(len(table))
     chosen = _measured(section, table, campaign)
-    known = {*INPUT_COLUMNS, *(channel.table_column for channel in campaign.channel)}
-    known |= {item.table_column for item in campaign.input}
-    unknown = [name for name in table.columns if name not in known]
-    if unknown:
-        remarks.append(
-            f"{table.name}: no channel has the column {', '.join(map(repr, unknown))}, which is left out; "
-            "if that is not meant, check its spelling."
-        )
     columns, used = zip(*(_readings(channel, section, table, remarks) for channel in chosen), strict=True)
     health, health_deviation = _health(section, table, user)
     inputs = _inputs(section, table, campaign, user)

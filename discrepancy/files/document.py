@@ -7,22 +7,20 @@ docs/verdict.md.
 import json
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
-from enum import Enum
+from dataclasses import dataclass, fields
 from importlib import resources
-from math import isfinite, isnan
+from math import isnan
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from discrepancy.errors import VerdictFileError
-from fe.runtime.patch import ModelPatch
 from reporting.files import atomic_write_text
 from reporting.json_file import read_json
 from reporting.provenance import Provenance
+from reporting.record_json import plain as json_of
 
 _Record = TypeVar("_Record")
 
@@ -101,22 +99,8 @@ def json_schema(record: type, schema: str) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return records as plain data that JSON can hold."""
-    if isinstance(value, ModelPatch):
-        return value.to_list()
-    if isinstance(value, Enum):
-        return value.value
-    if is_dataclass(value) and not isinstance(value, type):
-        return {item.name: plain(getattr(value, item.name)) for item in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(name): plain(item) for name, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not isfinite(value):
-        return None if isnan(value) else "Infinity" if value > 0.0 else "-Infinity"
-    return value
+    """Return records as plain data that JSON can hold: null, "Infinity" and "-Infinity" for odd numbers."""
+    return json_of(value, lambda odd: None if isnan(odd) else "Infinity" if odd > 0.0 else "-Infinity")
 
 
 def write_document(path: Path, schema: str, origin: Origin, record: object) -> Path:

@@ -1,5 +1,6 @@
 """`verdict.json`: what was concluded, what it rests on, and the proof."""
 
+from collections import ChainMap
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,12 +14,15 @@ from discrepancy.verdict import Proof, Verdict
 from fe.runtime.patch import ModelPatch
 from reporting.folders import restore_folder
 
-VERDICT_SCHEMA = "uav-twin verdict 3"
-"""Value of the key `schema`; files of numbers 1 and 2 are read too."""
+VERDICT_SCHEMA = "uav-twin verdict 4"
+"""Value of the key `schema`; files of earlier numbers are read too."""
 VERDICT_NAME = "verdict.json"
-_SECOND: dict[str, Any] = {"explained": None, "remainders": [], "not_fitted": [], "windows": []}
-_THIRD: dict[str, Any] = {"parameters": []}
-LATER_KEYS = {"uav-twin verdict 1": {**_SECOND, **_THIRD}, "uav-twin verdict 2": _THIRD}
+_NEW: tuple[dict[str, Any], ...] = (
+    {"explained": None, "remainders": [], "not_fitted": [], "windows": []},
+    {"parameters": []},
+    {"force": None},
+)
+LATER_KEYS = {f"uav-twin verdict {k + 1}": dict(ChainMap(*_NEW[k:])) for k in range(len(_NEW))}
 """Keys of the verdict that older files lack, by their schema."""
 
 

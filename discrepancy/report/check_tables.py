@@ -8,8 +8,7 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
-from discrepancy.report.text import number, unit_text
-from reporting.page import Table, columns, numbers
+from discrepancy.report.text import SAID, number, unit_text
 from reporting.words import listing
 
 HEADINGS = (
@@ -54,12 +53,10 @@ def neighbours(found: Separability, name: str) -> list[str]:
     return [other for place, other in enumerate(found.identifiers) if near[place] and place != at]
 
 
-def can_decide_table(found: Separability) -> Table:
-    """Return the rows as a table of the page, those that can be tested."""
-    sizes = ("prior median", "detectable from")
-    heads = columns(*(numbers(title) if title in sizes else title for title in HEADINGS))
+def can_decide_rows(found: Separability) -> list[tuple[str, ...]]:
+    """Return the rows of the effects that can be tested, as the page has them."""
     testable = [_row(found, item) for item in found.detectability if not item.reason]
-    return Table(heads, [tuple(cell.replace("_", " ") for cell in row) for row in testable])
+    return [tuple(cell.replace("_", " ") for cell in row) for row in testable]
 
 
 def confused_lines(found: Separability) -> list[str]:
@@ -83,12 +80,9 @@ def group_lines(found: Separability, told: str = "the table says to which") -> l
     """Return one sentence for each confusion group, or one that there is none; `told`: where to look."""
     seen = [item for item in found.detectability if not item.reason and isfinite(item.detectable)]
     if not found.identifiers or not any(item.parameter and item.distance > 0.0 for item in seen):
-        return [
-            "These trials show none of the effects that can be tested: nothing moves in what the model "
-            "predicts of them. Say how each trial begins and what drives it."
-        ]
+        return [SAID["nothing_shown"]]
     if not found.groups:
-        return ["Every effect that can be tested here can be told from every other at its prior median."]
+        return [SAID["all_apart"]]
     lines = []
     for group in found.groups:
         names = [name.replace("_", " ") for name in group]
@@ -110,13 +104,8 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         common = frozenset(TrialKind).intersection(*acts)
         apart = [kind for kind in TrialKind if kind in union - common and kind not in there]
         names = listing(name.replace("_", " ") for name in group)
-        lines.append(
-            f"To tell {names} apart, add {' or '.join(_KIND_WORDS[kind] for kind in apart)}: some of them "
-            "act there and others do not."
-            if apart
-            else f"To tell {names} apart, vary what was held: another amplitude, sign or place of the load, "
-            "a known added mass, another temperature, strain beside displacement."
-        )
+        kinds = " or ".join(_KIND_WORDS[kind] for kind in apart)
+        lines.append(SAID["add_kinds" if apart else "vary"].format(names=names, kinds=kinds))
     hidden = [
         item
         for item in found.detectability
@@ -126,21 +115,9 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         first = max(hidden, key=lambda item: item.distance)
         factor = (DETECTED / first.distance) ** 0.5 if first.distance > 0.0 else float("inf")
         unseen = [item.effect.identifier.replace("_", " ") for item in hidden]
-        if len(unseen) == 1:
-            told = f"At its prior median {unseen[0]} would not be seen; it would be"
-        else:
-            name = first.effect.identifier.replace("_", " ")
-            told = f"At their prior medians {listing(unseen)} would not be seen; {name} would be the first,"
-        lines.append(f"{told} with noise {factor:.2g} times smaller or {factor**2:.2g} times as many trials.")
+        told = SAID["unseen" if unseen[1:] else "unseen_one"]
+        name = first.effect.identifier.replace("_", " ")
+        lines.append(told.format(unseen=listing(unseen), first=name, factor=factor, trials=factor**2))
     unknown = [name for name, channel in campaign.channels.items() if channel.noise is None]
-    if unknown:
-        lines.append(
-            f"Give a noise record for {', '.join(unknown)} (samples at rest, or a standard deviation with "
-            "its degrees of freedom): without it the absolute gate cannot be applied, and the sizes above "
-            "take a thousandth of the range for its noise."
-        )
-    if not campaign.held_out:
-        lines.append(
-            "Hold out a trial, or measure one more at another level: without it nothing can be proved."
-        )
-    return lines
+    lines += [SAID["give_noise"].format(names=", ".join(unknown))] if unknown else []
+    return lines if campaign.held_out else [*lines, SAID["hold_out"]]

@@ -1,26 +1,65 @@
-"""The figures of the report with their captions, as far as the data allow them."""
+"""What the report shows, and its figures with their captions, as far as the data allow them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from discrepancy.judgement.separability import CONFUSED
+from discrepancy.files.document import Origin
+from discrepancy.files.patch import PrimitiveInterval
+from discrepancy.judgement.separability import CONFUSED, Separability
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.report.content import ReportFigure, ReportInput
-from discrepancy.report.evidence_figures import (
-    confusion_figure,
-    evidence_figure,
-    pit_figure,
-    separability_figure,
-    shares_figure,
-)
+from discrepancy.report.evidence_figures import confusion_figure, pit_figure, separability_figure
 from discrepancy.report.force_figure import missing_force_figure
-from discrepancy.report.law_figures import backbone_figure, force_figure
-from discrepancy.report.motion_figures import history_figure, spectrum_figure, worst_record
-from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure
-from discrepancy.report.text import WORDS
-from discrepancy.report.time_line import time_line_figure
+from discrepancy.report.motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
+from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure, time_line_figure
+from discrepancy.report.text import WORDS, added_label, force_sentence, scored
+from discrepancy.self_calibration import SelfCalibration
 from discrepancy.workflow import Investigation
+from fe.wing.design import WingDesign
 from reporting.figures import to_svg
 from reporting.words import listing
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """All that the report shows.
+
+    Attributes
+    ----------
+    investigation : Investigation
+        What came out.
+    origin : Origin
+        What it came from.
+    separability : Separability or None
+        What the campaign can decide.
+    self_calibration : SelfCalibration or None
+        Where it was asked for.
+    design : WingDesign or None
+        Of a wing, for the map.
+    intervals : sequence of sequence of PrimitiveInterval
+        Of the patch, by effect; empty without a patch.
+    fmu : str
+        Name of the patched FMU, or why there is none; empty if none is due.
+    """
+
+    investigation: Investigation
+    origin: Origin
+    separability: Separability | None = None
+    self_calibration: SelfCalibration | None = None
+    design: WingDesign | None = None
+    intervals: Sequence[Sequence[PrimitiveInterval]] = ()
+    fmu: str = ""
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """A figure with its words; `name` is that of its file."""
+
+    name: str
+    figure: Figure
+    title: str
+    caption: str
 
 
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
@@ -40,9 +79,10 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
 
     investigation = content.investigation
     verdict, proof, missing = investigation.verdict, investigation.proof, investigation.missing
-    before, after = investigation.before, after_of(investigation)
-    if missing is not None:
-        add("missing_force", missing_force_figure(missing), sentence=missing.sentence)
+    before, after = investigation.before, investigation.after if added_label(investigation) else None
+    if missing is not None and verdict.force is not None:
+        figure = missing_force_figure(missing, verdict.force)
+        add("missing_force", figure, sentence=force_sentence(verdict.force))
     if before is not None:
         scale = {
             "held_out": _held_out_words(before),
@@ -55,7 +95,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         with_effect = any(item.with_effect for item in verdict.windows)
         left = " The thin bars below are what the hypothesis leaves." if with_effect else ""
         add("time_line", time_line_figure(verdict.windows), left=left)
-        if (worst := worst_record(before)) is not None:
+        if (worst := worst_record(before.trials)) is not None:
             trial = before.trials[worst.trial].trial
             role = "held out" if trial.held_out else "fitted"
             figure = history_figure(before, after, worst)
@@ -63,27 +103,16 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
             add("spectrum", spectrum_figure(before, after, worst))
         if (backbone := backbone_figure(before, after)) is not None:
             add("backbone", backbone[0], channel=backbone[1])
-        if missing is None and (force := force_figure(before, after)) is not None:
-            add("restoring_force", force[0], record=force[1])
-    if verdict.hypotheses:
-        add("evidence", evidence_figure(verdict.hypotheses))
     if proof is not None:
-        held, fitted = (
-            (proof.held_out_before, proof.held_out_after),
-            (proof.fitted_before, proof.fitted_after),
-        )
-        pairs = zip(
-            ("model as it was", "with the effect"), held if held[1] is not None else fitted, strict=True
-        )
-        scores = {title: item for title, item in pairs if item is not None and item.pit}
-        where = "Held-out trials." if held[1] is not None else "Fitted trials: none is held out."
+        *pair, trials = scored(proof)
+        shown = zip(("model as it was", "with the effect"), pair, strict=True)
+        scores = {title: item for title, item in shown if item.pit}
+        where = "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
         add("pit", pit_figure(scores) if scores else None, where=where)
     if content.separability is not None:
         add("separability", separability_figure(content.separability), confused=CONFUSED)
     if content.self_calibration is not None:
         add("self_calibration", confusion_figure(content.self_calibration))
-    if verdict.explained is not None:
-        add("shares", shares_figure(verdict.explained), trials=verdict.explained.trials)
     return found
 
 
@@ -94,13 +123,6 @@ def _held_out_words(residuals: ResidualSet) -> str:
         return "No trial is held out."
     them = "them" if names[1:] else "it"
     return f"Held out: {listing(names)}; nothing but release and zero was fitted to {them}."
-
-
-def after_of(investigation: Investigation) -> ResidualSet | None:
-    """Return the residuals with the effect where one was added, else None."""
-    if investigation.fit is None or not investigation.fit.candidate.terms:
-        return None
-    return investigation.after
 
 
 def draw(figures: dict[str, ReportFigure]) -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""What the figures of residuals have in common: panels, the two models, maps of sizes."""
+"""What figures and tables have in common: panels, the two models, maps of sizes, words of a table."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -9,11 +9,14 @@ from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from discrepancy.location.residuals import ResidualSet
+from discrepancy.report.text import WORDS
 from reporting.figures import LEVELS, PAST, PREDICTION, REFERENCE, new_figure
+from reporting.page import Column, Page, Table, numbers
 
 AFTER = "with the effect"
 EMPTY = "#f0f1f2"
@@ -67,16 +70,6 @@ def plain_powers(axis: Axis, parts: tuple[float, ...]) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def name_cells(axes: Axes, rows: Iterable[str], columns: Iterable[str], slant: float) -> None:
-    """Name the rows and columns of a map."""
-    rows, columns = list(rows), list(columns)
-    axes.set_xticks(range(len(columns)), columns, rotation=slant, ha="right", rotation_mode="anchor")
-    axes.set_yticks(range(len(rows)), rows)
-    axes.tick_params(length=0)
-    axes.spines[:].set_visible(False)
-    axes.set_facecolor(EMPTY)
-
-
 def scale_of(values: Sequence[float] | NDArray[np.float64]) -> Normalize:
     """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end."""
     found = np.asarray(values, dtype=float)
@@ -84,9 +77,48 @@ def scale_of(values: Sequence[float] | NDArray[np.float64]) -> Normalize:
     return LogNorm(0.7, max(largest, 3.0))
 
 
-def size_bar(figure: Figure, norm: Normalize, place: tuple[float, float, float, float]) -> None:
-    """Draw the colour scale of sizes of residuals."""
-    bar = figure.colorbar(ScalarMappable(norm, LEVELS), cax=figure.add_axes(place))
+def size_bar(figure: Figure, norm: Normalize, place: tuple[float, float, float, float] | Axes) -> None:
+    """Draw the colour scale of sizes of residuals at a place of the figure, or beside a panel."""
+    aside: dict[str, Any] = {"ax": place, "fraction": 0.045, "pad": 0.02, "aspect": 14}
+    where = aside if isinstance(place, Axes) else {"cax": figure.add_axes(place)}
+    bar = figure.colorbar(ScalarMappable(norm, LEVELS), **where)
     bar.set_label("rms residual / noise")
     plain_powers(bar.ax.yaxis, (1.0, 2.0, 5.0) if float(norm.vmax or 1.0) < 50.0 else (1.0,))
     bar.outline.set_linewidth(0.5)
+
+
+def heat_map(
+    axes: Axes,
+    values: NDArray[np.float64],
+    names: tuple[Iterable[str], Iterable[str]],
+    norm: Normalize,
+    slant: float,
+    texts: NDArray[Any] | None = None,
+) -> AxesImage:
+    """Draw values (R, C), nan where a cell is empty, with names of rows and columns, and what cells say."""
+    image = axes.imshow(np.ma.masked_invalid(values), cmap=LEVELS, norm=norm, aspect="auto")
+    rows, columns = map(list, names)
+    axes.set_xticks(range(len(columns)), columns, rotation=slant, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(len(rows)), rows)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    axes.set_facecolor(EMPTY)
+    for (row, column), text in np.ndenumerate([] if texts is None else texts):
+        if text:
+            dark = float(norm(values[row, column])) < 0.6
+            colour = "white" if dark else "black"
+            axes.text(column, row, text, ha="center", va="center", fontsize=6.0, color=colour)
+    return image
+
+
+def add_table(page: Page, name: str, rows: Sequence[Sequence[str]], *more: str, **words: object) -> None:
+    """Add a table with its words of `words.toml`, if it has rows; `more` are further columns of numbers."""
+    if not rows:
+        return
+    told = WORDS["tables"][name]
+    heads = [
+        Column(head) if isinstance(head, str) else numbers(head["number"], head.get("unit", ""))
+        for head in [*told["columns"], *({"number": head} for head in more)]
+    ]
+    table = Table(heads[: len(rows[0])], rows)
+    page.add_table(table, told["caption"].format(**words).strip(), title=told["title"])

@@ -1,23 +1,32 @@
-"""Motion before and after: time histories and spectra of residuals."""
+"""Motion before and after: histories, spectra, and frequency and damping over the amplitude."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import welch
 
+from discrepancy.campaign.records import TrialKind
 from discrepancy.campaign.units import UNITS
+from discrepancy.errors import FitError
+from discrepancy.location.backbone import Backbone, backbones
 from discrepancy.location.dependence import predicted_frequencies
-from discrepancy.location.residuals import ResidualSet
-from discrepancy.report.kit import draw_noise, models, panels
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.report.kit import draw_noise, models, panels, plain_powers
 from discrepancy.report.residual_figures import size
 from reporting.figures import OBSERVED, REFERENCE, TRUTH, new_figure, publication_style
 
 FloatArray = NDArray[np.float64]
 
-COMPARABLE = 6.0
-"""Ratio of residuals before and after up to which they are drawn at one scale."""
+LEAST_POINTS = 4
+"""Fewest measured points of a mode whose backbone is drawn."""
+LARGEST_ERROR = 0.25
+"""Largest error of a damping ratio, relative to the median ratio, of a point that is drawn."""
+MOST_MODES = 3
+"""Modes that are fitted together in a window."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +37,11 @@ class Worst:
     channel: str
 
 
-def worst_record(before: ResidualSet) -> Worst | None:
+def worst_record(items: Sequence[FittedTrial]) -> Worst | None:
     """Return the dynamic record whose residuals exceed the noise most; None without one."""
     found = [
         (found, number, name)
-        for number, item in enumerate(before.trials)
+        for number, item in enumerate(items)
         if item.trial.is_dynamic
         for column, name in enumerate(item.trial.channels)
         if item.used[:, column].any() and np.isfinite(found := size(item, column))
@@ -63,22 +72,15 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
         axes.set_title(f"a  {worst.channel} in {item.trial.name}", loc="left")
         axes.legend(ncol=3, loc="upper right")
         axes.margins(x=0.01)
-        sizes = [size(one.residuals.trials[worst.trial], column) for one in shown]
-        alike = sizes[0] < COMPARABLE * sizes[-1]
         for number, ((panel,), one) in enumerate(zip(below, shown, strict=True)):
             each = one.residuals.trials[worst.trial]
             panel.sharex(axes)
             draw_noise(panel, factor * float(each.noise_deviation[column]), 0.3)
             panel.plot(time[used], factor * each.residual[used, column], lw=0.6, color=one.colour)
             panel.set_ylabel(f"residual, {unit}")
-            own = " (own scale)" if number and not alike else ""
-            panel.set_title(f"{'bc'[number]}  residual, {one.label}{own}", loc="left")
+            panel.set_title(f"{'bc'[number]}  residual, {one.label}", loc="left")
             panel.margins(x=0.01)
         below[0][0].legend(loc="upper right")
-        if alike:
-            limits = [limit for (panel,) in below for limit in panel.get_ylim()]
-            for (panel,) in below:
-                panel.set_ylim(min(limits), max(limits))
         figure.axes[-1].set_xlabel("time, s")
         for above in figure.axes[:-1]:
             above.tick_params(labelbottom=False)
@@ -145,3 +147,116 @@ def mode_frequencies(residuals: ResidualSet) -> tuple[float, ...]:
     """Return the frequencies [Hz] at which predictions ring, lowest first."""
     items = [item for item in residuals.trials if item.trial.is_dynamic]
     return predicted_frequencies(items) if items else ()
+
+
+# ---------------------------------------------------------------- backbones
+
+
+def _ringdowns(residuals: ResidualSet) -> list[FittedTrial]:
+    return [item for item in residuals.trials if item.trial.kind is TrialKind.RINGDOWN]
+
+
+def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
+    """Draw frequency and damping ratio of the ring-downs over the amplitude, and name the channel.
+
+    None where no record is long enough or no mode rings long enough.
+    """
+    items = _ringdowns(before)
+    frequencies = mode_frequencies(before if after is None else after)[:MOST_MODES]
+    worst = worst_record(items)
+    if worst is None or not frequencies:
+        return None
+    channel = worst.channel
+    measured = _backbones(items, channel, frequencies, None)
+    curves = [
+        (_backbones(_ringdowns(item.residuals), channel, frequencies, "prediction"), item)
+        for item in models(before, after)
+    ]
+    modes = [n for n in sorted(measured) if sum(len(c.time) for c in measured[n]) >= LEAST_POINTS][:2]
+    if not modes:
+        return None
+    factor, unit = UNITS[before.channels[channel].quantity].drawn
+    with publication_style():
+        figure, cells = panels(
+            len(modes), 2, 2.3 * len(modes) + 0.3, 1.0 - 0.22 / (2.3 * len(modes)), 0.19 / len(modes) + 0.02,
+            left=0.09, hspace=0.4, wspace=0.26,
+        )  # fmt: skip
+        for row, mode in enumerate(modes):
+            for place, (name, label, scale) in enumerate(
+                (("frequency", "frequency, Hz", 1.0), ("damping_ratio", "damping ratio, %", 100.0))
+            ):
+                axes = cells[row][place]
+                for found, shown in curves:
+                    for number, curve in enumerate(found.get(mode, [])):
+                        axes.plot(
+                            factor * curve.amplitude, scale * getattr(curve, name), shown.dashes,
+                            color=shown.colour, lw=1.1, alpha=0.8,
+                            label="_nolegend_" if number else shown.label,
+                        )  # fmt: skip
+                _draw_points(axes, measured[mode], name, factor, scale)
+                axes.set_xscale("log")
+                plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
+                axes.set_ylabel(label)
+                axes.set_title(f"{'abcd'[2 * row + place]}  mode {mode}", loc="left")
+                axes.set_xlabel(f"amplitude of {channel}, {unit}")
+                _range(axes, measured[mode], name, scale)
+                if row == 0 and place == 1:
+                    axes.legend(loc="best")
+    return figure, channel
+
+
+def _backbones(
+    items: Sequence[FittedTrial], channel: str, frequencies: Sequence[float], source: str | None
+) -> dict[int, list[Backbone]]:
+    found: dict[int, list[Backbone]] = {}
+    for item in items:
+        if channel not in item.trial.channels:
+            continue
+        column = item.column(channel)
+        noise = float(item.noise_deviation[column])
+        values = item.prediction[:, column] if source else np.where(
+            item.used[:, column], item.trial.values[:, column], item.prediction[:, column]
+        )  # fmt: skip
+        try:
+            curves = backbones(item.trial.time, values, list(frequencies), noise_deviation=noise)
+        except FitError:
+            continue
+        for curve in curves:
+            clear = _clear(curve)
+            if clear is not None:
+                found.setdefault(curve.mode, []).append(clear)
+    return found
+
+
+def _clear(curve: Backbone) -> Backbone | None:
+    """Return the points of a curve whose errors leave something to be seen."""
+    if not curve.time.size:
+        return None
+    limit = LARGEST_ERROR * max(float(np.median(np.abs(curve.damping_ratio))), 1e-4)
+    keep = curve.damping_ratio_error < limit
+    if not keep.any():
+        return None
+    fields = (
+        "time", "amplitude", "amplitude_error", "frequency", "frequency_error", "damping_ratio",
+        "damping_ratio_error",
+    )  # fmt: skip
+    return Backbone(curve.mode, *(getattr(curve, name)[keep] for name in fields))
+
+
+def _draw_points(axes: Axes, curves: Sequence[Backbone], name: str, factor: float, scale: float) -> None:
+    label = "measured, ± 1 standard error"
+    for curve in curves:
+        axes.errorbar(
+            factor * curve.amplitude, scale * getattr(curve, name), scale * getattr(curve, f"{name}_error"),
+            fmt="o", ms=2.6, color=OBSERVED, elinewidth=0.6, lw=0.0, alpha=0.85, label=label, zorder=3,
+        )  # fmt: skip
+        label = "_nolegend_"
+
+
+def _range(axes: Axes, curves: Sequence[Backbone], name: str, scale: float) -> None:
+    """Show what was measured and its surroundings, whatever a wrong model does."""
+    values = scale * np.concatenate([getattr(curve, name) for curve in curves])
+    low, high = np.quantile(values, (0.02, 0.98))
+    drawn = axes.get_ylim()
+    wide = max(float(high - low), 0.02 * abs(float(np.median(values))))
+    axes.set_ylim(max(drawn[0], low - 1.2 * wide), min(drawn[1], high + 1.2 * wide))

@@ -2,19 +2,8 @@
 
 from functools import partial
 
-from discrepancy.report.content import ReportFigure, ReportInput
-from discrepancy.report.findings import add_location, add_next, add_verdict
-from discrepancy.report.grounds import (
-    add_data,
-    add_gates,
-    add_inclusion,
-    add_not_fitted,
-    add_origin,
-    add_parameters,
-    add_proof,
-    add_self_calibration,
-    add_separability,
-)
+from discrepancy.report import findings, grounds
+from discrepancy.report.figures import ReportFigure, ReportInput
 from discrepancy.verdict import VerdictKind
 from reporting.page import Page
 
@@ -49,36 +38,35 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
                 page.add_figure(drawings[name], item.caption, title=item.title)
 
     page.add_section("Verdict")
-    add_verdict(page, content, partial(show, "missing_force"))
-    show("shares")
+    findings.add_verdict(page, content, partial(show, "missing_force"))
     if verdict.kind is VerdictKind.DATA_ERROR:
-        add_data(page, investigation)
-        add_origin(page, origin)
+        grounds.add_data(page, investigation)
+        grounds.add_origin(page, origin)
         return page.render()
     if verdict.next_experiments:
         page.add_section("Next experiment")
-        add_next(page, investigation)
-    page.add_section("Where the gap is")
-    add_location(page, investigation)
+        findings.add_next(page, investigation)
+    nothing = verdict.kind in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
+    page.add_section("What the model leaves" if nothing else "Where the gap is")
+    findings.add_location(page, investigation)
     show("residual_map", "residual_table", "time_line")
     page.add_section("What it looks like")
-    show("history", "backbone", "restoring_force", "spectrum", "load")
+    show("history", "backbone", "spectrum", "load")
     page.add_section("Why this verdict")
-    add_gates(page, investigation)
-    show("evidence")
-    add_inclusion(page, investigation)
-    add_not_fitted(page, verdict)
-    add_parameters(page, investigation)
+    grounds.add_gates(page, investigation)
+    grounds.add_evidence(page, verdict)
+    grounds.add_not_compared(page, verdict)
+    grounds.add_parameters(page, investigation)
     if investigation.proof is not None:
         page.add_section("Proof on held-out trials")
-        add_proof(page, investigation, investigation.proof)
+        grounds.add_proof(page, investigation, investigation.proof)
         show("pit")
     if content.separability is not None or content.self_calibration is not None:
         page.add_section("What this campaign can decide")
-        add_separability(page, content)
+        grounds.add_separability(page, content)
         show("separability")
-        add_self_calibration(page, content)
+        grounds.add_self_calibration(page, content)
         show("self_calibration")
-    add_data(page, investigation)
-    add_origin(page, origin)
+    grounds.add_data(page, investigation)
+    grounds.add_origin(page, origin)
     return page.render()

@@ -1,9 +1,10 @@
-"""Where the gap is: residuals on the wing, by channel and trial, and over the load."""
+"""Where and when the gap is: residuals on the wing, by channel and trial, over the load, and in time."""
 
 import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -13,36 +14,46 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Channel, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.report.kit import Shown, draw_noise, models, name_cells, panels, scale_of, size_bar, titles
+from discrepancy.report.kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar, titles
+from discrepancy.verdict import GapWindow, Moment
 from fe.wing.design import WingDesign
-from reporting.figures import LEVELS, OBSERVED, publication_style
+from reporting.figures import LEVELS, OBSERVED, REFERENCE, new_figure, publication_style
 
 FloatArray = NDArray[np.float64]
 
+MOST_RECORDS = 12
+"""Records that are drawn; those with the largest gaps go first."""
+LONGEST_NAME = 26
 MOST_CELLS = 12
 """Rows or columns up to which a heat map has its numbers written in."""
 _STRAIN = re.compile(r"strain\[(\d+)\]")
 
 
+def _squares(item: FittedTrial, column: int) -> NDArray[np.float64]:
+    """Return the sum of squared residuals of a channel over the noise, and what noise would leave (2,)."""
+    used = item.used[:, column]
+    left = np.sum(item.standardised[used, column] ** 2)
+    return np.array([left, item.expected_variance[used, column].sum()])
+
+
+def _rms(squares: NDArray[np.float64]) -> float:
+    """Return a size over what noise would leave; nan where the fit has absorbed all that there was."""
+    left, expected = squares
+    return float(np.sqrt(left / expected)) if expected >= 0.5 else float("nan")
+
+
 def size(item: FittedTrial, column: int) -> float:
     """Return the rms residual of a channel in a trial over what noise would leave; nan without samples."""
-    used = item.used[:, column]
-    expected = float(item.expected_variance[used, column].sum())
-    if expected < 0.5:  # the fit has absorbed all that there was
-        return float("nan")
-    return float(np.sqrt(np.sum(item.standardised[used, column] ** 2) / expected))
+    return _rms(_squares(item, column))
 
 
 def size_by_channel(residuals: ResidualSet) -> dict[str, float]:
     """Return the rms residual of each channel over what noise would leave, all trials together."""
-    squares: dict[str, list[float]] = {}
+    sums: dict[str, NDArray[np.float64]] = {}
     for item in residuals.trials:
         for column, name in enumerate(item.trial.channels):
-            used = item.used[:, column]
-            row = squares.setdefault(name, [0.0, 0.0])
-            row[0] += float(np.sum(item.standardised[used, column] ** 2))
-            row[1] += float(item.expected_variance[used, column].sum())
-    return {name: float(np.sqrt(s / e)) for name, (s, e) in squares.items() if e > 0.5}
+            sums[name] = sums.get(name, 0.0) + _squares(item, column)
+    return {name: size for name, squares in sums.items() if np.isfinite(size := _rms(squares))}
 
 
 def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
@@ -128,13 +139,9 @@ def _draw_planform(axes: Axes, design: WingDesign) -> None:
 
 
 def _draw_gauges(
-    axes: Axes,
-    channels: Mapping[str, Channel],
-    places: dict[str, tuple[float, float]],
-    sizes: dict[str, float],
-    norm: Normalize,
-    design: WingDesign,
-) -> None:
+    axes: Axes, channels: Mapping[str, Channel], places: dict[str, tuple[float, float]],
+    sizes: dict[str, float], norm: Normalize, design: WingDesign,
+) -> None:  # fmt: skip
     form = design.planform
     for name, (station, fraction) in places.items():
         if name not in sizes:
@@ -146,14 +153,9 @@ def _draw_gauges(
             edgecolors="#333333", linewidths=0.6, zorder=3,
         )  # fmt: skip
         axes.annotate(
-            name,
-            (station, depth),
-            (0.0, -6.5),
-            textcoords="offset points",
-            ha="center",
-            va="top",
+            name, (station, depth), (0.0, -6.5), textcoords="offset points", ha="center", va="top",
             fontsize=6.5,
-        )
+        )  # fmt: skip
 
 
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
@@ -169,25 +171,20 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
             1, len(tables), height, 1.0 - 0.28 / height, below / height, left=0.11,
             right=0.60 if after is None else 0.885, wspace=0.06,
         )  # fmt: skip
+        few = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
         for number, (axes, (_, _, table), title) in enumerate(zip(row, tables, titles(shown), strict=True)):
-            axes.imshow(np.ma.masked_invalid(table), cmap=LEVELS, norm=norm, aspect="auto")
-            name_cells(axes, [""] * len(channels) if number else channels, trials, 40)
+            names = ([""] * len(channels) if number else channels, trials)
+            heat_map(axes, table, names, norm, 40, _cells(table) if few else None)
             axes.set_title(title, loc="left")
-            if len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS:
-                _write_cells(axes, table, norm)
         right = 0.62 if after is None else 0.905
         size_bar(figure, norm, (right, below / height, 0.016, 1.0 - (below + 0.28) / height))
     return figure
 
 
-def _write_cells(axes: Axes, table: FloatArray, norm: Normalize) -> None:
-    for (row, column), value in np.ndenumerate(table):
-        if np.isfinite(value):
-            text = f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
-            dark = float(norm(value)) < 0.6
-            axes.text(
-                column, row, text, ha="center", va="center", fontsize=6.0, color="white" if dark else "black"
-            )
+@np.vectorize
+def _cells(value: float) -> str:
+    """Return what a cell says of a size."""
+    return "" if np.isnan(value) else f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None:
@@ -220,8 +217,7 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
             axes.set_xlabel(label)
             axes.set_ylabel(f"residual, {unit}")
             axes.set_title(f"{'abcd'[number]}  {kind.value}, {quantity.value}", loc="left")
-            if number == 0:
-                axes.legend(loc="best", fontsize=6.8)
+        figure.legend(*cells[0][0].get_legend_handles_labels(), loc="upper right", ncols=3)
     return figure
 
 
@@ -245,3 +241,62 @@ def _draw_loads(axes: Axes, shown: Shown, kind: TrialKind, names: Sequence[str],
             )  # fmt: skip
             label = "_nolegend_"
     return noise
+
+
+# ---------------------------------------------------------------- when
+
+
+def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
+    """Draw the windows of the records with the largest gaps; None without a window."""
+    if not windows:
+        return None
+    sizes: dict[str, float] = {}
+    for window in windows:
+        sizes[window.trial] = max(sizes.get(window.trial, 0.0), window.size)
+    largest = set(sorted(sizes, key=lambda name: -sizes[name])[:MOST_RECORDS])
+    trials = [name for name in sizes if name in largest]
+    norm = scale_of([window.size for window in windows])
+    both = any(window.with_effect for window in windows)
+    height = 0.34 * len(trials) + 0.9
+    with publication_style():
+        figure = new_figure(height)
+        figure.set_layout_engine("constrained")
+        axes = figure.add_subplot()
+        for row, name in enumerate(trials):
+            own = [window for window in windows if window.trial == name]
+            _draw_record(axes, row, own, norm, both=both)
+        axes.set_yticks(range(len(trials)), [_short(name) for name in trials])
+        axes.set_ylim(len(trials) - 0.4, -0.6)
+        axes.tick_params(axis="y", length=0)
+        axes.spines["left"].set_visible(False)
+        axes.set_xlabel("time since the start of the trial, s")
+        size_bar(figure, norm, axes)
+    return figure
+
+
+def _draw_record(axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, both: bool) -> None:
+    first, last = windows[0].first, windows[0].last
+    for middle in (row - 0.14, row + 0.2) if both else (row,):
+        axes.plot([first, last], [middle, middle], color=REFERENCE, lw=1.0, zorder=1)
+    for window in windows:
+        begin = first if window.begin is None else window.begin.value
+        end = last if window.end is None else window.end.value
+        low, height = (row + 0.1, 0.2) if window.with_effect else (row - 0.34, 0.4 if both else 0.68)
+        colour = colormaps[LEVELS](float(norm(window.size)))
+        axes.broken_barh(
+            [(begin, end - begin)], (low, height), facecolor=colour, edgecolor="#333333", lw=0.5, zorder=2
+        )
+        for moment in (window.begin, window.end):
+            if moment is not None:
+                _draw_moment(axes, moment, low + 0.5 * height, height)
+
+
+def _draw_moment(axes: Axes, moment: Moment, middle: float, height: float) -> None:
+    axes.plot([moment.low, moment.high], [middle, middle], color="white", lw=2.6, zorder=3)
+    axes.plot([moment.low, moment.high], [middle, middle], color=OBSERVED, lw=1.2, zorder=4)
+    for at in (moment.low, moment.high):
+        axes.plot([at, at], [middle - 0.3 * height, middle + 0.3 * height], color=OBSERVED, lw=0.9, zorder=4)
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}\N{HORIZONTAL ELLIPSIS}"

@@ -3,16 +3,12 @@
 from collections.abc import Sequence
 from math import isfinite
 
-import numpy as np
-
 from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.document_types import PRIMITIVE_UNITS
 from discrepancy.files.patch import PrimitiveInterval
 from discrepancy.models.interface import Model
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.wing import WingModel
-from discrepancy.models.wrapped import innermost
+from discrepancy.models.port_units import turns, unit_of_state
 from discrepancy.report.text import NAMING, rounded, unit_text
 from discrepancy.verdict import NamedEffect
 from discrepancy.workflow import Investigation
@@ -20,8 +16,6 @@ from fe.runtime.patch import CHANNEL_UNIT, ModelPatch, Primitive
 
 BESIDE = ("reference_velocity", "reference_displacement", "time", "start", "length", "station")
 """Where or at what a size holds; no sizes themselves."""
-ROTATING_PORT = "root"
-"""Port of the wing that turns; its others move up and down."""
 
 
 def si_sizes(
@@ -68,7 +62,7 @@ def size_sentence(
     sizes = [si_sizes(e.patch, row, model, campaign) for e, row in zip(effects, intervals, strict=True)]
     named = investigation.verdict.kind in NAMING
     parts = [
-        size if named and len(effects) == 1 else f"{effect.name} {size}"
+        size if named and len(effects) == 1 else f"{effect.name}, {size}"
         for effect, size in zip(effects, sizes, strict=True)
         if size
     ]
@@ -115,42 +109,9 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
         units = {"1" if item is Quantity.SIGNAL else UNITS[item].si for item in measured}
         return unit_text(units.pop()) if len(units) == 1 and unit == CHANNEL_UNIT else ""
     if " or " in unit:
-        if state := _unit_of_state(str(getattr(primitive, "port", "")), model):
+        port = str(getattr(primitive, "port", ""))
+        if state := unit_of_state(port, model):
             return state if unit.startswith("m/s") else f"{state}/s times capacity"
         moving, turning = unit.split(" or ")
-        return {True: turning, False: moving, None: unit}[_turns(str(getattr(primitive, "port", "")), model)]
+        return {True: turning, False: moving, None: unit}[turns(port, model)]
     return unit_text(unit)
-
-
-def _unit_of_state(port: str, model: Model) -> str:
-    """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
-    model = innermost(model)
-    if not isinstance(model, LumpedModel):
-        return ""
-    first = model.description.size
-    if not any(any(item.vector[first:]) for item in model.description.port if item.name == port):
-        return ""
-    shown = {item.quantity for item in model.description.output if item.vector and any(item.vector[first:])}
-    return unit_text(UNITS[shown.pop()].si) if len(shown) == 1 else "of the state's unit"
-
-
-def _turns(port: str, model: Model) -> bool | None:
-    """Return whether a port turns; None where the model does not say it.
-
-    A port of a lumped model moves if it is a sum or difference of unknowns measured as displacements.
-    """
-    model = innermost(model)
-    if isinstance(model, WingModel):
-        return port == ROTATING_PORT
-    if not isinstance(model, LumpedModel):
-        return None
-    vectors = [np.array(item.vector) for item in model.description.port if item.name == port]
-    if not vectors or not np.all(np.isin(vectors[0], (-1.0, 0.0, 1.0))):
-        return None
-    rows = [item.vector for item in model.description.output if item.quantity == "displacement"]
-    measured = {
-        int(np.argmax(row))
-        for row in rows
-        if row is not None and np.count_nonzero(row) == 1 and max(row) == 1.0
-    }
-    return False if set(np.flatnonzero(vectors[0])) <= measured else None

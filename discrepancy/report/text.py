@@ -2,17 +2,32 @@
 
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from math import floor, isfinite, isnan, log10
 from pathlib import Path
 from typing import Any
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.verdict import Estimate, ExplainedShare, Hypothesis, Verdict, VerdictKind
+from discrepancy.verdict import (
+    Estimate,
+    ExplainedShare,
+    ForceAtPort,
+    Hypothesis,
+    NamedEffect,
+    Proof,
+    Scores,
+    ShareOfForce,
+    Verdict,
+    VerdictKind,
+)
 from discrepancy.workflow import Investigation
+from reporting.words import counted, listing
 
 WORDS: dict[str, Any] = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 """What each kind of verdict means, also where the absolute fit could not be judged, and words of figures."""
+
+SAID: dict[str, str] = WORDS["said"]
+"""Paragraphs and remarks."""
 
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
 """Verdicts that say what is missing, if not all of it."""
@@ -21,6 +36,11 @@ LARGEST_PLAIN = 1e6
 """Numbers from here on have a power of ten."""
 
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
+MOTIONS = {
+    "N": ("force", "m", "m/s"), "N m": ("moment", "rad", "rad/s"),
+    "N or N m": ("force", "m or rad", "m/s or rad/s"),
+}  # fmt: skip
+"""What is missing at a port, and units of its displacement and speed, by the unit of the force."""
 
 
 def estimate_text(estimate: Estimate) -> tuple[str, str]:
@@ -102,10 +122,85 @@ def headline(verdict: Verdict) -> str:
     return f"{text} ({about} {probability_text(verdict.probability)})."
 
 
+def effects_text(effects: Iterable[NamedEffect], joint: str = "and") -> str:
+    """Return effects with their places."""
+    found = (f"{item.name} at {item.place}" if item.place else item.name for item in effects)
+    return listing(dict.fromkeys(found), joint)
+
+
+def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
+    """Return the members of a group by name, each with its effects; empty for any other verdict."""
+    found = {}
+    for group in verdict.group if verdict.kind is VerdictKind.GROUP else ():
+        one = next((item for item in verdict.hypotheses if " + ".join(item.identifiers) == group), None)
+        effects = tuple(item for item in verdict.effects if item.identifier == group)
+        effects = effects if one is None else one.effects
+        found[effects_text(effects) or group] = effects
+    return found
+
+
+def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
+    """Return what is missing, and the units of displacement and speed of its port."""
+    return MOTIONS.get(force.unit, ("flow", "", force.unit.partition("/s times")[0]))
+
+
+def force_sentence(force: ForceAtPort) -> str:
+    """Return where a force is missing, how large, what orders it, and what share of it its law is."""
+    what, place, rate = motion_of(force)
+    most = force.largest
+    at = f"{number(most.displacement)} {place} and " if place else ""
+    order = ""
+    if not force.law:
+        share = max(force.orders.values())
+        by = f"ordered by {listing(force.ordered_by)} ({100.0 * share:.0f} % of its variance)"
+        order = f", {by if force.ordered_by else 'ordered by none of displacement, velocity and time'}"
+    others = {name: value for name, value in force.evidence.items() if name != force.port}
+    own, beside = force.evidence[force.port], ""
+    if others:
+        nearest = max(others, key=lambda name: others[name])
+        ahead = own - others[nearest]
+        beside = f", {abs(ahead):,.0f} {'more' if ahead >= 0.0 else 'less'} than at {nearest}"
+    sentence = (
+        f"A {what} of {number(force.rms)} {force.unit} (rms) is missing at {force.port}, at most "
+        f"{number(abs(most.force))} at {at}{number(most.speed)} {rate}{order} (evidence {own:,.0f} nat over "
+        f"none{beside})."
+    )
+    tested = [share for share in (force.fitted, force.held_out) if share is not None and share.tested]
+    if tested:
+        shares = [
+            f"{share_text(share)} of {'what it does to predictions' if share.ahead else 'it'} in "
+            f"{counted(share.trials, 'fitted trial' if share is force.fitted else 'held-out trial')}"
+            for share in tested
+        ]
+        left, whole = number(tested[-1].left), number(tested[-1].whole)
+        sentence += (
+            f" {force.law[:1].upper()}{force.law[1:]} is {listing(shares)}, where {left} of {whole} "
+            f"{force.unit} (rms) are left."
+        )
+    return sentence
+
+
+def share_text(share: ShareOfForce) -> str:
+    """Return a share with its 90 % interval."""
+    return f"{100.0 * share.value:.3g} % ({100.0 * share.low:.3g} to {100.0 * share.high:.3g})"
+
+
+def rests_on_force(verdict: Verdict) -> bool:
+    """Whether hypotheses were weighed along the missing force, and not by what simulations of them leave."""
+    return any(isnan(item.chi_square) for item in verdict.hypotheses[:1])
+
+
+def scored(proof: Proof) -> tuple[Scores, Scores, str]:
+    """Return the scores before and after, and on which trials: those held out, where there are any."""
+    if proof.held_out_before is not None and proof.held_out_after is not None:
+        return proof.held_out_before, proof.held_out_after, "held-out"
+    return proof.fitted_before, proof.fitted_after, "fitted"
+
+
 def shares_sentence(verdict: Verdict) -> str:
     """Return what the mean square of the gap is made of, and what is left; empty where it is not known."""
     found = verdict.explained
-    if found is None:
+    if found is None or rests_on_force(verdict):
         return ""
     whose = "The best hypothesis takes" if verdict.kind is VerdictKind.UNEXPLAINED else "The effect takes"
     return (

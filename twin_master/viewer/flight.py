@@ -9,10 +9,13 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.errors import DamagedFileError
+from reporting.json_file import read_json
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import Expected, LearntExpectation
 from twin_master.learning.setup import learning_filter
@@ -20,7 +23,7 @@ from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, kept_knowledge
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import known_control, predict
-from twin_master.run_folder import read_config
+from twin_master.run_folder import PICTURE, VERDICT, read_config
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.viewer.journal import GrowingJournal, SeenTurn
@@ -62,6 +65,27 @@ class Belief:
     control_probability: Float
 
 
+class Picture(NamedTuple):
+    """The missing force that a verdict shows: behind which turn it came, its drawing, what it says."""
+
+    turn: int
+    drawing: Path
+    said: str
+
+
+def _picture(turn: int, verdict: Path) -> Picture | None:
+    """Return what the folder of a verdict shows of a missing force; None: nothing, or no whole verdict."""
+    drawing = verdict / PICTURE
+    if not drawing.is_file():
+        return None
+    try:
+        return Picture(
+            turn, drawing, str(read_json(verdict / VERDICT, DamagedFileError)["verdict"]["sentence"])
+        )
+    except (DamagedFileError, KeyError, TypeError):
+        return None
+
+
 class Flight:
     """A run or a watch that is looked at: its turns, and what the twin concluded in each when it was there.
 
@@ -77,6 +101,8 @@ class Flight:
 
     Attributes
     ----------
+    pictures : list of Picture
+        Of the missing forces that verdicts show, in the order in which they came.
     number : int
         Grows when turns were taken back, as a resumed run may do, or changed, as by an observation that came
         late: what was told of the flight is then void.
@@ -93,6 +119,7 @@ class Flight:
         self._believed, self._observed = array("q"), array("q")
         self._kept: OrderedDict[int, SeenTurn] = OrderedDict()
         self._told: dict[int, tuple[Notice, ...]] = {}  # behind a turn, where none came
+        self.pictures: list[Picture] = []
         self.number = 0
 
     def _know(self) -> None:
@@ -122,6 +149,7 @@ class Flight:
             self._believed, self._observed = array("q"), array("q")
             self._kept.clear()
             self._told.clear()
+            self.pictures.clear()
             self.number += 1
         if (kept := self._kept_at()) != self._knowledge_of:  # a patched model was adopted
             self._knowledge_of = kept
@@ -134,6 +162,9 @@ class Flight:
                 if line.notices:
                     turn = max(self.turns - 1, 0)
                     self._told[turn] = self._told.get(turn, ()) + line.notices
+                    self.number += 1
+                if line.verdict and (found := _picture(max(self.turns - 1, 0), self.folder / line.verdict)):
+                    self.pictures.append(found)
                     self.number += 1
                 continue
             if line.seen.turn == self.turns:
@@ -227,11 +258,7 @@ class Flight:
         model, plan = self.knowledge.model, self.knowledge.plan
         seen = self.seen(turn, turn + 1)[0]
         coming = predict(
-            model,
-            seen.filtered,
-            seen.control_index,
-            plan.policy,
-            self.scenario.mission.prediction_steps,
+            model, seen.filtered, seen.control_index, plan.policy, self.scenario.mission.prediction_steps
         )
         found = self._belief(coming.joint, None, coming.control_probability)
         if self._expectation is None:

@@ -67,11 +67,14 @@ class News:
         The turn that it tells; None where it is of the watch itself, such as a model that was adopted.
     notices : tuple of Notice
         What the operator was told where no turn came.
+    verdict : str
+        Folder of the verdict that came, or whose patch was adopted, in that of the watch; empty: none.
     """
 
     place: int
     seen: SeenTurn | None
     notices: tuple[Notice, ...] = ()
+    verdict: str = ""
 
 
 class GrowingJournal:
@@ -125,7 +128,10 @@ class GrowingJournal:
                     record = self._record(line, self._lines)
                     if self._end:  # not the heading
                         seen = _seen(record) if "filtered" in record else None
-                        found.append(News(self._end, seen, () if seen else _notices(record)))
+                        told = () if seen else _notices(record)
+                        verdict = record.get("verdict", {}).get("folder", "")
+                        verdict = record.get("model", {}).get("verdict", verdict)
+                        found.append(News(self._end, seen, told, verdict))
                     self._end += len(line)
                     self._lines += 1
         except FileNotFoundError:

@@ -103,6 +103,7 @@ class Teller:
             "count": count,
             "turn": turn,
             "first": first,
+            "picture": self._picture(turn),
         }
         try:
             past = self._text("past", first, end) if first < end else "null"
@@ -110,6 +111,14 @@ class Teller:
         except BegunAnewError:
             return None
         return f'{json.dumps(heading)[:-1]}, "past": {past}, "ahead": {ahead}}}'
+
+    def _picture(self, turn: int) -> dict[str, str] | None:
+        """Return the missing force that was known at a turn: where it is drawn, and what the verdict says."""
+        known = [number for number, item in enumerate(self._flight.pictures) if item.turn <= turn]
+        if not known:
+            return None
+        address = f"missing_force.svg?flight={self._flight.number}&picture={known[-1]}"
+        return {"address": address, "said": self._flight.pictures[known[-1]].said}
 
     def _text(self, what: str, first: int, end: int) -> str:
         """Return a part of an answer; viewers that follow a flight ask for the same one."""

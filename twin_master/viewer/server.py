@@ -11,7 +11,7 @@ from bokeh.util.paths import bokehjs_path
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import PeriodicCallback
 from tornado.netutil import bind_sockets
-from tornado.web import Application, RequestHandler, StaticFileHandler
+from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from reporting.errors import ReportingError
@@ -115,6 +115,22 @@ class _Text(RequestHandler):
         self.write(self._text)
 
 
+class _Picture(_Text):
+    """The missing force of a verdict, by its number."""
+
+    def initialize(self, flight: Flight) -> None:  # type: ignore[override]
+        self._flight = flight
+
+    def get(self) -> None:
+        try:
+            found = self._flight.pictures[int(self.get_argument("picture"))]
+            drawing = found.drawing.read_bytes()
+        except (ValueError, IndexError, OSError) as error:
+            raise HTTPError(404) from error
+        self.set_header("Content-Type", "image/svg+xml")
+        self.write(drawing)
+
+
 def _application(flight: Flight, viewers: _Viewers) -> Application:
     scene = scene_of(flight.folder, flight.knowledge)
     page = page_html(scene, scene_record(scene) | {"tallest_bar": TALLEST_BAR})
@@ -132,6 +148,7 @@ def _application(flight: Flight, viewers: _Viewers) -> Application:
         [
             *((path, _Text, {"text": text, "kind": kind}) for path, text, kind in texts),
             ("/turns", _Turns, {"viewers": viewers}),
+            ("/missing_force.svg", _Picture, {"flight": flight}),
             ("/bokeh/(bokeh.min.js)", StaticFileHandler, {"path": str(Path(bokehjs_path()) / "js")}),
         ],
     )

@@ -57,6 +57,7 @@ async function take(answer) {
   state.count = answer.count;
   if (answer.ahead !== null) state.ahead = answer.ahead;
   control(answer);
+  picture(answer.picture);
   if (moved) {
     draw();
     await allPainted();
@@ -99,6 +100,14 @@ function control(answer) {
   slider.setAttribute("aria-valuetext", `${scene.step_name} ${answer.turn}`);
   element("count").textContent = `${scene.step_name} ${answer.turn} of ${answer.count - 1}`;
   element("latest").setAttribute("aria-pressed", String(state.wanted === scene.latest));
+}
+
+// Of the last verdict that was known at the turn shown, where motion was observed.
+function picture(found) {
+  element("force").hidden = found === null;
+  if (found === null) return;
+  if (element("picture").getAttribute("src") !== found.address) element("picture").src = found.address;
+  element("verdict").textContent = found.said;
 }
 
 function bands(rows, turns) {

@@ -28,7 +28,7 @@ from twin_master.mission.loop import Source, operate
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
-from twin_master.run_folder import tidy, with_inputs
+from twin_master.run_folder import PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
@@ -251,11 +251,21 @@ class Watch:
             raise MissionInputError(
                 f"--from-turn names one of the {turns} turns watched so far, or the next one."
             )
-        self.adopt(
-            journal, judged(self.trial(journal, patched.file, patched.from_turn), self._progress), None
-        )
+        outcome = judged(self.trial(journal, patched.file, patched.from_turn), self._progress)
+        self.adopt(journal, outcome, None, self._kept_verdict(patched.file.parent))
 
-    def adopt(self, journal: JournalFile, outcome: Outcome, notice: Mapping[str, Any] | None) -> Twin:
+    def _kept_verdict(self, found: Path) -> str:
+        """Keep the missing force that a verdict shows, for viewers; return where, empty without one."""
+        if not (found / PICTURE).is_file() or not (found / VERDICT).is_file():
+            return ""
+        kept = f"{TEACHING}/given_{len(self.models)}"
+        for name in (VERDICT, PICTURE):
+            atomic_write_bytes(self.folder / kept / name, (found / name).read_bytes())
+        return kept
+
+    def adopt(
+        self, journal: JournalFile, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = ""
+    ) -> Twin:
         """Believe a patched model; return the twin that goes on."""
         name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
         atomic_write_bytes(self.folder / name, outcome.trial.patch)
@@ -266,6 +276,7 @@ class Watch:
             "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
             "before": outcome.before, "after": outcome.after, "alarms": [vars(alarm) for alarm in alarms],
             "policy_change": outcome.policy_change, **({} if notice is None else {"notice": dict(notice)}),
+            **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
         line = {
             "turn": twin.turns - 1,

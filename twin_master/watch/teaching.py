@@ -20,6 +20,7 @@ from typing import Any
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.trial import CANNOT, Judge, Outcome, Trial, beside, last_words
 
@@ -33,7 +34,6 @@ GROUP = "group"
 TRIED = ("named", "named in part", GROUP)
 """Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
 alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
-FOLDER = "teaching"
 NO_ALARMS = "--teach begins with an alarm, and this scenario gives none: `notice` is off."
 NO_WING = (
     "--teach looks for what the model of a wing lacks: strains under the damage states z1 and z2, predicted "
@@ -69,7 +69,7 @@ class Question:
 
     def folder(self, watch: Path) -> Path:
         """Return where the verdict is put."""
-        return watch / FOLDER / f"turns_{self.from_turn}_to_{self.to_turn}"
+        return watch / TEACHING / f"turns_{self.from_turn}_to_{self.to_turn}"
 
 
 @dataclass
@@ -191,10 +191,10 @@ class Search:
             The search ended without a verdict; the sentence is the last one that it said.
         """
         folder = question.folder(self.watch)
-        while not (folder / "verdict.json").is_file():
+        while not (folder / VERDICT).is_file():
             if self._process is None:
                 self._begin(question, waited_for=wait)
-            elif (code := self._process.poll()) is not None and not (folder / "verdict.json").is_file():
+            elif (code := self._process.poll()) is not None and not (folder / VERDICT).is_file():
                 self._process = None
                 raise TwinMasterError(last_words(self._log(question), code))
             if not wait or asked_to_end():
@@ -243,11 +243,11 @@ def verdict_of(
         sentence = f"{where}, and the search ended without a verdict: {folder}"
         return {**asked, "tried": False, "kind": "none", "notice": notice_of("verdict", sentence)}
     try:
-        verdict = read_json(folder / "verdict.json", DamagedFileError)["verdict"]
+        verdict = read_json(folder / VERDICT, DamagedFileError)["verdict"]
         kind, said = str(verdict["kind"]), str(verdict["sentence"])
     except (DamagedFileError, KeyError, TypeError) as error:
         return verdict_of(watch, question, TwinMasterError(f"{folder.name}: {error}"), turn, step)
-    tried, patch = kind in TRIED and (folder / "patch.json").is_file(), folder / "patch.json"
+    tried, patch = kind in TRIED and (folder / PATCH).is_file(), folder / PATCH
     sentence = f"{where}: {kind}. {said}"
     if tried:
         which = "patch of the most probable of these" if kind == GROUP else "patch"
@@ -347,7 +347,7 @@ class Tutor:
         trial = teaching.trial
         if trial is None or teaching.turn < trial["turn"] + TRIAL_TURNS:
             return False
-        file = self._search.watch / trial["folder"] / "patch.json"
+        file = self._search.watch / trial["folder"] / PATCH
         try:
             compared = trial["turn"] + 1, TRIAL_TURNS
             outcome = self._judge.outcome(partial(self._trial, file, trial["from_turn"], compared))

@@ -126,10 +126,14 @@ def test_everything_comes_out_in_si(tmp_path: Path) -> None:
     assert [trial.name for trial in campaign.fitted] == ["tip load up", "release"]
 
 
-def test_a_column_of_no_channel_is_remarked(tmp_path: Path) -> None:
-    campaign = read_campaign(folder_of(tmp_path, tip_up="force,g71,w [mm]\n0,0.5,0.1\n5,120.25,7.3\n"))
+def test_a_column_of_no_channel_is_one_remark(tmp_path: Path) -> None:
+    release = TABLES["release.csv"].replace("time,w [mm]\n", "time,w [mm],g71\n")
+    release = "\n".join([line if "g71" in line else f"{line},1" for line in release.splitlines()])
+    tip_up = "force,g71,w [mm]\n0,0.5,0.1\n5,120.25,7.3\n"
+    campaign = read_campaign(folder_of(tmp_path, tip_up=tip_up, release=f"{release}\n"))
     assert campaign.trials[0].channels == ("tip",)
-    assert any("'g71'" in remark and "tip_up.csv" in remark for remark in campaign.remarks)
+    (said,) = (remark for remark in campaign.remarks if "'g71'" in remark)
+    assert said.startswith("tip_up.csv and 1 more: no channel has the column 'g71'")
 
 
 def test_hash_follows_every_file(tmp_path: Path) -> None:

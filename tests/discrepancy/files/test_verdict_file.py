@@ -34,11 +34,14 @@ from discrepancy.verdict import (
     Estimate,
     Experiment,
     ExplainedShare,
+    ForceAtPort,
+    ForceMoment,
     Gate,
     Hypothesis,
     NamedEffect,
     NotFitted,
     RemainderEstimate,
+    ShareOfForce,
     Verdict,
     VerdictKind,
 )
@@ -82,7 +85,12 @@ VERDICT = Verdict(
     remainders=(RemainderEstimate("x1", 2.5, 0.3, 0.0),),
     not_fitted=(NotFitted("free_play", "screened out", 0.3), NotFitted("washout", "no flight")),
     parameters=(STIFFNESS,),
-)
+    force=ForceAtPort(
+        "root", "N m", 0.31, 0.02, 0.5, ForceMoment("release", 0.4, -0.6, 0.01, -1.1), {"root": 812.5},
+        0.04, {"displacement": 0.1, "velocity": 0.97}, ("velocity",), "Coulomb friction",
+        ShareOfForce(0.99, 0.98, 0.995, 0.03, 0.31, False, 3, True), None,
+    ),
+)  # fmt: skip
 
 
 def same(first: object, second: object) -> bool:
@@ -101,7 +109,7 @@ def test_a_verdict_comes_back_equal(tmp_path: Path, make_bench) -> None:
         assert same(back.proof, content)
         assert back.origin == ORIGIN
     text = path.read_text(encoding="utf-8")
-    assert json.loads(text)["schema"] == "uav-twin verdict 3"
+    assert json.loads(text)["schema"] == "uav-twin verdict 4"
     assert "NaN" not in text
     again = write_verdict(tmp_path / "again.json", VERDICT, content, ORIGIN)
     assert again.read_bytes() == path.read_bytes()
@@ -206,7 +214,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
 
     refused(whole[: len(whole) // 2], "is not valid JSON")
     refused("[]", "no file of this kind")
-    refused(whole.replace("uav-twin verdict 3", "uav-twin verdict 9"), "schema 'uav-twin verdict 9'")
+    refused(whole.replace("uav-twin verdict 4", "uav-twin verdict 9"), "schema 'uav-twin verdict 9'")
     refused(whole.replace('"kind": "named"', '"kind": "guessed"'), "verdict.kind")
     refused(whole.replace('"probability": 0.998', '"probability": "high"'), "verdict.probability")
     refused(whole.replace('"sentence"', '"sentences"', 1), "sentence")
@@ -223,7 +231,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(VerdictFileError, match="There is no file"):
         read_verdict(tmp_path / "nothing.json")
     path.write_text(whole, encoding="utf-8")
-    with pytest.raises(VerdictFileError, match="'uav-twin verdict 3', but 'uav-twin patch 2' is needed"):
+    with pytest.raises(VerdictFileError, match="'uav-twin verdict 4', but 'uav-twin patch 2' is needed"):
         read_patch(path)
 
 
@@ -311,19 +319,25 @@ def test_residual_file_carries_units_and_refuses_damage(tmp_path: Path, make_ben
         read_residuals(path)
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", [1, 2, 3])
 def test_files_of_earlier_numbers_are_read(number: int, tmp_path: Path) -> None:
     path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
     content = json.loads(path.read_text(encoding="utf-8"))
     content["schema"] = f"uav-twin verdict {number}"
-    del content["model_file"], content["verdict"]["parameters"]
-    for row in content["verdict"]["hypotheses"]:
-        del row["parameters"]
-    later = {"explained": None, "remainders": (), "not_fitted": ()} if number == 1 else {}
+    later: dict[str, object] = {"force": None}
+    if number < 3:
+        del content["model_file"]
+        for row in content["verdict"]["hypotheses"]:
+            del row["parameters"]
+        later["parameters"] = ()
+    if number < 2:
+        later |= {"explained": None, "remainders": (), "not_fitted": ()}
     for key in later:
         del content["verdict"][key]
     path.write_text(json.dumps(content), encoding="utf-8")
-    hypotheses = tuple(replace(item, parameters=()) for item in VERDICT.hypotheses)
+    told = VERDICT if number == 3 else replace(
+        VERDICT, hypotheses=tuple(replace(item, parameters=()) for item in VERDICT.hypotheses)
+    )  # fmt: skip
     found = read_verdict(path)
-    assert same(found.verdict, replace(VERDICT, parameters=(), hypotheses=hypotheses, **later))
-    assert found.origin == replace(ORIGIN, model_file=None)
+    assert same(found.verdict, replace(told, **later))
+    assert found.origin == (ORIGIN if number == 3 else replace(ORIGIN, model_file=None))

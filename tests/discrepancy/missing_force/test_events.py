@@ -15,7 +15,7 @@ from discrepancy.missing_force.events import Acting, EventSearch
 from discrepancy.missing_force.filtered import Process
 from discrepancy.missing_force.view import View
 from discrepancy.missing_force.windows import residual_windows
-from discrepancy.report.time_line import time_line_figure
+from discrepancy.report.residual_figures import time_line_figure
 from discrepancy.verdict import GapWindow, Moment
 from discrepancy.workflow import investigate
 

@@ -30,6 +30,7 @@ from discrepancy.models.patched import PatchedModel
 from discrepancy.models.ported import apart, refined
 from discrepancy.models.wrapped import has_law
 from discrepancy.report.force_figure import missing_force_figure
+from discrepancy.report.text import force_sentence
 from discrepancy.search.strategy import Search
 from discrepancy.sources.examples import ExampleKind, example_campaign, plan_for, plan_of
 from discrepancy.verdict import VerdictKind
@@ -168,9 +169,24 @@ def test_a_report_opens_with_the_missing_force(tmp_path: Path) -> None:
         assert np.std(sizes) < 0.2 * np.mean(sizes)
         assert np.all(np.sign(item.force[moving]) == np.sign(item.speed[moving]))
         assert np.all(item.deviation > 0.0)
-    assert f"{missing.size:.3g} N" in missing.sentence
-    assert "Coulomb friction is" in missing.sentence
-    assert len(missing_force_figure(missing).axes) == 6
+    told = found.verdict.force  # as the file of the verdict has it
+    assert told is not None
+    assert (told.port, told.unit, told.law, told.ordered_by) == ("rail", "N", missing.law, ("velocity",))
+    force, speed = (np.concatenate([getattr(c, key) for c in missing.courses]) for key in ("force", "speed"))
+    assert told.rms == pytest.approx(np.sqrt(np.mean(force**2)))
+    assert told.speed == pytest.approx(np.sqrt(np.mean(speed**2)))
+    assert abs(told.largest.force) == np.abs(force).max()
+    (course,) = (item for item in missing.courses if item.trial == told.largest.trial)
+    assert told.largest.speed == course.speed[course.time == told.largest.time]
+    for share, trials in ((told.fitted, 2), (told.held_out, 1)):
+        assert share is not None
+        assert share.trials == trials
+        assert 0.9 < share.low <= share.value <= share.high
+        assert share.left < 0.3 * share.whole
+    said = force_sentence(told)
+    assert said.startswith(f"A force of {told.rms:.3g} N (rms) is missing at rail, at most ")
+    assert "Coulomb friction is" in said
+    assert len(missing_force_figure(missing, told).axes) == 6
 
 
 def test_a_rig_without_a_gap_misses_no_force(tmp_path: Path) -> None:

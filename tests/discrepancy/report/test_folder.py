@@ -14,8 +14,7 @@ from discrepancy.files.patch import read_patch
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_verdict
 from discrepancy.judgement.separability import Separability
-from discrepancy.report.content import ReportInput
-from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.figures import ReportInput, draw, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
@@ -48,7 +47,7 @@ def test_the_folder_of_a_named_effect(drag: Investigation, written: Path) -> Non
     residuals = read_residuals(folder / "residuals.nc")
     assert len(residuals.trials) == len(drag.campaign.trials)
     pictures = {path.name for path in (folder / "figures").iterdir()}
-    assert {"history.svg", "history.png", "evidence.svg", "backbone.svg", "separability.png"} <= pictures
+    assert {"history.svg", "history.png", "missing_force.svg", "backbone.svg", "separability.png"} <= pictures
     assert not list(folder.parent.glob(".*"))  # nothing half-written is left
 
 

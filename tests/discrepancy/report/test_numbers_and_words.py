@@ -17,6 +17,7 @@ from discrepancy.judgement.conclusion import named_effects
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
+from discrepancy.models.port_units import port_unit
 from discrepancy.models.wing import WingModel
 from discrepancy.report.residual_figures import (
     gauge_places,
@@ -153,6 +154,40 @@ port = [{ name = "outlet", vector = 1.0 }]
     ):
         patch = ModelPatch((law,))
         assert si_sizes(patch, primitive_intervals(patch), model, drag.campaign) == text
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "units"),
+    [
+        (
+            'output = [{ name = "a", vector = [1.0, 0.0], quantity = "angle" }]',
+            "",
+            ["N m", "N or N m", "N or N m"],
+        ),
+        (
+            'output = [{ name = "a", vector = [1.0, 0.0] }]',
+            'input = [{ name = "b", vector = [0.0, 1.0], quantity = "angular_velocity" }]',
+            ["N", "N m", "N or N m"],
+        ),
+    ],
+)
+def test_a_port_turns_as_what_is_measured_or_prescribed_of_it(
+    first: str, second: str, units: list[str]
+) -> None:
+    text = f"""
+format = 1
+name = "Two"
+mass = [[1.0, 0.0], [0.0, 1.0]]
+free = true
+{first}
+{second}
+port = [
+  {{ name = "one", vector = [1.0, 0.0] }}, {{ name = "other", vector = [0.0, 1.0] }},
+  {{ name = "between", vector = [1.0, -1.0] }},
+]
+"""
+    model = LumpedModel(parse_lumped(tomllib.loads(text)))
+    assert [port_unit(name, model) for name in ("one", "other", "between")] == units
 
 
 def test_a_name_that_holds_its_identifier_is_said_once(drag: Investigation) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -19,18 +20,19 @@ from discrepancy.report.check_tables import (
     rows_of,
     untested_lines,
 )
-from discrepancy.report.content import ReportInput
-from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.findings import add_verdict, closing_sentence
-from discrepancy.report.grounds import add_gates, parameter_rows
+from discrepancy.report.grounds import add_gates, add_not_compared, parameter_rows
 from discrepancy.report.page import render_report
 from discrepancy.report.residual_figures import size_table
 from discrepancy.report.text import (
     headline,
     number,
     percent,
+    probability_text,
     remainders_sentence,
     residual_sizes,
+    share_text,
     shares_sentence,
 )
 from discrepancy.verdict import ExplainedShare, NotFitted, RemainderEstimate, VerdictKind
@@ -63,6 +65,54 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: 
     worse = replace(drag, proof=replace(drag.proof, gap_closed=-0.2, held_out_after=None))
     assert closing_sentence(worse).startswith("On fitted trials χ²/dof is ")
     assert closing_sentence(replace(drag, proof=None)) == ""
+
+
+def text_of(investigation: Investigation) -> str:
+    """Return the whole page of an investigation without its figures."""
+    page = html.unescape(render_report(ReportInput(investigation, ORIGIN), {}, {}))
+    return page.replace("\N{NO-BREAK SPACE}", " ")
+
+
+def test_a_report_opens_with_effect_size_share_and_probability(drag: Investigation) -> None:
+    force = drag.verdict.force
+    assert force is not None
+    assert force.held_out is not None
+    text = text_of(drag)
+    opening = (
+        f"Quadratic aerodynamic damping at {force.port}", f"{number(force.rms)} N",
+        share_text(force.held_out), probability_text(drag.verdict.probability), headline(drag.verdict),
+    )  # fmt: skip
+    places = [text.index(f">{words}<") for words in opening]
+    assert places == sorted(places)
+
+
+def test_members_of_a_group_stand_apart_and_first(drag: Investigation) -> None:
+    (effect,) = drag.verdict.effects
+    rival = replace(effect, identifier="rival", name="a rival")
+    hypotheses = tuple(
+        replace(drag.verdict.hypotheses[0], effects=effects, log_evidence=0.0, probability=0.3)
+        for effects in ((), (effect,), (effect, replace(rival, identifier="other", name="other")), (rival,))
+    )
+    verdict = replace(
+        drag.verdict, kind=VerdictKind.GROUP, effects=(effect, rival), hypotheses=hypotheses,
+        group=(effect.identifier, rival.identifier),
+    )  # fmt: skip
+    text = text_of(replace(drag, verdict=verdict))
+    assert f"Quadratic aerodynamic damping at {effect.place} or a rival at {effect.place}" in text
+    members = re.findall(r"<td>(\d?)</td><td>(.*?)</td>", text[text.index("The members of the group") :])
+    assert [row for row in members if row[0]] == [("1", effect.name), ("2", "a rival")]
+    roles = re.findall(r"<td>([^<]*)</td><td>(member of the group|)</td>", text[text.index("Evidence.") :])
+    assert [role for _, role in roles[:4]] == ["member of the group"] * 2 + [""] * 2
+
+
+def test_what_was_not_compared_is_told_by_reason(drag: Investigation) -> None:
+    left = tuple(NotFitted(name, "No flight trial.") for name in ("washout", "inertia_relief"))
+    left += (NotFitted("free_play", "screened out: 0.3 nat at most", 0.3),)
+    page = Page("a", "b")
+    page.add_section("c")
+    add_not_compared(page, replace(drag.verdict, not_fitted=left))
+    assert "<td>No flight trial.</td><td>washout and inertia relief</td>" in page.render()
+    assert "<td>Screened out</td><td>free play (0.3 nat)</td>" in page.render()
 
 
 def test_parameters_are_shown_before_and_after(drag: Investigation) -> None:
@@ -100,7 +150,7 @@ def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_ju
         replace(absolute, passed=None, statistic=float("nan")), shape,
         replace(consistency, passed=False, statistic=2e-5),
     )  # fmt: skip
-    verdict = replace(drag.verdict, kind=VerdictKind.UNEXPLAINED, effects=(), gates=gates)
+    verdict = replace(drag.verdict, kind=VerdictKind.UNEXPLAINED, effects=(), gates=gates, force=None)
     page = Page("a", "b")
     page.add_section("c")
     add_verdict(page, ReportInput(replace(drag, verdict=verdict, proof=None), ORIGIN))
@@ -179,9 +229,7 @@ def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(dr
         not_fitted=(NotFitted("washout", "No flight trial."), NotFitted("free_play", "screened out", 0.3)),
     )
     content = ReportInput(replace(drag, verdict=verdict), ORIGIN)
-    figures = report_figures(content)
-    assert figures["shares"].title == "What the gap is made of"
-    text = render_report(content, draw({"shares": figures["shares"]}), {"shares": figures["shares"]})
+    text = render_report(content, {}, {})
     text = text.replace("\N{NO-BREAK SPACE}", " ")
     for words in (
         "90.0 % of the mean square on held-out trials",

@@ -22,6 +22,7 @@ import pytest
 
 from benchmarks.browser import CHROMIUM, open_browser
 from fe.wing.design import SHIPPED_DESIGN, load_design
+from reporting.figures import new_figure, to_svg
 from reporting.files import atomic_write_bytes
 from reporting.progress import SilentProgress
 from tests.command_line import command
@@ -349,6 +350,17 @@ def test_the_page_in_a_browser(begun: Path, lines: list[bytes], tmp_path: Path) 
         assert first.value("sources.ahead.data.turn") == list(range(11, 21))
         assert tabs[1].value("state.shown") == 29
         before = first.picture(tmp_path / "turn_10.png")
+        # A verdict on motion came behind turn 29.
+        (begun / "teaching" / "figures").mkdir(parents=True)
+        drawing = to_svg(new_figure(2.0))
+        (begun / "teaching" / "figures" / "missing_force.svg").write_bytes(drawing)
+        said = json.dumps({"verdict": {"sentence": "A spring is <missing>."}})
+        (begun / "teaching" / "verdict.json").write_text(said)
+        add(begun, line_of({"verdict": {"folder": "teaching", "notice": {}}}))
+        tabs[1].wait("!element('force').hidden && element('picture').naturalWidth > 0")
+        assert tabs[1].value("element('verdict').textContent") == "A spring is <missing>."
+        assert tabs[1].value("document.documentElement.scrollWidth <= innerWidth")
+        assert first.value("element('force').hidden")  # nothing was known at turn 10
         # A viewer that was away gets what it missed; one that looks back stays there, and knows of the rest.
         tabs[2].value("socket.onclose = null; socket.close()")
         add(begun, *lines[31:-1], line_of(json.loads(lines[-1][65:]) | TOLD))

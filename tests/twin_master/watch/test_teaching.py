@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import sys
 import time
 from dataclasses import replace
@@ -14,17 +15,27 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from fe.runtime.patch import ModelPatch, SensorGain
+from discrepancy.catalogue.library import library
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.verdict import VerdictKind
+from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
+from discrepancy.workflow import investigate
+from fe.runtime.patch import ModelPatch, PowerStiffness, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
 from scenarios import scenario_files
+from tests.discrepancy.rigs import ORIGIN
 from tests.twin_master.watch.watches import lines, watchful
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
 from twin_master.mission.loop import Flight
 from twin_master.network.inference import known_control
+from twin_master.viewer.flight import Flight as SeenFlight
+from twin_master.viewer.messages import Request, Teller
+from twin_master.viewer.scene import scene_of
 from twin_master.watch.feeds import CsvFeed
-from twin_master.watch.folder import Watch
+from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.replay import replay
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
 from twin_master.watch.trial import Judge, Outcome, patched_model, policy_change
@@ -90,6 +101,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
     assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
+    assert seen(watch).pictures == []  # turns show no motion, and no force in it
     # Stopped within the trial, and after the adoption: the same journal.
     stopped = watchful(base, tmp_path / "stopped")
     asked = verdict["to_turn"]
@@ -103,6 +115,46 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
         assert (again.folder / JOURNAL_NAME).read_bytes() == journal
         stopped = again
     assert journal == (watch.folder / JOURNAL_NAME).read_bytes()
+
+
+def seen(watch: Watch) -> SeenFlight:
+    """Return a watch as viewers see it."""
+    flight = SeenFlight(watch.folder)
+    while flight.update():
+        pass
+    return flight
+
+
+def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(
+    base: Watch, recorded: Path, tmp_path: Path
+) -> None:
+    """Releases on the ground, of the first mode as one mass, show a cubic spring at the tip."""
+    rig = LumpedModel.load("single_mass_rig")
+    tip = rig.description.port[0].model_copy(update={"name": "tip"})
+    rig = LumpedModel(rig.description.model_copy(update={"port": (tip,)}))
+    plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
+    hidden = ModelPatch((PowerStiffness("tip", 2.0, 3.0, 0, 0.02),))
+    campaign = example_campaign(rig, "ringdown", 3, replace(plan, duration=0.5 * plan.duration), hidden)
+    few = [item for item in library() if item.identifier in ("cubic_stiffness", "coulomb_friction")]
+    found = investigate(campaign, rig, few)
+    assert found.verdict.kind is VerdictKind.NAMED
+    write_verdict_folder(tmp_path / "verdict", VerdictContent(found, ORIGIN))
+    watch = watchful(base, tmp_path / "watch")
+    watch.run(CsvFeed(recorded, watch.scenario), lambda _d: None, turns=20)
+    assert seen(watch).pictures == []  # turns are no motion
+    given = Patched(tmp_path / "verdict" / "patch.json", 15)
+    watch.run(CsvFeed(recorded, watch.scenario), lambda _d: None, turns=25, patched=given)
+    shutil.rmtree(tmp_path / "verdict")
+    flight = seen(watch)
+    (picture,) = flight.pictures
+    teller = Teller(flight, scene_of(watch.folder, flight.knowledge))
+    assert b"<svg" in picture.drawing.read_bytes()
+    asked = Request(number=1, flight=-1, first=0, end=0, turn=18, shown=-1, count=-1)
+    assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time
+    shown = json.loads(str(teller.answer(replace(asked, turn=19))))["picture"]
+    assert shown["said"] == found.verdict.sentence
+    (picture.drawing.parent.parent / "verdict.json").write_text("{}")
+    assert seen(watch).pictures == []
 
 
 def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:

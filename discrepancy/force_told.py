@@ -1,0 +1,90 @@
+"""What a verdict tells of the missing force: size, motion, what orders it, and what share of it a law is."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from discrepancy.errors import DiscrepancyError
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.problem import Problem
+from discrepancy.missing_force.force import ForceCourse, MissingForce
+from discrepancy.missing_force.hypotheses import key_of
+from discrepancy.missing_force.naming import ForceSearch
+from discrepancy.missing_force.shares import ForceShare, ForceShares, order_of
+from discrepancy.models.port_units import port_unit
+from discrepancy.search.strategy import Search
+from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
+
+LEAST_ORDER, ALIKE = 0.3, 0.05
+"""Share of the force's variance from which a variable is said to order it, and by which others are alike."""
+
+
+def told_force(problem: Problem, search: Search, fit: CandidateFit, missing: MissingForce) -> ForceAtPort:
+    """Return what is told of a missing force beside the fit that stands for a verdict.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    search : Search
+        With its hypotheses along the missing force, if it has any.
+    fit : CandidateFit
+        What stands for the verdict.
+    missing : MissingForce
+        As it is drawn.
+    """
+    force, position, speed, time = (
+        np.concatenate([getattr(item, name) for item in missing.courses])
+        for name in ("force", "position", "speed", "time")
+    )
+    scaled = [values / max(float(np.std(values)), 1e-300) for values in (position, speed)]
+    orders = {
+        "displacement": order_of(position, force),
+        "velocity": order_of(speed, force),
+        "amplitude": order_of(np.hypot(*scaled), np.abs(force)),
+        "time": order_of(time, force),
+    }
+    least = max(LEAST_ORDER, max(orders.values()) - ALIKE)
+    rms, displacement, velocity = (float(np.sqrt(np.mean(item**2))) for item in (force, position, speed))
+    shares = _shares(problem, search, fit) if missing.law else (None, None)
+    ports = problem.model.ports()
+    laws = [(term.effect.name, term.place) for term in fit.candidate.terms if term.place in ports]
+    several = missing.law and len({place for _, place in laws}) > 1
+    return ForceAtPort(
+        missing.port, port_unit(missing.port, problem.model.inner), rms, displacement, velocity,
+        _largest(missing.courses), missing.evidence, missing.correlation_time, orders,
+        tuple(name for name, share in orders.items() if share >= least),
+        " and ".join(f"{name} at {place}" for name, place in laws) if several else missing.law, *shares,
+    )  # fmt: skip
+
+
+def _largest(courses: Sequence[ForceCourse]) -> ForceMoment:
+    item = max(courses, key=lambda one: float(np.abs(one.force).max()))
+    at = int(np.abs(item.force).argmax())
+    course = (item.time, item.force, item.position, item.speed)
+    return ForceMoment(item.trial, *(float(values[at]) for values in course))
+
+
+def _shares(
+    problem: Problem, search: Search, fit: CandidateFit
+) -> tuple[ShareOfForce | None, ShareOfForce | None]:
+    """Return the shares that a hypothesis is of the missing force, in fitted and in held-out trials."""
+    force, key = search.force, key_of(fit.candidate)
+    try:
+        if force is None:
+            force = ForceSearch(problem)
+            force.locate()
+        found = next((item for item in search.forces if key_of(item.candidate) == key), None)
+        found = found or force.followed(force.whole, fit.candidate, fit.point.effect)
+        if found is None:
+            return None, None
+        shares = ForceShares(force)
+        outside = _share(shares.of(found, held_out=True)) if shares.has_held_out else None
+        return _share(shares.of(found, held_out=False)), outside
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # a share that cannot be told is left out
+        return None, None
+
+
+def _share(share: ForceShare) -> ShareOfForce:
+    sizes = (share.value, *share.interval, share.left, share.whole)
+    return ShareOfForce(*sizes, ahead=share.ahead, trials=share.trials, tested=share.tested)
