@@ -1,8 +1,8 @@
 """Campaigns of further rigs that others measured: `python -m benchmarks.public_rigs DATA OUT`.
 
-DATA holds the records as they were published, `falling.txt`, `CoolingWater.csv` and `Q1.txt`, which are not part
-of the project (docs/measured_rigs.md says where they are). Campaign and `model.toml` of each are in the folder
-of its name here; they were written before the first run. Printed: the commands that search them.
+DATA holds the records as they were published, `falling.txt`, `CoolingWater.csv` and `Q1.txt`, which are not
+part of the project (docs/measured_rigs.md says where they are). Campaign and `model.toml` of each are in the
+folder of its name here; they were written before the first run. Printed: the commands that search them.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ JOINED = 4
 
 def fall(data: FloatArray) -> FloatArray:
     """Return time [s] since the first sample, and height [m] of the coffee filter."""
-    return data - [data[0, 0], 0.0]
+    return np.asarray(data - [data[0, 0], 0.0])
 
 
 def cooling(data: FloatArray) -> FloatArray:
     """Return time [s] and temperature [degC] of the mug, published with a number and minutes."""
-    return data[:, 1:] * [60.0, 1.0]
+    return np.asarray(data[:, 1:] * [60.0, 1.0])
 
 
 def swing(data: FloatArray) -> FloatArray:
@@ -43,10 +43,10 @@ def swing(data: FloatArray) -> FloatArray:
 
 RIGS: dict[str, tuple[str, int, str, str, Callable[[FloatArray], FloatArray]]] = {
     "coffee_filter": ("falling.txt", 2, "fall.csv", "height", fall),
-    "cooling_water": ("CoolingWater.csv", 1, "cooling.csv", "temperature", cooling),
+    "cooling_water": ("CoolingWater.csv", 1, "cooling.csv", "water", cooling),
     "swinging_gate": ("Q1.txt", 2, "swing.csv", "position", swing),
 }
-"""Published file, its lines of heading, table of the campaign, its column, and what makes one of the other."""
+"""Published file, its lines of heading, table of the campaign, its column, and what makes the table."""
 
 
 def write(rig: str, data: Path, folder: Path) -> Path:
