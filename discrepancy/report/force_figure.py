@@ -47,6 +47,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
 def _draw(axes: Axes, missing: MissingForce, column: int, *, left: bool) -> None:
     """Draw one panel: over displacement (0), speed (1) or time (2)."""
     axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
+    axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
     if column == 2:
         _draw_in_time(axes, missing, left=left)
     else:
