@@ -277,16 +277,21 @@ def believed(verdict: Verdict) -> tuple[NamedEffect, ...]:
 
 
 def study(
-    hidden: Hidden, seed: int, work: Path, turns: int = TURNS, effects: Sequence[Effect] | None = None
+    hidden: Hidden,
+    seed: int,
+    work: Path,
+    turns: int = TURNS,
+    effects: Sequence[Effect] | None = None,
+    again: bool = True,
 ) -> Case:
-    """Fly with a hidden effect, find it, and fly again with what was found."""
+    """Fly with a hidden effect, find it, and fly again with what was found if that is asked for."""
     began = perf_counter()
     place = work / f"{HIDDEN.index(hidden)}_{seed}"
     before = fly_mission(place.with_name(place.name + "_before"), seed, hidden.primitives, turns=turns)
     verdict = investigated(place.with_name(place.name + "_before"), seed, effects)
     after = None
     chosen = believed(verdict)
-    if chosen:
+    if chosen and again:
         found = outputs_of(sum((effect.patch for effect in chosen), ModelPatch()))
         corrections = tuple(item for item in map(undone, found) if item is not None)
         known = tuple(item for item in found if undone(item) is None)
@@ -315,6 +320,7 @@ def main() -> int:
     parser.add_argument("--first-seed", type=int, default=2021)
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
     parser.add_argument("--turns", type=int, default=TURNS)
+    parser.add_argument("--once", action="store_true", help="do not fly again with what was found")
     parser.add_argument("--catalogue", help="identifiers of effects that are looked for, with commas")
     given = parser.parse_args()
     effects = [effect_by_identifier(item, library()) for item in (given.catalogue or "").split(",") if item]
@@ -328,7 +334,7 @@ def main() -> int:
         for hidden in chosen:
             cases = []
             for seed in range(given.first_seed, given.first_seed + given.seeds):
-                case = study(hidden, seed, Path(folder), given.turns, effects or None)
+                case = study(hidden, seed, Path(folder), given.turns, effects or None, not given.once)
                 cases.append(case)
                 after = (
                     ""
