@@ -27,6 +27,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.wing_in_air import depends_on_temperature, scenario_in_air
+from discrepancy.catalogue.entry import Effect
+from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.sources.from_run import run_campaign, run_model
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import investigate
@@ -34,6 +36,7 @@ from fe.runtime.patch import (
     InertiaRelief,
     LocalStiffnessLoss,
     ModelPatch,
+    PointMass,
     Primitive,
     SensorDrift,
     SensorGain,
@@ -105,6 +108,8 @@ HIDDEN = (
         "all gauges show 15 microstrain/K, swing of 20 K",
     ),
     Hidden("inertia_relief", "", (InertiaRelief(0.25),), "structure's weight relieves the lift by 25 % more"),
+    Hidden("point_mass", "", (PointMass(0.2, 2.0),), "0.2 kg at 2 m"),
+    Hidden("point_mass", "", (PointMass(0.5, 2.0),), "0.5 kg at 2 m"),
 )  # fmt: skip
 
 
@@ -257,9 +262,9 @@ def undone(item: Primitive) -> Primitive | None:
     return None
 
 
-def investigated(folder: Path, seed: int) -> Verdict:
-    """Return the verdict on the run in a folder."""
-    return investigate(run_campaign(folder), run_model(folder), seed=seed, thorough=False).verdict
+def investigated(folder: Path, seed: int, effects: Sequence[Effect] | None = None) -> Verdict:
+    """Return the verdict on the run in a folder, by the whole catalogue or some of its effects."""
+    return investigate(run_campaign(folder), run_model(folder), effects, seed=seed, thorough=False).verdict
 
 
 def believed(verdict: Verdict) -> tuple[NamedEffect, ...]:
@@ -271,21 +276,29 @@ def believed(verdict: Verdict) -> tuple[NamedEffect, ...]:
     return ()
 
 
-def study(hidden: Hidden, seed: int, work: Path) -> Case:
-    """Fly with a hidden effect, find it, and fly again with what was found."""
+def study(
+    hidden: Hidden,
+    seed: int,
+    work: Path,
+    turns: int = TURNS,
+    effects: Sequence[Effect] | None = None,
+    again: bool = True,
+) -> Case:
+    """Fly with a hidden effect, find it, and fly again with what was found if that is asked for."""
     began = perf_counter()
-    place = work / f"{hidden.identifier or 'none'}_{seed}"
-    before = fly_mission(place.with_name(place.name + "_before"), seed, hidden.primitives)
-    verdict = investigated(place.with_name(place.name + "_before"), seed)
+    place = work / f"{HIDDEN.index(hidden)}_{seed}"
+    before = fly_mission(place.with_name(place.name + "_before"), seed, hidden.primitives, turns=turns)
+    verdict = investigated(place.with_name(place.name + "_before"), seed, effects)
     after = None
     chosen = believed(verdict)
-    if chosen:
+    if chosen and again:
         found = outputs_of(sum((effect.patch for effect in chosen), ModelPatch()))
         corrections = tuple(item for item in map(undone, found) if item is not None)
         known = tuple(item for item in found if undone(item) is None)
         after = fly_mission(
-            place.with_name(place.name + "_after"), seed, (*hidden.primitives, *corrections), known
-        )
+            place.with_name(place.name + "_after"), seed, (*hidden.primitives, *corrections), known,
+            turns=turns,
+        )  # fmt: skip
     return Case(hidden, seed, verdict, before, after, perf_counter() - began)
 
 
@@ -306,7 +319,11 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=2021)
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
+    parser.add_argument("--turns", type=int, default=TURNS)
+    parser.add_argument("--once", action="store_true", help="do not fly again with what was found")
+    parser.add_argument("--catalogue", help="identifiers of effects that are looked for, with commas")
     given = parser.parse_args()
+    effects = [effect_by_identifier(item, library()) for item in (given.catalogue or "").split(",") if item]
     console = Console(width=150)
     heads = ("rms z1, z2 {}", "90 % sets", "3g beyond the limit")
     table = Table(
@@ -317,7 +334,7 @@ def main() -> int:
         for hidden in chosen:
             cases = []
             for seed in range(given.first_seed, given.first_seed + given.seeds):
-                case = study(hidden, seed, Path(folder))
+                case = study(hidden, seed, Path(folder), given.turns, effects or None, not given.once)
                 cases.append(case)
                 after = (
                     ""

@@ -1,7 +1,7 @@
 """What the published ring-downs and loading runs of the real wing say about the wing model.
 
 `python -m benchmarks.study_real_wing DATA --pictures DIR` investigates them with several windows of the
-ring-downs, and the loading runs alone, and draws the picture of docs/real_wing.md. DATA is the authors'
+ring-downs, and the loading runs alone, and draws the pictures of docs/real_wing.md. DATA is the authors'
 calibration folder.
 """
 
@@ -22,6 +22,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.models.wing import WingModel
+from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.sources.real_wing import SIGNAL, RecordPlan, wing_campaign
 from discrepancy.workflow import Investigation, investigate
 
@@ -100,7 +101,7 @@ def held_out_rms(campaign: Campaign, found: Investigation) -> str:
 
 
 def draw(found: Investigation, folder: Path) -> None:
-    """Draw residuals of the first trial, and of the held-out ones, before and after."""
+    """Draw residuals of the first trial before and after, and the missing force."""
     mpl.use("agg")
     import matplotlib.pyplot as plt
 
@@ -125,6 +126,8 @@ def draw(found: Investigation, folder: Path) -> None:
     axes[2].set_xlabel("time since the release, s")
     figure.savefig(folder / "real_wing_residuals.png", dpi=90)
     plt.close(figure)
+    if found.missing is not None:
+        missing_force_figure(found.missing).savefig(folder / "real_wing_force.png", dpi=110)
 
 
 def main() -> int:

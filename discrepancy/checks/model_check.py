@@ -160,6 +160,9 @@ def _scales(campaign: Campaign, predictions: dict[str, FloatArray]) -> dict[tupl
             if expected <= _VISIBLE * largest[trial.name, channel.quantity] or expected == 0.0:
                 continue
             scale = _slope(data, model) if not trial.is_dynamic else _dynamic_scale(data, model, trial, used)
+            shown = float(np.median(data) * np.sign(np.median(model)))
+            if scale < 0.0 and not trial.is_dynamic and shown > 2.0 * channel.offset_deviation:
+                continue  # a reversed channel would show the other sign: this slope is a temperature's, say
             # What stays in the noise has no scale, unless the noise itself is beyond what the model shows.
             if abs(scale) * expected > _ABOVE_NOISE * noise and np.isfinite(scale) and scale != 0.0:
                 result[name, trial.name] = scale

@@ -269,7 +269,7 @@ class _Record:
             places, values = np.r_[places, new], np.r_[values, self._evidence(*found)[0]]
             order = np.argsort(places)
             places, values = places[order], values[order]
-            near = np.flatnonzero(values > values.max() - RANGE)
+            near = np.flatnonzero(values >= values.max() - RANGE)
             first, last = places[max(near[0] - 1, 0)], places[min(near[-1] + 1, len(places) - 1)]
 
 

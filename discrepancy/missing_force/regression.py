@@ -11,6 +11,8 @@ from .filtered import Filtered
 
 FloatArray = NDArray[np.float64]
 
+ROUNDING = 1e-12
+"""Share of the squared size of a column that rounding may have made."""
 LEAST_PRECISION = 1e-10
 """Of an unknown of which nothing is known before."""
 
@@ -44,11 +46,14 @@ class Regression:
         at = np.array([0, *(1 + k for k in chosen)])
         part = self.products[np.ix_(at, at)]
         prior = np.maximum(precision, LEAST_PRECISION)
-        factor = cho_factor(part[1:, 1:] + np.diag(prior))
-        mean = cho_solve(factor, part[1:, 0])
-        value = -0.5 * (part[0, 0] - part[0, 1:] @ mean) - self.log_determinant
-        value -= float(np.sum(np.log(np.diag(factor[0])))) - 0.5 * float(np.sum(np.log(prior)))
-        return Solution(float(value), mean, cho_solve(factor, np.eye(len(prior))))
+        size = 1.0 / np.sqrt(np.diag(part)[1:] + prior)  # columns may be of any scale, and nearly one another
+        scaled = (part[1:, 1:] + np.diag(prior)) * np.outer(size, size) + ROUNDING * np.eye(len(size))
+        factor = cho_factor(scaled)
+        mean = size * cho_solve(factor, size * part[1:, 0])
+        left = np.r_[1.0, -mean]
+        value = -0.5 * float(left @ part @ left + mean @ (prior * mean)) - self.log_determinant
+        value -= float(np.sum(np.log(np.diag(factor[0]) / size)) + 0.5 * np.sum(np.log(prior)))
+        return Solution(value, mean, np.outer(size, size) * cho_solve(factor, np.eye(len(prior))))
 
 
 def local_solution(

@@ -1,5 +1,7 @@
 """Natural scales of a lumped rig under a campaign: what acts and moves where the structure has none."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -144,6 +146,9 @@ def rig_scales(
             motion = lumped.moving(trial, conditions)
         except ModelError:
             motion = lumped.moving(trial, conditions, still=True)
+        if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
+            sizes = state_sizes(lumped, campaign, trial, conditions)
+            motion = lumped.moving(trial, replace(conditions, initial=sizes))
         ports.add(motion, max(pushes, default=0.0), not trial.held_out)
         here = motion.q @ motion.rig.shapes.T[:, : description.size]
         pace = motion.velocity @ motion.rig.shapes.T[:, : description.size]

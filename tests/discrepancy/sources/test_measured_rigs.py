@@ -1,5 +1,6 @@
 """Rigs that others measured: their files as published become campaigns, and what the search says of them."""
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.public_rigs.__main__ import BLOWN, RIGS, write
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.library import effect_by_identifier, library
@@ -20,6 +22,8 @@ from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
 from uav_twin.cli import app
 
+PUBLIC = os.environ.get("UAV_TWIN_PUBLIC_RIGS")
+"""Folder of the files of `benchmarks.public_rigs`, as they were published."""
 PUBLISHED = Path(__file__).parents[3].parent / "shared" / "reference" / "measured"
 Rig = tuple[Campaign, Model]
 
@@ -169,3 +173,51 @@ def test_the_pendulum_has_no_name_and_its_share_is_said(pendulum: Rig) -> None:
     assert verdict.kind is VerdictKind.UNEXPLAINED
     assert "is missing at 'pivot', ordered by" in verdict.sentence
     assert verdict.explained is None or verdict.explained.value < 0.5
+
+
+def write_public(folder: Path) -> None:
+    """Write records in the form in which they were published: a fall, a cooling and a swing."""
+    time = 0.1 * np.arange(500)
+    tables = {
+        "falling.txt": ("// a fall\nTime\tPosition", "\t", (time[:27] / 4.0, 0.5 - 0.3 * time[:27])),
+        "CoolingWater.csv": ('"","time","temp"', ",", (time, 10.0 * time, 22.0 + 70.0 * np.exp(-0.2 * time))),
+        "Q1.txt": ("Voltage\nTime\tVoltage", "\t", (time, 0.1 * np.exp(-0.03 * time) * np.cos(0.7 * time))),
+    }
+    for name, (heading, separator, columns) in tables.items():
+        np.savetxt(folder / name, np.column_stack(columns), "%.6f", separator, header=heading, comments="")
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name: str, tmp_path: Path) -> None:
+    write_public(tmp_path)
+    folder = write(name, tmp_path, tmp_path / name)
+    campaign, model = read_campaign(folder), load_model(folder / "model.toml")
+    assert not [fault for fault in check_against_model(campaign, model) if fault.fatal]
+    (trial,) = campaign.trials
+    swing = [0.1 * np.exp(-0.03 * t) * np.cos(0.7 * t) for t in BLOWN + 0.1 * np.arange(4)]
+    last, value = {  # of the swing means of four, from the moment on at which nobody blows any more
+        "coffee_filter": (0.65, 0.5),
+        "cooling_water": (29940.0, 92.0),
+        "swinging_gate": (40.4, np.mean(swing)),
+    }[name]
+    assert (trial.time[0], trial.time[-1], trial.values[0, 0]) == pytest.approx((0.0, last, value), rel=1e-4)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(PUBLIC is None, reason="UAV_TWIN_PUBLIC_RIGS names no folder of the published records")
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("coffee_filter", VerdictKind.UNEXPLAINED),
+        ("cooling_water", VerdictKind.NAMED_IN_PART),
+        ("swinging_gate", VerdictKind.UNEXPLAINED),
+    ],
+)
+def test_public_records_have_the_verdict_of_the_page(name: str, kind: VerdictKind, tmp_path: Path) -> None:
+    folder = write(name, Path(str(PUBLIC)), tmp_path / name)
+    verdict = investigate(folder, folder / "model.toml", thorough=False).verdict
+    assert verdict.kind is kind, verdict.sentence
+    if name == "cooling_water":
+        assert verdict.family == "outflow |x|^n"
+        low, high = map(float, re.search(r"of the level \S+ \((\S+) to (\S+)\)", verdict.sentence).groups())
+        assert 2.0 < low < high < 3.5
