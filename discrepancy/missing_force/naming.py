@@ -45,7 +45,7 @@ BEAM = 3
 """Sets to which one more effect is added."""
 BEGIN_TIMES = (1.0, 10.0)
 """Correlation times over that of the port's motion, from which the most probable one is looked for."""
-ROUNDS = 12
+ROUNDS = 8
 LONGEST_STEP = 1.5
 SETTLED = 0.05
 """Steps of the unknowns of an effect: how many, the longest, and that after which no other follows."""

@@ -331,7 +331,7 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path: 
     assert term.effect.identifier == "coulomb_friction"
     (friction,) = best.candidate.patch(problem.setting, best.effect)
     assert friction.coefficient == pytest.approx(20.4, rel=0.1)
-    assert np.abs(best.shared).max() < 0.5
+    assert np.abs(best.shared).max() < 1.5
 
 
 def chain(kind: ExampleKind, effect: str, place: str, **values: float) -> Problem:
