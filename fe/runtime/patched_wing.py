@@ -13,9 +13,12 @@ import numpy.typing as npt
 
 from .errors import InvalidPatchError
 from .local_loss import boxes_of, remaining_skin, strain_factors
+from .motion import laws_of
 from .patch import (
     INTERNAL_FORCES,
+    LOADS,
     InertiaRelief,
+    LoadGain,
     LoadPlace,
     ModelPatch,
     ModulusTemperature,
@@ -25,7 +28,7 @@ from .patch import (
     Washout,
 )
 from .patch_arrays import PatchArrays
-from .patched_structure import PatchedStructure, StructureTerms
+from .patched_structure import Modes, PatchedStructure
 from .planform_forces import PLANFORM, STATION_PORTS, PlanformStations, at_stations, planform_stations
 from .state import Losses
 
@@ -37,6 +40,10 @@ LOAD_PLACE = "tip_load"
 """Name of the place of the static test."""
 OVERHANG = 0.15
 """How far beyond the tip a place may lie, as a share of the semi-span."""
+HOLDING = 3
+"""Number of the load of `PatchedState` that holds the wing before a release."""
+MODE_COUNT = 6
+"""Modes that move; those whose frequencies the FMU shows."""
 PORTS = ("root", "tip", "span")
 """Ports where internal forces act on the motion of one place, or of the mean."""
 KNOWN_PORTS = (*PORTS, PLANFORM)
@@ -97,39 +104,63 @@ class PatchedWing:
         patch: ModelPatch = EMPTY,
         temperature_difference: float = 0.0,
     ) -> PatchedStructure:
-        """Return stiffness and mass at a state under a patch; primitives of other kinds are passed over.
+        """Return stiffness and mass at a state under a patch; see `stiffness` and `mass`."""
+        stiffness = self.stiffness(young_modulus_factor, stiffness_loss, patch, temperature_difference)
+        return PatchedStructure(self.arrays, stiffness, self.mass(servo_mass, pitot_mass, patch))
+
+    def mass(self, servo_mass: float, pitot_mass: float, patch: ModelPatch = EMPTY) -> FloatArray:
+        """Return the mass (n, n) with the point masses of a patch [kg].
+
+        Raises
+        ------
+        InvalidPatchError
+            If a place lies off the wing.
+        """
+        arrays = self.arrays
+        mass = arrays.mass[0] + servo_mass * arrays.mass[1] + pitot_mass * arrays.mass[2]
+        for item in patch:
+            if isinstance(item, PointMass):
+                for row in self._along(item.station) @ arrays.line_rows[:3]:
+                    mass += item.mass * np.multiply.outer(row, row)
+        return np.asarray(mass)
+
+    def stiffness(
+        self,
+        young_modulus_factor: float,
+        stiffness_loss: Losses,
+        patch: ModelPatch = EMPTY,
+        temperature_difference: float = 0.0,
+    ) -> FloatArray:
+        """Return the stiffness (n, n) at a state under a patch; primitives of other kinds are passed over.
 
         Parameters
         ----------
-        young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
+        young_modulus_factor, stiffness_loss
             As of `fe.runtime.state.DigitalState`.
         patch : ModelPatch
-            Its point masses, root compliances, local losses and temperature coefficients act.
+            Its root compliances, local losses and temperature coefficients act.
         temperature_difference : float
             Temperature less the reference temperature [K].
 
         Raises
         ------
         InvalidPatchError
-            If a change leaves no stiffness, or a place lies off the wing.
+            If a change leaves no stiffness.
         """
         arrays, e = self.arrays, young_modulus_factor
         compliance = 0.0
-        points = []
         for item in patch:
             if isinstance(item, ModulusTemperature):
                 e = e * (1.0 - item.coefficient * temperature_difference)
             elif isinstance(item, RootCompliance):
                 compliance += item.compliance
-            elif isinstance(item, PointMass):
-                points.append((item.mass, self._along(item.station)))
         theta = np.array((e, *(1.0 - z for z in arrays.losses(stiffness_loss)), 1.0))
         if not (isfinite(e) and theta.min() > 0.0):
             raise InvalidPatchError(
                 f"The factors on the stiffness of skin and damage regions must be positive, but are "
                 f"{', '.join(f'{factor:g}' for factor in theta[:-1])}; lessen the losses or the coefficient."
             )
-        spring = 0.0
+        stiffness = np.tensordot(theta, arrays.stiffness, 1)
         if compliance != 0.0:
             flexibility = 1.0 / arrays.flap_spring + compliance
             if flexibility <= 0.0:
@@ -138,15 +169,25 @@ class PatchedWing:
                     f"{-compliance:g}; give a compliance above {-1.0 / arrays.flap_spring:g}."
                 )
             spring = 1.0 / flexibility - arrays.flap_spring
+            stiffness += spring * np.multiply.outer(arrays.flap_row, arrays.flap_row)
         boxes = boxes_of(patch)
-        remaining = np.ones(len(arrays.strip_lines) - 1)
         if boxes:
-            remaining = remaining_skin(boxes, arrays.strip_lines).of_strips
-        parts = np.flatnonzero(remaining[arrays.strip_of] != 1.0).astype(np.int64)
-        factors = (remaining[arrays.strip_of[parts]] - 1.0) * theta[arrays.term_of[parts]]
-        losses = tuple((factor, self._strips[part]) for part, factor in zip(parts, factors, strict=True))
-        terms = StructureTerms(theta, losses, spring, (servo_mass, pitot_mass), tuple(points))
-        return PatchedStructure(arrays, terms)
+            remaining = remaining_skin(boxes, arrays.strip_lines).of_strips[arrays.strip_of]
+            for part in np.flatnonzero(remaining != 1.0):
+                stiffness += (remaining[part] - 1.0) * theta[arrays.term_of[part]] * self._strips[part]
+        return np.asarray(stiffness)
+
+    def at(
+        self, vector: FloatArray, patch: ModelPatch = EMPTY, temperature_difference: float = 0.0
+    ) -> "PatchedState":
+        """Return the wing as `fe.runtime.transient` takes it, at values (V,) of all that can be chosen.
+
+        Raises
+        ------
+        InvalidPatchError
+            If the wing cannot carry the patch.
+        """
+        return PatchedState(self, vector, patch, temperature_difference)
 
     # ------------------------------------------------------------ loads and rows
 
@@ -387,3 +428,64 @@ class PatchedWing:
         arrays = self.arrays
         skin = remaining_skin(boxes, arrays.strip_lines)
         return strain_factors(skin, arrays.gauge_stations, arrays.gauge_length, self._skin_share)
+
+
+class PatchedState:
+    """The wing in one state and under one patch, as `fe.runtime.transient` takes it.
+
+    The loads are load factor, its square, the force at the load point as the patch has it, and one at the
+    load point itself, which holds the wing before a release. Outputs are the gauges and the tip.
+
+    Attributes
+    ----------
+    components : (2, G, n) ndarray
+        Rows of the strains across the gauges, and of shear.
+    """
+
+    holding = HOLDING
+    on_modes = ON_MODES
+
+    def __init__(self, wing: PatchedWing, vector: FloatArray, patch: ModelPatch, temperature: float) -> None:
+        e, *losses, servo, pitot = vector[:-2].tolist()
+        arrays, self._gains = wing.arrays, [item for item in patch if isinstance(item, LoadGain)]
+        self._structure = wing.structure(e, tuple(losses), servo, pitot, patch, temperature)
+        self.laws = laws_of(wing.internal_forces(patch), wing.port_rows)
+        held = wing.held_ports(self.laws.ports)
+        self._held = np.vstack((arrays.load_tip, *held.values()))
+        force = wing.force_row(LOAD_PLACE, patch.of(*LOADS))
+        ports = self.laws.rows(wing.port_rows, wing.size)
+        parts = wing.load_parts(patch.of(*LOADS, PointMass))
+        self.loads = np.vstack((parts, force, arrays.load_tip, ports)).T
+        factors, strains = wing.strain_factors(patch), arrays.strain_rows
+        if factors is not None:
+            strains = factors[:, np.newaxis] * strains
+        self.outputs, self.components = np.vstack((strains[0], arrays.tip_row)), strains[1:]
+        self.accelerations = np.zeros((0, wing.size))
+
+    def acting(self, vector: FloatArray) -> FloatArray:
+        """Return the coefficients (4,) of the loads."""
+        load_factor, tip_force = vector[-2:].tolist()
+        force = tip_force
+        for item in self._gains:
+            force = (1.0 + item.gain) * force + (item.tare if tip_force != 0.0 else 0.0)
+        return np.array((load_factor, load_factor**2, force, 0.0))
+
+    @cached_property
+    def answers(self) -> FloatArray:
+        """Displacements (n, 4 + J) at rest under the unit loads."""
+        return self._structure.static(self.loads)
+
+    @cached_property
+    def modes(self) -> Modes:
+        """The modes that move."""
+        return self._structure.modes(MODE_COUNT, self._held)
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Their shapes (n, M)."""
+        return self.modes.shapes
+
+    @property
+    def to_modes(self) -> FloatArray:
+        """Modal coordinates (M, n) of a displacement."""
+        return self.modes.to_modes
