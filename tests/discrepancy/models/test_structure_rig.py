@@ -91,7 +91,7 @@ def test_it_is_the_structure_in_motion(either: tuple[Model, ReducedModel]) -> No
 
 
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.FLIGHT, TrialKind.RINGDOWN, TrialKind.FORCED])
-@pytest.mark.parametrize("law", [None, PowerStiffness("tip", 1e4, 1.0, 0, 1e-4)])
+@pytest.mark.parametrize("law", [None, PowerStiffness("tip", 10.0, 3.0, 0, 1e-4)])
 def test_it_is_its_fmu(
     kind: TrialKind, law: PowerStiffness | None, pair: tuple[FmuModel, ReducedModel]
 ) -> None:
