@@ -1,6 +1,6 @@
 """Motion of few modes at any time stamps, under several forces: exact between the stamps without laws.
 
-Linear steps are those of `fe.runtime.modal_system.exact_step`. Lengths that differ by less than `ALIKE` of the
+Steps are those of `fe.runtime.modal_system.exact_step`; lengths that differ by less than `ALIKE` of the
 usual one are one.
 """
 

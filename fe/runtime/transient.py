@@ -13,14 +13,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import exp, isfinite
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from .damping import rayleigh_damping_ratio
 from .errors import InvalidStateError
-from .modal_system import ModalSystem
+from .modal_system import ModalSystem, exact_step
 
 if TYPE_CHECKING:
     from .motion import Laws, ModalMotion
@@ -78,56 +78,6 @@ class TransientState:
         array = np.array(values, dtype=np.float64)
         place, velocity, load, forces, rest = np.split(array, [*ends, len(array) - memory.size])
         return cls(place, velocity, load, forces, rest.reshape(memory.shape))
-
-
-class Propagator(NamedTuple):
-    """Exact solution of the free modal equations after one duration; every entry has the shape (M,).
-
-    q(t) = `displacement_displacement` q(0) + `displacement_velocity` q'(0), and in the same way for q'(t).
-    """
-
-    displacement_displacement: FloatArray
-    displacement_velocity: FloatArray
-    velocity_displacement: FloatArray
-    velocity_velocity: FloatArray
-
-
-def free_propagator(angular_frequency: FloatArray, damping_ratio: FloatArray, duration: float) -> Propagator:
-    """Return the exact free response of uncoupled modes, for any damping ratio.
-
-    Written without differences of large numbers, so that zeta near 1 and zeta >> 1 are accurate.
-
-    Parameters
-    ----------
-    angular_frequency : (M,) ndarray
-        Undamped angular frequencies [rad/s].
-    damping_ratio : (M,) ndarray
-        Damping ratios, zero or positive [1].
-    duration : float
-        Time [s], zero or positive.
-    """
-    omega, zeta = angular_frequency, damping_ratio
-    decay = zeta * omega
-    root = omega * np.sqrt(
-        np.abs((zeta - 1.0) * (zeta + 1.0))
-    )  # damped frequency, or half the gap of the decays
-    over = zeta > 1.0
-    # oscillating and critical: exp(-decay t) (cos, sin / root)
-    envelope = np.exp(-decay * duration)
-    sine = envelope * duration * np.sinc(root * duration / np.pi)
-    cosine = envelope * np.cos(root * duration)
-    # not oscillating: two decays, slow * fast = omega^2
-    fast = decay + root
-    slow = omega**2 / fast
-    slow_exponential = np.exp(-slow * duration)
-    gap = np.where(over, 2.0 * root, 1.0)
-    with np.errstate(under="ignore"):
-        gap_part = np.where(gap * duration > 0.0, -np.expm1(-gap * duration) / gap, duration)
-        hyperbolic_sine = slow_exponential * gap_part
-        sinus = np.where(over, hyperbolic_sine, sine)
-        displacement_displacement = np.where(over, slow_exponential + slow * sinus, cosine + decay * sine)
-        velocity_velocity = np.where(over, np.exp(-fast * duration) - slow * sinus, cosine - decay * sine)
-    return Propagator(displacement_displacement, sinus, -(omega**2) * sinus, velocity_velocity)
 
 
 class StructureState(Protocol):
@@ -216,7 +166,7 @@ class ModalIntegrator:
         self._rayleigh = damping_alpha, damping_beta
         self._laws = self.structure.laws
         self._loads = self.structure.loads.shape[1] - (0 if self._laws is None else len(self._laws))
-        self._cached: tuple[float, Propagator] | None = None
+        self._cached: tuple[float, FloatArray] | None = None
 
     @property
     def modes(self) -> Any:
@@ -427,17 +377,12 @@ class ModalIntegrator:
         self, state: TransientState, duration: float, acting: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         if self._cached is None or self._cached[0] != duration:
-            self._cached = (duration, free_propagator(self._omega, self.damping_ratio, duration))
-        propagator = self._cached[1]
+            damping = np.diag(2.0 * self.damping_ratio * self._omega)
+            self._cached = duration, exact_step(self._omega**2, damping, np.array([duration]))[0][0]
         static = self._modal_static @ acting
-        aside, velocity = state.displacement - static, state.velocity
-        return (
-            propagator.displacement_displacement * aside
-            + propagator.displacement_velocity * velocity
-            + static,
-            # plus zero: a structure at rest has the velocity 0, not -0
-            propagator.velocity_displacement * aside + propagator.velocity_velocity * velocity + 0.0,
-        )
+        moved = self._cached[1] @ np.concatenate((state.displacement - static, state.velocity))
+        # plus zero: a structure at rest has the velocity 0, not -0
+        return moved[: len(static)] + static, moved[len(static) :] + 0.0
 
     # ------------------------------------------------------------ what is seen
 
