@@ -106,6 +106,8 @@ class StructureBehaviour:
         """Advance by one step of `duration` [s] with inputs and effects held; raises as `start`."""
         if self._vector is None:
             raise RuntimeError("the structure was not initialised")
+        if self._effects is None:
+            return self._go(time, duration, inputs)
         return self._whole(lambda: self._go(time, duration, inputs))
 
     def later(self, group: int) -> list[float]:
@@ -129,9 +131,7 @@ class StructureBehaviour:
 
     def _point(self) -> float:
         if self._integrator is not None and self._state is not None:
-            holding = self._integrator.structure.holding
-            point = self._roles.point_load if holding is None else holding
-            return self._integrator.point_displacement(self._state, point)
+            return self._integrator.point_displacement(self._state, self._held(self._integrator))
         self._static = self._static or self._model.static_response(self._vector)
         return float(self._model.static_load[self._roles.point_load] @ self._static.coordinates)
 
@@ -197,36 +197,48 @@ class StructureBehaviour:
         """Begin, where there is no state yet, or advance; return the outputs."""
         changed = self._effects is not None and self._take_effects(self._effects)
         before, vector, own = self._vector, self._chosen(inputs), self._own
-        self._static = None
+        integrator, state, static = self._integrator, self._state, None
         if not (self._moves or (self._acting is not None and self._acting.changes_structure)):
-            self._integrator = self._state = None
-            self._vector, self._static = vector, self._model.static_response(vector)
-            values = [*self._static.strain.tolist(), *self._static.displacement.tolist(), *self._resting]
-            return values if self._acting is None else self._show(values, duration, time + duration)
-        integrator, state = self._integrator, self._state
-        if (
-            integrator is None
-            or before is None
-            or changed
-            or vector[:own].tobytes() != before[:own].tobytes()
-        ):
-            integrator = self._made(vector)
-            if self._integrator is not None and state is not None:
-                state = integrator.take_over(state, self._integrator)
-        self._integrator, self._vector = integrator, vector
+            integrator = state = None
+            static = self._model.static_response(vector)
+            values = [*static.strain.tolist(), *static.displacement.tolist(), *self._resting]
+        else:
+            if (
+                integrator is None
+                or before is None
+                or changed
+                or vector[:own].tobytes() != before[:own].tobytes()
+            ):
+                integrator = self._made(vector)
+                if self._integrator is not None and state is not None:
+                    state = integrator.take_over(state, self._integrator)
+            state = self._next(integrator, state, vector, time, duration)
+            values = integrator.outputs(state).tolist()
+        self._vector, self._integrator, self._state, self._static = vector, integrator, state, static
+        return values if self._acting is None else self._show(values, duration, time + duration)
+
+    def _next(
+        self,
+        integrator: ModalIntegrator,
+        state: TransientState | None,
+        vector: FloatArray,
+        time: float,
+        duration: float,
+    ) -> TransientState:
+        """Return the state under the loads of all that is chosen; where there is none, the first one."""
         load = integrator.structure.acting(vector)
         if not self._moves:
-            self._state = integrator.settled(load, state)
-        elif state is not None:
-            self._state = integrator.advance(state, duration, load, time - self._begun)
-        elif self._roles.release is None:
-            self._state = integrator.at_rest(load)
-        else:
-            holding = integrator.structure.holding
-            point = self._roles.point_load if holding is None else holding
-            self._state = integrator.released(self._parameters[self._roles.release], load, point)
-        values = integrator.outputs(self._state).tolist()
-        return values if self._acting is None else self._show(values, duration, time + duration)
+            return integrator.settled(load, state)
+        if state is not None:
+            return integrator.advance(state, duration, load, time - self._begun)
+        if self._roles.release is None:
+            return integrator.at_rest(load)
+        return integrator.released(self._parameters[self._roles.release], load, self._held(integrator))
+
+    def _held(self, integrator: ModalIntegrator) -> int:
+        """Return the number of the load that holds the structure aside."""
+        holding = integrator.structure.holding
+        return self._roles.point_load if holding is None else holding
 
     def _take_effects(self, effects: Effects) -> bool:
         """Take the effects as they are tuned; return whether they changed."""
