@@ -335,17 +335,9 @@ class Trial:
 
     def rows(self, rows: BoolArray, **changes: Any) -> "Trial":
         """Return the trial with some of its rows (N,) only, and other fields changed."""
-        parts = (
-            "values",
-            "used",
-            "time",
-            "force",
-            "load_factor",
-            "temperature",
-            "health",
-            "health_deviation",
-        )
-        return replace(self, **{part: getattr(self, part)[rows] for part in parts}, **changes)
+        parts = ("values", "used", "time", "force", "load_factor", "temperature")
+        of_rows = {part: getattr(self, part)[rows] for part in (*parts, "health", "health_deviation")}
+        return replace(self, **of_rows, **changes)
 
     @property
     def input_names(self) -> tuple[str, ...]:

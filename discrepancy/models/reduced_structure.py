@@ -1,6 +1,6 @@
 """A structure from a mesh or matrices as a model: its reduced model, whose modes and statics are known."""
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -10,10 +10,11 @@ from scipy.linalg import inv
 
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.body import DEFAULT_PLACE, Moving, Outputs, Place
 from discrepancy.models.interface import ModelParameter, PortScale
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.structural import DEFAULT_PLACE, Moving, Outputs, Place, StructuralModel
+from discrepancy.models.structural import StructuralModel
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, ModelPatch, Primitive
 from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum
 from fe.runtime.state import Losses
@@ -178,13 +179,17 @@ class ReducedBody:
     def units(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
         """Return the unit loads (k, n) of a trial at rest: load factor and its square, or a force of 1 N."""
         if trial.kind is not TrialKind.FLIGHT:
-            return self.force_row(trial.load_place, parameters, loads)[None]
+            return self._with_always(self.force_row(trial.load_place, parameters, loads)[None], parameters)
         if LOAD_FACTOR not in self.model.controls:
             raise ModelError(
                 f"The trial {trial.name!r} is a flight, but {self.model.name} has no control {LOAD_FACTOR}."
             )
         row = self._load(parameters, **{LOAD_FACTOR: 1.0})
-        return np.stack((row, np.zeros_like(row)))
+        return self._with_always(np.stack((row, np.zeros_like(row))), parameters)
+
+    def _with_always(self, rows: FloatArray, parameters: FloatArray) -> FloatArray:
+        always = self.always(parameters)
+        return rows if always is None else np.vstack((rows, always))
 
     def always(self, parameters: FloatArray) -> FloatArray | None:
         """Return the load (n,) of constant loads and of controls that no trial records, if there is any."""
@@ -196,12 +201,6 @@ class ReducedBody:
         acting = model.load_coefficients(vector)
         return np.asarray(model.rows[0] @ acting) if acting.any() else None
 
-    def stiffness_key(
-        self, parameters: FloatArray, health: Losses, structure: ModelPatch, temperature: float
-    ) -> Hashable:
-        """Return what a state depends on; no primitive changes the structure."""
-        return parameters.tobytes(), tuple(float(loss) for loss in health)
-
     def stiffness(
         self, parameters: FloatArray, health: Losses, structure: ModelPatch, temperature: float
     ) -> ReducedSystem:
@@ -212,7 +211,7 @@ class ReducedBody:
         OutsideModelError
             If one lies outside the validity box of the reduced model.
         """
-        key = self.stiffness_key(parameters, health, structure, temperature)
+        key = parameters.tobytes(), tuple(float(loss) for loss in health)
         return self._systems.get(key, lambda: self._made(self._vector(parameters, health)))
 
     def _made(self, vector: FloatArray) -> ReducedSystem:

@@ -1,13 +1,11 @@
 """A structure whose matrices are known as a model: under patches, at rest, in ring-downs and under forces."""
 
-from collections.abc import Hashable, Mapping
-from typing import NamedTuple, Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.body import Body, Moving, Outputs, Solver
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.input_course import Course
 from discrepancy.models.interface import (
@@ -21,7 +19,6 @@ from discrepancy.models.interface import (
 )
 from discrepancy.models.memory import Memory
 from discrepancy.models.ported import NO_PATCH, PortedSystem
-from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.second_order_motion import Motion
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
@@ -37,94 +34,8 @@ from fe.runtime.patch import (
     PointMass,
     Primitive,
 )
-from fe.runtime.state import Losses
 
 FloatArray = NDArray[np.float64]
-Outputs = tuple[tuple[str, Quantity], ...]
-Place = str | tuple[float, float]
-DEFAULT_PLACE = "tip_load"
-"""Place of a load where a trial says none."""
-
-
-class Moving(NamedTuple):
-    """A structure in a basis (n, k) of its first modes and some static shapes, in which it moves."""
-
-    basis: FloatArray
-    system: SecondOrderSystem
-
-
-class Solver(Protocol):
-    """The stiffness (n, n) of a structure in one state."""
-
-    def solve(self, loads: FloatArray) -> FloatArray:
-        """Return K^-1 loads, (n,) or (n, k)."""
-
-
-class Body(Protocol):
-    """What a model of a structure asks of its structure, in n coordinates of its own.
-
-    Attributes
-    ----------
-    regions : tuple of str
-        Damage regions.
-    points : mapping of str to (n,) ndarray
-        Rows of the ports whose laws act on one motion.
-    port_rows : mapping of str to (n,) ndarray
-        Rows of all ports where laws act.
-    missing : tuple of str
-        Further ports of `port_rows` where missing forces are looked for.
-    length : float or None
-        Largest station [m], if it has any.
-    reference : str
-        Place whose stiffness and modal mass are the natural ones.
-    """
-
-    regions: tuple[str, ...]
-    points: Mapping[str, FloatArray]
-    port_rows: Mapping[str, FloatArray]
-    missing: tuple[str, ...]
-    length: float | None
-    reference: str
-
-    def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if there is no such output."""
-
-    def output_rows(self, outputs: Outputs, component: int, losses: ModelPatch) -> FloatArray:
-        """Return the rows (C, n) of outputs; `component` 1 and 2: transverse and shear strain."""
-
-    def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the structure can carry a primitive."""
-
-    def internal_forces(self, forces: ModelPatch) -> ModelPatch:
-        """Return forces as they act at ports of `port_rows`."""
-
-    def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
-        """Return the load (n,) of 1 N at a place, as load primitives have it."""
-
-    def units(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
-        """Return the unit loads (k, n) of a trial at rest, as load primitives have them."""
-
-    def always(self, parameters: FloatArray) -> FloatArray | None:
-        """Return the load (n,) that acts in every motion, too, if there is one."""
-
-    def stiffness_key(
-        self, parameters: FloatArray, health: Losses, structure: ModelPatch, temperature: float
-    ) -> Hashable:
-        """Return what the stiffness of a state depends on."""
-
-    def stiffness(
-        self, parameters: FloatArray, health: Losses, structure: ModelPatch, temperature: float
-    ) -> Solver:
-        """Return the stiffness at parameters, losses, a patch and a temperature less the reference [K]."""
-
-    def moving(
-        self, parameters: FloatArray, health: Losses, structure: ModelPatch, temperature: float, place: Place,
-        ports: tuple[str, ...] = (),
-    ) -> Moving:  # fmt: skip
-        """Return the structure as it moves when let go, or pushed, at a place, with forces at `ports`."""
-
-    def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
-        """Return the scales of forces that are spread over the structure, by the first mode (n,)."""
 
 
 class StructuralModel:
@@ -250,26 +161,22 @@ class StructuralModel:
             )
         quantities = [quantity for _, quantity in outputs]
         try:
-            rows = self.body.output_rows(outputs, 0, patch.of(LocalStiffnessLoss))
+            losses = patch.of(LocalStiffnessLoss)
+            blocks = [self.body.output_rows(outputs, n, losses) for n in range(3 if components else 1)]
             forces = patch.of(*INTERNAL_FORCES)
             laws = NO_LAWS
             if len(forces):
                 laws = laws_of(self.body.internal_forces(forces), self.body.port_rows)
             if not trial.is_dynamic:
-                return self._at_rest(trial, outputs, rows, patch, conditions, laws, components)
+                return self._at_rest(trial, outputs, blocks, patch, conditions, laws)
             moved = self._moved(trial, conditions, patch, laws.ports)
             motion = self._motion(moved, trial, conditions, patch, laws, refinement)
-            response = motion.response(rows @ moved.basis, quantities)
+            response = motion.response(blocks[0] @ moved.basis, quantities)
             if self.body.always(conditions.parameters) is not None:
-                response.values[:] += self._always(trial, conditions, outputs, rows)
-            if not components:
-                return response
-            losses = patch.of(LocalStiffnessLoss)
-            across, shear = (
-                motion.values(self.body.output_rows(outputs, number, losses) @ moved.basis)
-                for number in (1, 2)
+                response.values[:] += self._always(trial, conditions, outputs, blocks[0])
+            return Response(
+                response.values, response.rates, *(motion.values(rows @ moved.basis) for rows in blocks[1:])
             )
-            return Response(response.values, response.rates, across, shear)
         except FiniteElementError as cause:
             raise ModelError(str(cause)) from cause
 
@@ -277,11 +184,10 @@ class StructuralModel:
         self,
         trial: Trial,
         outputs: Outputs,
-        rows: FloatArray,
+        blocks: list[FloatArray],
         patch: ModelPatch,
         conditions: Conditions,
         laws: Laws,
-        components: bool,
     ) -> Response:
         if any(quantity.is_rate for _, quantity in outputs):
             raise ModelError(
@@ -296,21 +202,12 @@ class StructuralModel:
         depends = any(isinstance(item, ModulusTemperature) for item in structure)
         temperature = trial.temperature if depends else np.zeros(size)
         acting = np.column_stack((health, temperature))
-        amounts, always = _amounts(trial, loads), self.body.always(parameters)
-        if always is not None:
+        amounts = _amounts(trial, loads)
+        if self.body.always(parameters) is not None:
             amounts = np.column_stack((amounts, np.ones(size)))
-
-        def units() -> FloatArray:
-            rows = self.body.units(trial, parameters, loads)
-            return rows if always is None else np.vstack((rows, always))
-
-        blocks = [rows]
-        if components:
-            losses = patch.of(LocalStiffnessLoss)
-            blocks += [self.body.output_rows(outputs, number, losses) for number in (1, 2)]
         values = np.empty((size, len(blocks) * len(outputs)))
         place = None if flight else trial.load_place
-        port_rows = laws.rows(self.body.port_rows, rows.shape[1])
+        port_rows = laws.rows(self.body.port_rows, blocks[0].shape[1])
         memory: FloatArray | None = None
         before = np.zeros(len(laws))
         start = 0
@@ -318,20 +215,18 @@ class StructuralModel:
         changes = np.flatnonzero(np.any(np.diff(acting, axis=0) != 0.0, axis=1)) + 1
         for end in (*changes.tolist(), size):
             *lost, warmer = acting[start]
-            key = self.body.stiffness_key(parameters, tuple(lost), structure, warmer)
             stiffness = self.body.stiffness(parameters, tuple(lost), structure, warmer)
             shown, at_ports, flexible, port_flexibility = self._statics.get(
-                (key, place, loads.primitives, outputs, components, laws.ports),
+                (stiffness, place, loads.primitives, outputs, len(blocks), laws.ports),
                 lambda stiffness=stiffness: static_units(  # type: ignore[misc]
-                    stiffness, units(), blocks, port_rows
+                    stiffness, self.body.units(trial, parameters, loads), blocks, port_rows
                 ),
             )
             part = amounts[start:end] @ shown
             if len(laws):
-                linear = amounts[start:end] @ at_ports
                 solution = static_solution(
                     laws,
-                    linear,
+                    amounts[start:end] @ at_ports,
                     port_flexibility,
                     memory=memory,
                     start=before @ at_ports if start else None,
@@ -341,10 +236,8 @@ class StructuralModel:
                 part = part - solution.forces @ flexible
             values[start:end] = part
             before, start = amounts[end - 1], end
-        count = len(outputs)
-        if not components:
-            return Response(values)
-        return Response(values[:, :count], None, values[:, count : 2 * count], values[:, 2 * count :])
+        seen, *components = np.split(values, len(blocks), axis=1)
+        return Response(seen, None, *components)
 
     def _always(self, trial: Trial, conditions: Conditions, outputs: Outputs, rows: FloatArray) -> FloatArray:
         """Return what outputs (C,) show in a motion of the load that always acts."""
@@ -435,8 +328,9 @@ class StructuralModel:
         row = self.body.force_row(trial.load_place, values, empty)
         rows = self._point_rows(len(row))
         if not trial.is_dynamic:
-            units = self.body.units(trial, values, empty)
-            return np.asarray(_amounts(trial, empty) @ (rows @ static.solve(units.T)).T)
+            amounts = _amounts(trial, empty)
+            units = self.body.units(trial, values, empty)[: amounts.shape[1]]
+            return np.asarray(amounts @ (rows @ static.solve(units.T)).T)
         if trial.kind is TrialKind.FORCED:
             motion = moved.system.forced(row @ moved.basis, Course.of_force(trial), trial.time, NO_LAWS)
             return motion.values(rows @ moved.basis)

@@ -9,10 +9,10 @@ from scipy.linalg import cho_factor, cho_solve
 
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.body import Moving, Outputs, Place
 from discrepancy.models.interface import PortScale
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.structural import Moving, Outputs, Place
 from fe.runtime.patch import (
     PRIMITIVES,
     LocalStiffnessLoss,

@@ -5,8 +5,7 @@ equation for each mode, because Rayleigh damping (17) leaves the modes uncoupled
 held. Modes that are not kept follow the load without delay (static correction). Laws at ports couple the
 modes: `fe.runtime.motion` steps them, and omitted modes follow their forces with the lag of the damping.
 
-NumPy and relative imports only: this file is copied into the FMU. What laws need is imported where there are
-any, since a plain structure starts in a tenth of the time without.
+NumPy and relative imports only: this file is copied into the FMU. Laws are imported where there are any.
 """
 
 from collections.abc import Sequence
@@ -239,8 +238,6 @@ class ModalIntegrator:
             feed=np.stack((np.zeros(len(beyond)), beyond)),
         )  # fmt: skip
 
-    # ------------------------------------------------------------ at rest
-
     def settled(self, load: npt.ArrayLike, before: TransientState | None = None) -> TransientState:
         """Return the equilibrium, without motion, under loads (L,) that are reached from those `before`.
 
@@ -330,8 +327,6 @@ class ModalIntegrator:
         place = state.displacement + self._modal_static[:, point] * held
         return TransientState(place, state.velocity, state.load + fading, state.forces, state.memory)
 
-    # ------------------------------------------------------------ in motion
-
     def advance(
         self, state: TransientState, duration: float, load: npt.ArrayLike, time: float = 0.0
     ) -> TransientState:
@@ -384,8 +379,6 @@ class ModalIntegrator:
         # plus zero: a structure at rest has the velocity 0, not -0
         return moved[: len(static)] + static, moved[len(static) :] + 0.0
 
-    # ------------------------------------------------------------ what is seen
-
     def displacement(self, state: TransientState) -> FloatArray:
         """Return the displacement (n,) at a state, in the coordinates of the structure.
 
@@ -428,8 +421,6 @@ class ModalIntegrator:
         deviation = self._omega * (state.displacement - self._modal_static @ self._still(state))
         return float(0.5 * (state.velocity @ state.velocity + deviation @ deviation))
 
-    # ------------------------------------------------------------ another state of health
-
     def take_over(self, state: TransientState, before: "ModalIntegrator") -> TransientState:
         """Return a state of another integrator in the modes of this one, after a change of health or mass.
 
@@ -440,10 +431,9 @@ class ModalIntegrator:
 
         `state` is in the modes of `before`, the integrator of the same model that it belongs to.
         """
-        load, memory = state.load, state.memory
-        forces = state.forces
-        if not _alike(self._laws, before._laws):
-            memory = np.zeros((0, 0)) if self._laws is None else self._laws.memory()
+        load, memory, forces = state.load, state.memory, state.forces
+        if self._laws is not None and not (before._laws is not None and self._laws.alike(before._laws)):
+            memory = self._laws.memory()
             forces = np.zeros(len(memory))
             if not len(state.displacement):  # at rest: reached from no load
                 load = np.zeros_like(load)
@@ -456,14 +446,3 @@ class ModalIntegrator:
         to_modes = self.structure.to_modes
         velocity = to_modes @ (before.structure.shapes @ state.velocity)
         return TransientState(to_modes @ place, velocity, load, forces, memory)
-
-
-def _alike(one: "Laws | None", other: "Laws | None") -> bool:
-    """Return whether laws are the same ones at the same ports, whose memory then stays."""
-    return one is other or (
-        one is not None
-        and other is not None
-        and one.ports == other.ports
-        and bool(np.array_equal(one.numbers, other.numbers))
-        and one.elements.shape == other.elements.shape
-    )
