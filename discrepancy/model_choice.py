@@ -1,6 +1,5 @@
 """Which model a campaign is compared with: a wing, a structure, a lumped model, an FMU, or one patched."""
 
-import atexit
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -11,12 +10,12 @@ from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.document import Origin
 from discrepancy.files.patch import StoredPatch, read_patch
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.fmu_file import parse_fmu_model
 from discrepancy.models.fmu_runs import binding_file
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.patched import PatchedModel
+from discrepancy.models.reduced_structure import structure_model
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
 from discrepancy.sources.from_run import (
     CALIBRATION_FILE,
@@ -25,21 +24,14 @@ from discrepancy.sources.from_run import (
     patch_of_run,
     run_model,
 )
-from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
-from fe.structure.design import is_structure, load_structure
+from fe.structure.design import is_structure
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from fmu_asset.archive.design_record import packed_design_hash
-from fmu_asset.errors import FmuError
-from fmu_asset.folders import plain_folder, remove_folder
-from fmu_asset.packing.structure_fmu import fmu_bytes
-from fmu_asset.structures.rig import rig_text
-from reporting.errors import FileNotWrittenError
-from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
-from reporting.toml_file import parse_toml, read_toml
+from reporting.toml_file import read_toml
 from scenarios import structure_files
 
 
@@ -251,30 +243,13 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
 
 
 def _structure(path: Path, progress: Progress | None) -> ModelChoice:
-    """Return a structure by its FMU, which is kept beside the reduced models."""
     try:
         reduced = reduced_structure(path, progress=progress)
-        content, content_hash = fmu_bytes(reduced)
-        name = f"structure_{content_hash[:32]}.fmu"
-        text = rig_text(load_structure(path), name)
-        folder = _folder_with(name, content)
-    except (FiniteElementError, FmuError, FileNotWrittenError) as cause:
+    except FiniteElementError as cause:
         raise ModelError(str(cause)) from cause
-    model = FmuModel(parse_fmu_model(parse_toml(text, str(path), ModelError), str(path)), folder)
     source = reduced.design_hash
+    model = structure_model(reduced)
     return ModelChoice(model, ModelKind.STRUCTURE, path.name, source, path=path, design_hash=source)
-
-
-def _folder_with(name: str, content: bytes) -> Path:
-    """Return a folder that holds a file: the cache or, where that cannot be written, one till the end."""
-    try:
-        if not (cache_folder() / name).is_file():
-            atomic_write_bytes(cache_folder() / name, content)
-        return cache_folder()
-    except (OSError, FileNotWrittenError):
-        folder = plain_folder()
-        atexit.register(remove_folder, folder)  # till then the model opens its FMU again and again
-        return atomic_write_bytes(folder / name, content).parent
 
 
 def _fmu(path: Path) -> ModelChoice:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_records import pre_trigger_record, with_noise
 from discrepancy.campaign.records import (
+    USUAL_REGIONS,
     Campaign,
     Channel,
     Event,
@@ -28,6 +29,7 @@ from discrepancy.campaign.remarks import remarks_on
 from discrepancy.campaign.sampling import check_sampling, nearly_even
 from discrepancy.campaign.schema import (
     INPUT_COLUMNS,
+    OF_REGION,
     CampaignSection,
     ChannelSection,
     ColumnSection,
@@ -138,7 +140,7 @@ def _unused(section: CampaignSection, tables: Mapping[str, TextTable]) -> list[s
     files: dict[str, list[str]] = {}
     for name in dict.fromkeys(trial.file for trial in section.trial):
         for column in tables[name].columns:
-            if column not in known:
+            if column not in known and not column.startswith(OF_REGION):
                 files.setdefault(column, []).append(name)
     return [
         f"{where[0]}{f' and {len(where) - 1} more' if where[1:] else ''}: no channel has the column "
@@ -189,7 +191,7 @@ def _trial(
     zeros = np.zeros(len(table))
     chosen = _measured(section, table, campaign)
     columns, used = zip(*(_readings(channel, section, table, remarks) for channel in chosen), strict=True)
-    health, health_deviation = _health(section, table, user)
+    regions, health, health_deviation = _health(section, table, user)
     inputs = _inputs(section, table, campaign, user)
     # at rest under other inputs no force need act
     held = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
@@ -209,6 +211,7 @@ def _trial(
         start=start,
         run=section.run,
         health=health,
+        regions=regions,
         health_deviation=health_deviation,
         release=None
         if section.release is None
@@ -329,20 +332,27 @@ def _temperature(section: TrialSection, table: TextTable, campaign: CampaignSect
     return np.full(len(table), difference(repr(section.temperature), reference))
 
 
-def _health(section: TrialSection, table: TextTable, user: str) -> tuple[FloatArray, FloatArray]:
-    """Return stiffness losses and their deviations, (N, 2), from columns, keys, or healthy."""
-    health, deviation = np.zeros((len(table), 2)), np.zeros((len(table), 2))
-    for index, name in enumerate(("z1", "z2")):
-        stated = None if section.health is None else getattr(section.health, name)
-        if name in table.columns and stated is not None:
+def _health(
+    section: TrialSection, table: TextTable, user: str
+) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
+    """Return damage regions, and their losses and deviations (N, K), from columns, keys, or healthy."""
+    stated = {} if section.health is None else section.health.losses
+    usual = None if section.health is None else section.health.deviation
+    columns = [name.removeprefix(OF_REGION) for name in table.columns if name.startswith(OF_REGION)]
+    losses = (name for name in columns if name.removesuffix("_deviation") not in {*columns, *stated} - {name})
+    regions = tuple(dict.fromkeys((*USUAL_REGIONS, *stated, *losses)))
+    health, deviation = np.zeros((2, len(table), len(regions)))
+    for index, name in enumerate(regions):
+        column = name if name in USUAL_REGIONS else f"{OF_REGION}{name}"
+        if column in table.columns and name in stated:
             raise CampaignFileError(
                 f"{user.capitalize()} gives {name} twice: remove it from `health` or from {table.name}."
             )
-        health[:, index] = _within(table, name, user, 1.0, "a fraction from 0 to 1", stated)
-        usual = None if section.health is None else section.health.deviation
-        column = f"{name}_deviation"
+        what = "a fraction from 0 to 1"
+        health[:, index] = _within(table, column, user, 1.0, what, stated.get(name))
+        column = f"{column}_deviation"
         deviation[:, index] = _within(table, column, user, inf, "a standard deviation", usual)
-    return health, deviation
+    return regions, health, deviation
 
 
 def _within(

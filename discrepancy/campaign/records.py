@@ -234,6 +234,10 @@ class Release:
             )
 
 
+USUAL_REGIONS = ("z1", "z2")
+"""Damage regions that every trial knows: those of the shipped wing."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """One trial: known inputs, measured values, labels of its state.
@@ -266,9 +270,9 @@ class Trial:
         Start of the trial since the campaign's start [s].
     run : str
         Label of the run (set-up) that the trial belongs to.
-    health : (N, 2) ndarray
-        Known stiffness losses z1, z2 (fractions); prior means where `health_deviation` is positive.
-    health_deviation : (N, 2) ndarray
+    health : (N, K) ndarray
+        Known stiffness losses of `regions` (fractions); prior means where `health_deviation` is positive.
+    health_deviation : (N, K) ndarray
         Prior standard deviations; zero where they are known.
     release : Release or None
         Ring-downs only.
@@ -288,6 +292,8 @@ class Trial:
         Forced trials: as that of an input, for the force.
     file : str
         That holds it; empty where there is none.
+    regions : tuple of str
+        Names of the damage regions, z1 and z2 first.
     """
 
     name: str
@@ -312,6 +318,7 @@ class Trial:
     inputs: tuple[RecordedInput, ...] = ()
     hold: Hold | None = None
     file: str = field(default="", compare=False)
+    regions: tuple[str, ...] = USUAL_REGIONS
 
     @classmethod
     def plain(
@@ -328,17 +335,9 @@ class Trial:
 
     def rows(self, rows: BoolArray, **changes: Any) -> "Trial":
         """Return the trial with some of its rows (N,) only, and other fields changed."""
-        parts = (
-            "values",
-            "used",
-            "time",
-            "force",
-            "load_factor",
-            "temperature",
-            "health",
-            "health_deviation",
-        )
-        return replace(self, **{part: getattr(self, part)[rows] for part in parts}, **changes)
+        parts = ("values", "used", "time", "force", "load_factor", "temperature")
+        of_rows = {part: getattr(self, part)[rows] for part in (*parts, "health", "health_deviation")}
+        return replace(self, **of_rows, **changes)
 
     @property
     def input_names(self) -> tuple[str, ...]:

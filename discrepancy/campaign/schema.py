@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from keyword import iskeyword
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
 from discrepancy.campaign.units import conversion_of
@@ -21,6 +21,8 @@ INPUT_COLUMNS = (
     "time", "force", "load_factor", "temperature", "z1", "z2", "z1_deviation", "z2_deviation",
 )  # fmt: skip
 """Columns of the tables that are no channels."""
+OF_REGION = "health."
+"""Begins the column of the losses of a damage region by its name."""
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
@@ -148,11 +150,17 @@ class ReleaseSection(Section):
 
 
 class HealthSection(Section):
-    """`health` of a trial: fractions."""
+    """`health` of a trial: fractions by damage region."""
 
-    z1: Fraction | None = None
-    z2: Fraction | None = None
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Fraction]
+
     deviation: NotNegative = 0.0
+
+    @property
+    def losses(self) -> dict[str, float]:
+        """Losses by region."""
+        return dict(self.__pydantic_extra__)
 
 
 class TrialSection(Section):

@@ -12,8 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.reading import CAMPAIGN_FILE
-from discrepancy.campaign.records import Campaign, Channel, Hold, RecordedInput, Start, Trial, TrialKind
-from discrepancy.campaign.schema import FORMAT, input_columns
+from discrepancy.campaign.records import (
+    USUAL_REGIONS,
+    Campaign,
+    Channel,
+    Hold,
+    RecordedInput,
+    Start,
+    Trial,
+    TrialKind,
+)
+from discrepancy.campaign.schema import FORMAT, OF_REGION, input_columns
 from discrepancy.campaign.units import UNITS, in_unit, sum_text
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
@@ -92,7 +101,8 @@ def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
             )
         reference = campaign.reference_temperature
         columns["temperature"] = [sum_text(reference, value) for value in trial.temperature.tolist()]
-    for index, name in enumerate(("z1", "z2")):
+    for index, region in enumerate(trial.regions):
+        name = region if region in USUAL_REGIONS else f"{OF_REGION}{region}"
         if np.any(trial.health[:, index] != 0.0):
             columns[name] = _plain(trial.health[:, index])
         if np.any(trial.health_deviation[:, index] != 0.0):

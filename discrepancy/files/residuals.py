@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import (
+    USUAL_REGIONS,
+    Channel,
+    NoiseRecord,
+    Quantity,
+    Release,
+    Trial,
+    TrialKind,
+)
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import DiscrepancyError, VerdictFileError
 from discrepancy.location.residuals import FittedTrial, ResidualSet
@@ -151,6 +159,7 @@ def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
     attributes: dict[str, Any] = {
         "name": trial.name, "kind": trial.kind.value, "run": trial.run, "start": trial.start,
         "held_out": int(trial.held_out), "load_place": json.dumps(trial.load_place),
+        "regions": json.dumps(trial.regions),
     }  # fmt: skip
     if trial.release is not None:
         attributes["release"] = json.dumps(astuple(trial.release))
@@ -183,6 +192,7 @@ def _trial(group: xr.Dataset) -> FittedTrial:
         run=str(attributes["run"]),
         release=None if release is None else Release(*release),
         held_out=bool(attributes["held_out"]),
+        regions=tuple(json.loads(attributes["regions"])) if "regions" in attributes else USUAL_REGIONS,
         **rows,
     )
     found = ("prediction", "residual", "noise_deviation", "predictive_deviation", "leverage")

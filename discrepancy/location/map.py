@@ -116,10 +116,10 @@ def state_of(trial: Trial) -> str:
     if trial.run:
         words.append(f"run {trial.run}")
     if np.any(trial.health):
-        z1, z2 = trial.health[0]
-        words.append(
-            f"z1 = {z1:.2g}, z2 = {z2:.2g}" + ("" if np.ptp(trial.health, axis=0).max() == 0 else " ..")
+        losses = ", ".join(
+            f"{name} = {loss:.2g}" for name, loss in zip(trial.regions, trial.health[0], strict=True)
         )
+        words.append(losses + ("" if np.ptp(trial.health, axis=0).max() == 0 else " .."))
     return ", ".join(words)
 
 

@@ -256,10 +256,8 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
     base, slopes = _ported(problem, trial, outputs, point.shared)
-    base, *slopes = (
-        item and replace(item, outputs=item.outputs * gains[:, None], through=item.through * gains)
-        for item in (base, *slopes)
-    )
+    base = _shown(base, gains)
+    slopes = [None if item is None else _shown(item, gains) for item in slopes]
     used = trial.used
     deviation = trial.noise_factor * np.array([item.static_deviation for item in data.noise])
     coloured = [
@@ -293,6 +291,11 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         here[0], here[1], trial.begins.value == "settled" and trial.kind.value != "ringdown", point.shared,
         gain_unknowns, by_unknowns,
     )  # fmt: skip
+
+
+def _shown(system: PortedSystem, gains: FloatArray) -> PortedSystem:
+    """Return a system whose outputs are shown with gains (C,)."""
+    return replace(system, outputs=system.outputs * gains[:, None], through=system.through * gains)
 
 
 def _ported(

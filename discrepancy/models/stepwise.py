@@ -1,7 +1,7 @@
 """Motion of few modes at any time stamps, under several forces: exact between the stamps without laws.
 
-The linear step of each length is the exponential of one matrix (Van Loan 1978), by a Taylor polynomial and
-squaring, all lengths at once. Lengths that differ by less than `ALIKE` of the usual one are one.
+Steps are those of `fe.runtime.modal_system.exact_step`; lengths that differ by less than `ALIKE` of the
+usual one are one.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ from discrepancy.models.compiled_motion import compiled_steps
 from discrepancy.models.input_course import SMOOTH_PARTS, Course
 from discrepancy.models.memory import Memory
 from discrepancy.models.stepwise_kernel import Structure
-from fe.runtime.modal_system import ModalSystem
+from fe.runtime.modal_system import ModalSystem, exact_step
 from fe.runtime.motion import FASTEST_PHASE, SLOWEST_PHASE, Laws, ModalMotion, port_flexibility
 from fe.runtime.motion_arrays import Samples, State
 
@@ -30,7 +30,6 @@ ALIKE = 1e-9
 KEPT_STEPS = 16
 STEPS_AT_LEAST = 8
 """Substeps of an interval with laws where nothing in the structure has a pace of its own."""
-_TAYLOR = 14
 _kept = Memory(KEPT_STEPS)
 
 
@@ -105,68 +104,14 @@ def exact_steps(system: ModalSystem, lengths: FloatArray) -> ExactSteps:
     distinct = np.ascontiguousarray(lengths[first])
     stiffness = _stiffness_of(system)
     key = (stiffness.tobytes(), system.damping.tobytes(), distinct.tobytes())
-    transition, begin, end = _kept.get(key, lambda: _exponentials(system, distinct))
+    whole = stiffness if system.coupled else np.ascontiguousarray(np.diag(stiffness))
+    transition, begin, end = _kept.get(key, lambda: exact_step(whole, system.damping, distinct))
     return ExactSteps(distinct, np.asarray(which, dtype=np.int64).ravel(), transition, begin, end)
-
-
-def _exponentials(system: ModalSystem, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return transitions (S, 2M, 2M) and the parts of the force at both ends (S, 2M, M)."""
-    if not system.coupled:
-        return _by_mode(system, lengths)
-    return _whole(_stiffness_of(system), np.asarray(system.damping), lengths)
 
 
 def _stiffness_of(system: ModalSystem) -> FloatArray:
     given = system.stiffness_matrix if isinstance(system, CoupledModes) else None
     return np.diag(system.stiffness) if given is None else given
-
-
-def _by_mode(system: ModalSystem, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the same for modes that do not act on each other, each by itself."""
-    count, size = len(system.angular_frequency), len(lengths)
-    transition = np.zeros((size, 2 * count, 2 * count))
-    begin, end = np.zeros((2, size, 2 * count, count))
-    for mode in range(count):
-        at = np.array([mode, count + mode])
-        one = _whole(system.stiffness[mode].reshape(1, 1), system.damping[mode, mode].reshape(1, 1), lengths)
-        transition[:, at[:, None], at] = one[0]
-        begin[:, at, mode], end[:, at, mode] = one[1][:, :, 0], one[2][:, :, 0]
-    return transition, begin, end
-
-
-def _whole(
-    stiffness: FloatArray, damping: FloatArray, lengths: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the same for coordinates that act on each other."""
-    count = len(stiffness)
-    own = np.eye(count)
-    longest = float(lengths.max())
-    # Velocities are measured in units of the highest frequency, which balances the matrix.
-    unit = max(float(np.sqrt(np.max(np.abs(stiffness)))), float(np.max(np.abs(damping))), 1.0 / longest)
-    q, v = slice(0, count), slice(count, 2 * count)
-    f, s = slice(2 * count, 3 * count), slice(3 * count, 4 * count)
-    matrix = np.zeros((4 * count, 4 * count))
-    matrix[q, v] = unit * own
-    matrix[v, q] = -stiffness / unit
-    matrix[v, v] = -damping
-    matrix[v, f] = own / unit
-    scaled = matrix * lengths[:, None, None]
-    scaled[:, f, s] = own  # the force changes by one over the step
-    norm = float(np.max(np.sum(np.abs(scaled[:, : 2 * count, : 2 * count]), axis=2), initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))
-    scaled /= 2.0**squarings
-    unity = np.eye(4 * count)
-    result = np.broadcast_to(unity, scaled.shape)
-    for order in range(_TAYLOR, 0, -1):
-        result = unity + scaled @ result / order
-    for _ in range(squarings):
-        result = result @ result
-    scale = np.repeat((1.0, unit), count)
-    state = slice(0, 2 * count)
-    slope = result[:, state, s] * scale[:, None]
-    whole = result[:, state, f] * scale[:, None]
-    transition = result[:, state, state] * scale[:, None] / scale
-    return np.ascontiguousarray(transition), np.ascontiguousarray(whole - slope), np.ascontiguousarray(slope)
 
 
 def simulate_at(

@@ -1,27 +1,35 @@
 """The structure of the wing in the states that are asked for: stiffness, motion, rows of outputs; kept."""
 
-from collections.abc import Hashable
-from typing import NamedTuple
+from collections.abc import Hashable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from discrepancy.campaign.records import Quantity
+from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.body import Moving, Outputs, Place
+from discrepancy.models.interface import PortScale
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
-from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, ModulusTemperature, PointMass, RootCompliance
+from fe.runtime.patch import (
+    PRIMITIVES,
+    LocalStiffnessLoss,
+    ModelPatch,
+    ModulusTemperature,
+    PointMass,
+    PortLoad,
+    Primitive,
+    RootCompliance,
+)
 from fe.runtime.patched_structure import motion_basis
-from fe.runtime.patched_wing import ON_MODES, PORTS, PatchedWing, Place, strain_gauge
+from fe.runtime.patched_wing import LOAD_PLACE, MODE_COUNT, ON_MODES, PORTS, PatchedWing, strain_gauge
+from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import Losses
 
 FloatArray = NDArray[np.float64]
-Outputs = tuple[tuple[str, Quantity], ...]
 Key = Hashable
-
-MODE_COUNT = 6
-"""Modes that move in ring-downs and under forces; those of the FMU."""
 
 
 class Stiffness:
@@ -41,13 +49,6 @@ class Stiffness:
         return np.asarray(cho_solve(self._factor, loads, check_finite=False))
 
 
-class MovingWing(NamedTuple):
-    """The wing in a basis (n, k) of its first modes and some static shapes."""
-
-    basis: FloatArray
-    system: SecondOrderSystem
-
-
 class WingStructure:
     """The wing in the states and under the structural patches that were asked for, each made once.
 
@@ -58,13 +59,18 @@ class WingStructure:
 
     Attributes
     ----------
-    point_rows : (3, n) ndarray
-        Displacements of `PORTS` by the unknowns.
+    regions, points, port_rows, missing, length, reference
+        As of `discrepancy.models.structural.Body`.
     """
 
+    missing: tuple[str, ...] = STATION_PORTS
+    reference: str = LOAD_PLACE
+
     def __init__(self, wing: PatchedWing) -> None:
-        self.wing = wing
-        self.point_rows = np.stack([wing.port_rows[port] for port in PORTS])
+        self.wing, self.regions = wing, wing.arrays.regions
+        self.length: float | None = wing.span
+        self.port_rows: Mapping[str, FloatArray] = wing.port_rows
+        self.points: Mapping[str, FloatArray] = {port: wing.port_rows[port] for port in PORTS}
         self._stiffnesses, self._systems = Memory(), Memory()
         self._rows = Memory()
 
@@ -132,9 +138,7 @@ class WingStructure:
         key = self.stiffness_key(parameters, health, structure, temperature)
         return self._stiffnesses.get(
             key,
-            lambda: Stiffness(
-                self.wing.structure(float(parameters[0]), health, 0.0, 0.0, structure, temperature).stiffness
-            ),
+            lambda: Stiffness(self.wing.stiffness(float(parameters[0]), health, structure, temperature)),
         )
 
     def moving(
@@ -145,21 +149,21 @@ class WingStructure:
         temperature: float,
         place: Place,
         ports: tuple[str, ...] = (),
-    ) -> MovingWing:
+    ) -> Moving:
         """Return the wing as it moves when released from, or pushed at, a place, with forces at `ports`."""
         key = self.stiffness_key(parameters, health, structure, temperature)
         masses = structure.of(PointMass)
         held = self.wing.held_ports(ports)
 
-        def make() -> MovingWing:
-            e, servo, pitot, alpha, beta = (float(value) for value in parameters)
+        def make() -> Moving:
+            _, servo, pitot, alpha, beta = (float(value) for value in parameters)
             stiffness = self.stiffness(parameters, health, structure, temperature)
-            mass = self.wing.structure(e, health, servo, pitot, masses).mass
+            mass = self.wing.mass(servo, pitot, masses)
             still = stiffness.solve(np.vstack((self.wing.force_row(place), *held.values())).T)
             basis = motion_basis(stiffness.solve, mass, self.wing.arrays.start_shapes, still)
             small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness.matrix @ basis
             small_mass, small = 0.5 * (small_mass + small_mass.T), 0.5 * (small + small.T)
-            return MovingWing(
+            return Moving(
                 basis,
                 SecondOrderSystem(
                     small_mass,
@@ -174,32 +178,31 @@ class WingStructure:
 
         return self._systems.get((key, masses.primitives, parameters[1:].tobytes(), place, tuple(held)), make)
 
-    def static_units(
-        self,
-        stiffness: Stiffness,
-        place: Place | None,
-        loads: ModelPatch,
-        blocks: list[FloatArray],
-        port_rows: FloatArray,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return outputs (k, C) and motions (k, J) of ports of unit loads, and the same of unit port forces.
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
+        return primitive in PRIMITIVES.values() and primitive is not PortLoad
 
-        Parameters
-        ----------
-        stiffness : Stiffness
-            Of the wing.
-        place : str or tuple of float, optional
-            Of a force of 1 N; left out, the loads are the parts of the lift.
-        loads : ModelPatch
-            What changes them.
-        blocks : list of (C, n) ndarray
-            Rows of outputs.
-        port_rows : (J, n) ndarray
-            Rows of the ports.
-        """
-        units = self.wing.load_parts(loads) if place is None else self.wing.force_row(place, loads)[None]
-        answer = stiffness.solve(np.concatenate((units, port_rows)).T)
-        shown = np.concatenate([rows @ answer for rows in blocks]).T
-        moved = (port_rows @ answer).T
-        count = len(units)
-        return shown[:count], moved[:count], shown[count:], moved[count:]
+    def internal_forces(self, forces: ModelPatch) -> ModelPatch:
+        """Return forces as they act at ports of `port_rows`."""
+        return self.wing.internal_forces(forces)
+
+    def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+        """Return the load (n,) of 1 N at a place; raises `InvalidPatchError` if it is off the wing."""
+        return self.wing.force_row(place, loads)
+
+    def units(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+        """Return the unit loads (k, n) of a trial at rest: the parts of the lift, or a force of 1 N."""
+        if trial.kind is TrialKind.FLIGHT:
+            return self.wing.load_parts(loads)
+        return self.wing.force_row(trial.load_place, loads)[None]
+
+    def always(self, parameters: FloatArray) -> None:
+        """Return nothing: all loads of the wing are recorded."""
+
+    def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
+        """Return the scales of a force over the planform, from those of its mean and the first mode."""
+        share = self.wing.planform.share
+        motion = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
+        ratio = motion / float(share @ motion)
+        by_place = tuple(zip(share.tolist(), ratio.tolist(), strict=True))
+        return {PLANFORM: replace(ports["span"], spread=by_place)}

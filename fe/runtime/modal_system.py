@@ -63,8 +63,6 @@ class LinearStep(NamedTuple):
 def linear_step(system: ModalSystem, shape: FloatArray, constant: FloatArray, h: float) -> LinearStep:
     """Return the exact step of the linear system under a force that is linear in time.
 
-    The exponential of one matrix (Van Loan 1978) by scaling, a Taylor polynomial and squaring.
-
     Parameters
     ----------
     system : ModalSystem
@@ -79,55 +77,87 @@ def linear_step(system: ModalSystem, shape: FloatArray, constant: FloatArray, h:
     LinearStep
         Arrays over (q, v).
     """
-    key = (
-        system.angular_frequency.tobytes(),
-        system.damping.tobytes(),
-        shape.tobytes(),
-        constant.tobytes(),
-        h,
-    )
-    step = _STEPS.get(key)
-    if step is None:
-        step = _linear_step(system, shape, constant, h)
+    key = (system.stiffness.tobytes(), system.damping.tobytes(), h)
+    if key not in _STEPS:
         if len(_STEPS) >= MOST_STEPS:
             _STEPS.pop(next(iter(_STEPS)))
-        _STEPS[key] = step
-    return step
+        stiffness = system.stiffness if not system.coupled else np.diag(system.stiffness)
+        _STEPS[key] = tuple(part[0] for part in exact_step(stiffness, system.damping, np.array([h])))
+    transition, begin, end = _STEPS[key]
+    return LinearStep(transition, begin @ shape, end @ shape, (begin + end) @ constant)
 
 
-_STEPS: dict[tuple[bytes, bytes, bytes, bytes, float], LinearStep] = {}
+_STEPS: dict[tuple[bytes, bytes, float], tuple[FloatArray, ...]] = {}
 MOST_STEPS = 64
 """Linear steps that are kept, because the same structure is often moved again with other laws."""
+_TAYLOR = 10
 
 
-def _linear_step(system: ModalSystem, shape: FloatArray, constant: FloatArray, h: float) -> LinearStep:
-    count = len(system.angular_frequency)
+def exact_step(
+    stiffness: FloatArray, damping: FloatArray, lengths: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the exact steps of q'' + D q' + S q = f under forces that are linear in time.
+
+    The exponential of one matrix (Van Loan 1978) by scaling, a Taylor polynomial and squaring, all lengths at
+    once.
+
+    Parameters
+    ----------
+    stiffness : (M,) or (M, M) ndarray
+        S [1/s^2]; (M,) where neither it nor D couples the coordinates: each is then stepped by itself.
+    damping : (M, M) ndarray
+        D [1/s].
+    lengths : (S,) ndarray
+        [s].
+
+    Returns
+    -------
+    transition : (S, 2M, 2M) ndarray
+        Of (q, v).
+    begin, end : (S, 2M, M) ndarray
+        By the forces at the begin and at the end of a step.
+    """
+    if stiffness.ndim == 2:
+        transition, begin, end = _exponential(stiffness[None], damping[None], lengths)
+        return transition[:, 0], begin[:, 0], end[:, 0]
+    count, size, mode = len(stiffness), len(lengths), np.arange(len(stiffness))
+    parts = _exponential(stiffness[:, None, None], np.diag(damping)[:, None, None], lengths)
+    whole, forces = np.zeros((size, 2, count, 2, count)), np.zeros((2, size, 2, count, count))
+    whole[:, :, mode, :, mode] = parts[0].transpose(1, 0, 2, 3)
+    for force, part in zip(forces, parts[1:], strict=True):
+        force[:, :, mode, mode] = part[..., 0].transpose(0, 2, 1)
+    begin, end = forces.reshape(2, size, 2 * count, count)
+    return whole.reshape(size, 2 * count, 2 * count), begin, end
+
+
+def _exponential(
+    stiffness: FloatArray, damping: FloatArray, lengths: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the same for B systems (B, n, n) each by itself, as (S, B, 2n, 2n) and (S, B, 2n, n)."""
+    count, own = stiffness.shape[1], np.eye(stiffness.shape[1])
     # Velocities are measured in units of the highest frequency, which balances the matrix.
-    unit = max(
-        float(np.max(system.angular_frequency)), float(np.max(np.abs(system.damping))), 1.0 / h if h else 1.0
-    )
-    matrix = np.zeros((2 * count + 3, 2 * count + 3))
-    matrix[:count, count : 2 * count] = unit * np.eye(count)
-    matrix[count : 2 * count, :count] = -np.diag(system.angular_frequency**2) / unit
-    matrix[count : 2 * count, count : 2 * count] = -system.damping
-    matrix[count : 2 * count, 2 * count] = shape / unit
-    matrix[count : 2 * count, 2 * count + 2] = constant / unit
-    matrix *= h
-    matrix[2 * count, 2 * count + 1] = 1.0
-    norm = float(np.max(np.sum(np.abs(matrix[: 2 * count, : 2 * count]), axis=1)))
-    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))
-    scaled = matrix / 2.0**squarings
-    result = np.eye(len(matrix))
-    for order in range(14, 0, -1):
-        result = np.eye(len(matrix)) + scaled @ result / order
+    largest = (np.abs(part).max(axis=(1, 2), keepdims=True) for part in (stiffness, damping))
+    fastest, damped = largest
+    unit = np.maximum(np.maximum(np.sqrt(fastest), damped), 1.0 / (float(lengths.max()) or 1.0))
+    q, v, f, s = (slice(number * count, (number + 1) * count) for number in range(4))
+    matrix = np.zeros((len(stiffness), 4 * count, 4 * count))
+    matrix[:, q, v] = unit * own
+    matrix[:, v, q] = -stiffness / unit
+    matrix[:, v, v] = -damping
+    matrix[:, v, f] = own / unit
+    scaled = matrix * lengths[:, None, None, None]
+    scaled[:, :, f, s] = own  # the force changes by one over the step
+    both = slice(0, 2 * count)
+    norm = float(np.max(np.sum(np.abs(scaled[:, :, both]), axis=3), initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.125))))
+    scaled /= 2.0**squarings
+    unity = np.eye(4 * count)
+    result = np.broadcast_to(unity, scaled.shape)
+    for order in range(_TAYLOR, 0, -1):
+        result = unity + scaled @ result / order
     for _ in range(squarings):
         result = result @ result
-    scale = np.repeat((1.0, unit), count)
-    state = slice(0, 2 * count)
-    slope = result[state, 2 * count + 1] * scale
-    return LinearStep(
-        np.ascontiguousarray(result[state, state] * scale[:, None] / scale),
-        result[state, 2 * count] * scale - slope,
-        slope,
-        result[state, 2 * count + 2] * scale,
-    )
+    scale = np.concatenate((np.ones_like(unit), unit), axis=1).repeat(count, axis=1)
+    slope, whole = result[:, :, both, s] * scale, result[:, :, both, f] * scale
+    transition = result[:, :, both, both] * scale / scale.transpose(0, 2, 1)
+    return np.ascontiguousarray(transition), whole - slope, np.ascontiguousarray(slope)

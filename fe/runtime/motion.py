@@ -104,6 +104,11 @@ class Laws:
         whole[chosen] = memory
         return whole
 
+    def alike(self, other: "Laws") -> bool:
+        """Return whether these are the same laws at the same ports, whose memory then stays."""
+        same = self.ports == other.ports and self.elements.shape == other.elements.shape
+        return same and bool(np.array_equal(self.numbers, other.numbers))
+
     @cached_property
     def of_speed(self) -> IntArray:
         """1 for each law (J,) of speed."""

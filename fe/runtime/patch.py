@@ -191,7 +191,7 @@ SENSORS = (
 
 @dataclass(frozen=True)
 class ModelPatch:
-    """A set of primitive changes; the empty patch is the model as it was, to the last bit.
+    """A set of primitive changes; the empty patch is the model as it was.
 
     Attributes
     ----------

@@ -20,65 +20,32 @@ HELD = 1e-7
 """Part of a static shape, relative to it, below which a basis of motion holds it already."""
 
 
-class StructureTerms(NamedTuple):
-    """What the matrices of a structure are the sum of."""
-
-    theta: FloatArray  # (K + 2,) of the stiffness terms
-    strips: tuple[tuple[float, FloatArray], ...]  # what is added of a strip's part, its stiffness (n, n)
-    spring: float  # added to the root's flapping spring
-    masses: tuple[float, float]  # servo, pitot
-    points: tuple[tuple[float, FloatArray], ...]  # point mass, weights (P,) of its station
-
-
 class Modes(NamedTuple):
     """Modes that move: angular frequencies (M,) [rad/s], shapes (n, M), displacements to modes (M, n)."""
 
-    frequency: FloatArray
+    angular_frequency: FloatArray
     shapes: FloatArray
     to_modes: FloatArray
 
+    @property
+    def frequency(self) -> FloatArray:
+        """Natural frequencies (M,) [Hz]."""
+        return np.asarray(self.angular_frequency / (2.0 * np.pi))
+
 
 class PatchedStructure:
-    """Stiffness and mass of the wing at one state and under one set of changes.
+    """Stiffness and mass (n, n) of the wing at one state and under one set of changes.
 
     Parameters
     ----------
     arrays : PatchArrays
-        The wing for patches.
-    terms : StructureTerms
-        State and changes.
-
-    Attributes
-    ----------
+        The wing for patches, in whose basis they are.
     stiffness, mass : (n, n) ndarray
-        In the basis of the arrays.
+        As `fe.runtime.patched_wing.PatchedWing` gives them.
     """
 
-    def __init__(self, arrays: PatchArrays, terms: StructureTerms) -> None:
-        self._arrays, self._terms = arrays, terms
-
-    @cached_property
-    def stiffness(self) -> FloatArray:
-        """Stiffness (n, n)."""
-        arrays, terms = self._arrays, self._terms
-        stiffness = np.tensordot(terms.theta, arrays.stiffness, 1)
-        for factor, strip in terms.strips:
-            stiffness += factor * strip
-        if terms.spring != 0.0:
-            stiffness += terms.spring * np.multiply.outer(arrays.flap_row, arrays.flap_row)
-        return np.asarray(stiffness)
-
-    @cached_property
-    def mass(self) -> FloatArray:
-        """Mass (n, n)."""
-        arrays = self._arrays
-        servo, pitot = self._terms.masses
-        mass = arrays.mass[0] + servo * arrays.mass[1] + pitot * arrays.mass[2]
-        for added, weights in self._terms.points:
-            for rows in arrays.line_rows[:3]:
-                row = weights @ rows
-                mass += added * np.multiply.outer(row, row)
-        return np.asarray(mass)
+    def __init__(self, arrays: PatchArrays, stiffness: FloatArray, mass: FloatArray) -> None:
+        self._arrays, self.stiffness, self.mass = arrays, stiffness, mass
 
     @cached_property
     def _inverse(self) -> FloatArray:

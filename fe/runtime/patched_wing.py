@@ -4,7 +4,6 @@ NumPy and relative imports only: this file is copied into the FMU. The arrays ar
 `fe.runtime.patch_arrays`; the equations are in `docs/patches.md`.
 """
 
-import re
 from functools import cached_property
 from math import isfinite
 
@@ -12,54 +11,32 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import InvalidPatchError
-from .local_loss import boxes_of, remaining_skin, strain_factors
-from .patch import (
-    INTERNAL_FORCES,
-    InertiaRelief,
-    LoadPlace,
-    ModelPatch,
-    ModulusTemperature,
-    PointMass,
-    PortForce,
-    RootCompliance,
-    Washout,
-)
+from .local_loss import boxes_of, remaining_skin
+from .motion import laws_of
+from .patch import LOADS, LoadGain, ModelPatch, ModulusTemperature, PointMass, RootCompliance
 from .patch_arrays import PatchArrays
-from .patched_structure import PatchedStructure, StructureTerms
-from .planform_forces import PLANFORM, STATION_PORTS, PlanformStations, at_stations, planform_stations
+from .patched_structure import Modes, PatchedStructure
+from .planform_forces import STATION_PORTS
 from .state import Losses
+from .wing_rows import EMPTY as EMPTY
+from .wing_rows import LOAD_PLACE as LOAD_PLACE
+from .wing_rows import PORTS as PORTS
+from .wing_rows import Place as Place
+from .wing_rows import WingRows
+from .wing_rows import strain_gauge as strain_gauge
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-Place = str | tuple[float, float]
 
-LOAD_PLACE = "tip_load"
-"""Name of the place of the static test."""
-OVERHANG = 0.15
-"""How far beyond the tip a place may lie, as a share of the semi-span."""
-PORTS = ("root", "tip", "span")
-"""Ports where internal forces act on the motion of one place, or of the mean."""
-KNOWN_PORTS = (*PORTS, PLANFORM)
-"""All places that an internal force may name."""
+HOLDING = 3
+"""Number of the load of `PatchedState` that holds the wing before a release."""
+MODE_COUNT = 6
+"""Modes that move; those whose frequencies the FMU shows."""
 ON_MODES = frozenset(STATION_PORTS)
 """Ports whose position in motion is that of the modes alone. Beyond the modes, neighbouring stations move one
 another half as much as themselves, which a flexibility of each port by itself does not hold."""
-_STRAIN = re.compile(r"strain\[(\d+)\]")
-_NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
-_DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
-
-STANDARD_GRAVITY = 9.80665
-"""[m/s^2]; that of `fe.full.turn_load`, which is not copied into the FMU."""
-EMPTY = ModelPatch()
 
 
-def strain_gauge(output: str) -> int:
-    """Return the row k - 1 of an output strain[k], k from 1; -1 for other outputs."""
-    strain = _STRAIN.fullmatch(output)
-    return -1 if strain is None else int(strain.group(1)) - 1
-
-
-class PatchedWing:
+class PatchedWing(WingRows):
     """The wing in a basis that holds the changes of `fe.runtime.patch`.
 
     Parameters
@@ -69,24 +46,11 @@ class PatchedWing:
     """
 
     def __init__(self, arrays: PatchArrays) -> None:
-        self.arrays = arrays
-        self.size = len(arrays.load_tip)
+        super().__init__(arrays)
         lower = np.tril_indices(self.size)
         self._strips = np.zeros((len(arrays.strip_of), self.size, self.size))
         self._strips[:, lower[0], lower[1]] = arrays.strip_stiffness
         self._strips[:, lower[1], lower[0]] = arrays.strip_stiffness
-
-    @property
-    def gauge_count(self) -> int:
-        """Number of gauges G."""
-        return int(self.arrays.strain_rows.shape[1])
-
-    @property
-    def span(self) -> float:
-        """Semi-span [m]."""
-        return self.arrays.semi_span
-
-    # ------------------------------------------------------------ structure
 
     def structure(
         self,
@@ -97,39 +61,63 @@ class PatchedWing:
         patch: ModelPatch = EMPTY,
         temperature_difference: float = 0.0,
     ) -> PatchedStructure:
-        """Return stiffness and mass at a state under a patch; primitives of other kinds are passed over.
+        """Return stiffness and mass at a state under a patch; see `stiffness` and `mass`."""
+        stiffness = self.stiffness(young_modulus_factor, stiffness_loss, patch, temperature_difference)
+        return PatchedStructure(self.arrays, stiffness, self.mass(servo_mass, pitot_mass, patch))
+
+    def mass(self, servo_mass: float, pitot_mass: float, patch: ModelPatch = EMPTY) -> FloatArray:
+        """Return the mass (n, n) with the point masses of a patch [kg].
+
+        Raises
+        ------
+        InvalidPatchError
+            If a place lies off the wing.
+        """
+        arrays = self.arrays
+        mass = arrays.mass[0] + servo_mass * arrays.mass[1] + pitot_mass * arrays.mass[2]
+        for item in patch:
+            if isinstance(item, PointMass):
+                for row in self._along(item.station) @ arrays.line_rows[:3]:
+                    mass += item.mass * np.multiply.outer(row, row)
+        return np.asarray(mass)
+
+    def stiffness(
+        self,
+        young_modulus_factor: float,
+        stiffness_loss: Losses,
+        patch: ModelPatch = EMPTY,
+        temperature_difference: float = 0.0,
+    ) -> FloatArray:
+        """Return the stiffness (n, n) at a state under a patch; primitives of other kinds are passed over.
 
         Parameters
         ----------
-        young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
+        young_modulus_factor, stiffness_loss
             As of `fe.runtime.state.DigitalState`.
         patch : ModelPatch
-            Its point masses, root compliances, local losses and temperature coefficients act.
+            Its root compliances, local losses and temperature coefficients act.
         temperature_difference : float
             Temperature less the reference temperature [K].
 
         Raises
         ------
         InvalidPatchError
-            If a change leaves no stiffness, or a place lies off the wing.
+            If a change leaves no stiffness.
         """
         arrays, e = self.arrays, young_modulus_factor
         compliance = 0.0
-        points = []
         for item in patch:
             if isinstance(item, ModulusTemperature):
                 e = e * (1.0 - item.coefficient * temperature_difference)
             elif isinstance(item, RootCompliance):
                 compliance += item.compliance
-            elif isinstance(item, PointMass):
-                points.append((item.mass, self._along(item.station)))
         theta = np.array((e, *(1.0 - z for z in arrays.losses(stiffness_loss)), 1.0))
         if not (isfinite(e) and theta.min() > 0.0):
             raise InvalidPatchError(
                 f"The factors on the stiffness of skin and damage regions must be positive, but are "
                 f"{', '.join(f'{factor:g}' for factor in theta[:-1])}; lessen the losses or the coefficient."
             )
-        spring = 0.0
+        stiffness = np.tensordot(theta, arrays.stiffness, 1)
         if compliance != 0.0:
             flexibility = 1.0 / arrays.flap_spring + compliance
             if flexibility <= 0.0:
@@ -138,252 +126,83 @@ class PatchedWing:
                     f"{-compliance:g}; give a compliance above {-1.0 / arrays.flap_spring:g}."
                 )
             spring = 1.0 / flexibility - arrays.flap_spring
+            stiffness += spring * np.multiply.outer(arrays.flap_row, arrays.flap_row)
         boxes = boxes_of(patch)
-        remaining = np.ones(len(arrays.strip_lines) - 1)
         if boxes:
-            remaining = remaining_skin(boxes, arrays.strip_lines).of_strips
-        parts = np.flatnonzero(remaining[arrays.strip_of] != 1.0).astype(np.int64)
-        factors = (remaining[arrays.strip_of[parts]] - 1.0) * theta[arrays.term_of[parts]]
-        losses = tuple((factor, self._strips[part]) for part, factor in zip(parts, factors, strict=True))
-        terms = StructureTerms(theta, losses, spring, (servo_mass, pitot_mass), tuple(points))
-        return PatchedStructure(arrays, terms)
+            remaining = remaining_skin(boxes, arrays.strip_lines).of_strips[arrays.strip_of]
+            for part in np.flatnonzero(remaining != 1.0):
+                stiffness += (remaining[part] - 1.0) * theta[arrays.term_of[part]] * self._strips[part]
+        return np.asarray(stiffness)
 
-    # ------------------------------------------------------------ loads and rows
-
-    @cached_property
-    def _line_order(self) -> IntArray:
-        """Numbers (L,) of the lines of a section from the leading edge to the trailing edge."""
-        return np.argsort(self.arrays.line_chord)
-
-    def _along(self, y: float) -> FloatArray:
-        """Weights (P,) of the stations at `y` m from the root: the parabola of the mesh cell."""
-        stations, span = self.arrays.stations, self.span
-        if not 0.0 <= y <= (1.0 + OVERHANG) * span:
-            raise InvalidPatchError(
-                f"A place must lie on the wing, 0 to {span:g} m from the root, but is {y:g} m."
-            )
-        if y > span:  # a force beyond the tip hangs on a stiff arm
-            inboard = 0.97 * span
-            arm = (y - inboard) / (span - inboard)
-            return np.asarray(arm * self._along(span) + (1.0 - arm) * self._along(inboard))
-        cell = min(max(int(np.searchsorted(stations[2::2], y)), 0), (len(stations) - 3) // 2)
-        first, last = stations[2 * cell], stations[2 * cell + 2]
-        t = (y - first) / (last - first)
-        weights = np.zeros(len(stations))
-        weights[2 * cell : 2 * cell + 3] = (
-            (1.0 - t) * (1.0 - 2.0 * t),
-            4.0 * t * (1.0 - t),
-            t * (2.0 * t - 1.0),
-        )
-        return weights
-
-    def displacement_row(self, y: float, chord: float, beside: float | None = None) -> FloatArray:
-        """Return the row (n,) of the upward displacement of a section at a chord fraction.
-
-        Parameters
-        ----------
-        y : float
-            Distance from the root [m].
-        chord : float
-            Chord fraction.
-        beside : float, optional
-            The section is straight through the two lines beside this chord fraction; `chord` by default.
+    def at(
+        self, vector: FloatArray, patch: ModelPatch = EMPTY, temperature_difference: float = 0.0
+    ) -> "PatchedState":
+        """Return the wing as `fe.runtime.transient` takes it, at values (V,) of all that can be chosen.
 
         Raises
         ------
         InvalidPatchError
-            If `y` lies off the wing.
+            If the wing cannot carry the patch.
         """
-        along = self._along(y)
-        chords, order = self.arrays.line_chord, self._line_order
-        within = chord if beside is None else beside
-        number = int(np.searchsorted(chords[order], within, side="right"))
-        behind = min(max(number, 1), len(order) - 1)
-        first, last = order[behind - 1], order[behind]
-        share = (chord - chords[first]) / (chords[last] - chords[first])
-        rows = self.arrays.line_rows[2:]
-        row = (1.0 - share) * (along @ rows[first])
-        return np.asarray(row + share * (along @ rows[last]) if share != 0.0 else row)
+        return PatchedState(self, vector, patch, temperature_difference)
 
-    def force_row(self, place: Place, patch: ModelPatch = EMPTY) -> FloatArray:
-        """Return the load (n,) of 1 N at a place; as a row, the displacement there.
 
-        Parameters
-        ----------
-        place : str or tuple of float
-            "tip_load", or distance from the root [m] and chord fraction.
-        patch : ModelPatch
-            Its load places act.
+class PatchedState:
+    """The wing in one state and under one patch, as `fe.runtime.transient` takes it.
 
-        Raises
-        ------
-        InvalidPatchError
-            If the place is not known or lies off the wing.
-        """
-        along_span = sum(item.along_span for item in patch if isinstance(item, LoadPlace))
-        along_chord = sum(item.along_chord for item in patch if isinstance(item, LoadPlace))
-        if isinstance(place, str):
-            if place != LOAD_PLACE:
-                raise InvalidPatchError(
-                    f"The place {place!r} is not known; give {LOAD_PLACE!r} or the distance from the root "
-                    "in metres and the chord fraction."
-                )
-            row = self.arrays.load_tip
-            y, chord = self.arrays.load_place, float(self.arrays.line_chord[0])
-        else:
-            y, chord = place
-            row = self.displacement_row(y, chord)
-        if along_span == 0.0 and along_chord == 0.0:
-            return row
-        arrays = self.arrays
+    The loads are load factor, its square, the force at the load point as the patch has it, and one at the
+    load point itself, which holds the wing before a release. Outputs are the gauges and the tip.
 
-        def chord_at(distance: float) -> float:
-            return arrays.root_chord + (arrays.tip_chord - arrays.root_chord) * distance / arrays.semi_span
+    Attributes
+    ----------
+    components : (2, G, n) ndarray
+        Rows of the strains across the gauges, and of shear.
+    """
 
-        # how far aft of the straight chord line; outboard is along that line
-        aft = (chord - arrays.straight_chord_line) * chord_at(y) + along_chord
-        moved = y + along_span
-        moved_chord = arrays.straight_chord_line + aft / chord_at(moved)
-        # the clamp grips the same two lines wherever it pulls, else the response had a kink at each web
-        shift = self.displacement_row(moved, moved_chord, chord) - self.displacement_row(y, chord)
-        return np.asarray(row + shift)
+    holding = HOLDING
+    on_modes = ON_MODES
 
-    def load(self, load_factor: float, patch: ModelPatch = EMPTY) -> FloatArray:
-        """Return the load (n,) [N] of a turn at a load factor under a patch: washout, relief by weight."""
-        linear, square = self.load_parts(patch)
-        return np.asarray(load_factor * linear + load_factor**2 * square)
+    def __init__(self, wing: PatchedWing, vector: FloatArray, patch: ModelPatch, temperature: float) -> None:
+        e, *losses, servo, pitot = vector[:-2].tolist()
+        arrays, self._gains = wing.arrays, [item for item in patch if isinstance(item, LoadGain)]
+        self._structure = wing.structure(e, tuple(losses), servo, pitot, patch, temperature)
+        self.laws = laws_of(wing.internal_forces(patch), wing.port_rows)
+        held = wing.held_ports(self.laws.ports)
+        self._held = np.vstack((arrays.load_tip, *held.values()))
+        force = wing.force_row(LOAD_PLACE, patch.of(*LOADS))
+        ports = self.laws.rows(wing.port_rows, wing.size)
+        parts = wing.load_parts(patch.of(*LOADS, PointMass))
+        self.loads = np.vstack((parts, force, arrays.load_tip, ports)).T
+        factors, strains = wing.strain_factors(patch), arrays.strain_rows
+        if factors is not None:
+            strains = factors[:, np.newaxis] * strains
+        self.outputs, self.components = np.vstack((strains[0], arrays.tip_row)), strains[1:]
+        self.accelerations = np.zeros((0, wing.size))
 
-    def load_parts(self, patch: ModelPatch = EMPTY) -> FloatArray:
-        """Return the parts (2, n) of `load` that go with the load factor and with its square [N]."""
-        arrays = self.arrays
-        parts = np.stack((arrays.load_lift, np.zeros(self.size)))
-        for item in patch:
-            if isinstance(item, Washout):
-                if item.exponent < 0.0:
-                    raise InvalidPatchError(
-                        f"The exponent of a washout must not be negative, but is {item.exponent:g}."
-                    )
-                eta = np.clip(arrays.stations / arrays.semi_span, 0.0, 1.0) ** item.exponent
-                parts[1] -= item.coefficient * (eta @ arrays.lift_rows)
-            elif isinstance(item, InertiaRelief):
-                parts[0] += item.fraction * arrays.weight
-            elif isinstance(item, PointMass):
-                parts[0] -= STANDARD_GRAVITY * item.mass * (self._along(item.station) @ arrays.line_rows[2])
-        return parts
+    def acting(self, vector: FloatArray) -> FloatArray:
+        """Return the coefficients (4,) of the loads."""
+        load_factor, tip_force = vector[-2:].tolist()
+        force = tip_force
+        for item in self._gains:
+            force = (1.0 + item.gain) * force + (item.tare if tip_force != 0.0 else 0.0)
+        return np.array((load_factor, load_factor**2, force, 0.0))
 
     @cached_property
-    def planform(self) -> PlanformStations:
-        """Stations of forces that are spread over the planform."""
-        arrays = self.arrays
-        return planform_stations(arrays.semi_span, arrays.root_chord, arrays.tip_chord)
-
-    def internal_forces(self, patch: ModelPatch) -> ModelPatch:
-        """Return the internal forces of a patch by the ports of `port_row`, those of the planform by station.
-
-        Raises
-        ------
-        InvalidPatchError
-            If a force acts at a place that the wing does not have.
-        """
-        forces = patch.of(*INTERNAL_FORCES)
-        for item in forces:
-            if isinstance(item, PortForce) and item.port not in KNOWN_PORTS:
-                raise InvalidPatchError(
-                    f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model does not "
-                    f"have; it has {', '.join(KNOWN_PORTS)}."
-                )
-        return at_stations(forces, self.planform.share)
+    def answers(self) -> FloatArray:
+        """Displacements (n, 4 + J) at rest under the unit loads."""
+        return self._structure.static(self.loads)
 
     @cached_property
-    def port_rows(self) -> dict[str, FloatArray]:
-        """Rows (n,) of all ports of `internal_forces`: `PORTS`, then the stations of the planform."""
-        return {name: self.port_row(name) for name in (*PORTS, *STATION_PORTS)}
+    def modes(self) -> Modes:
+        """The modes that move."""
+        return self._structure.modes(MODE_COUNT, self._held)
 
-    def held_ports(self, ports: tuple[str, ...]) -> dict[str, FloatArray]:
-        """Return the rows (n,) of the ports whose static shapes a motion with forces on `ports` holds.
+    @property
+    def shapes(self) -> FloatArray:
+        """Their shapes (n, M)."""
+        return self.modes.shapes
 
-        They are `PORTS`, and the stations of the planform where forces act on these.
-        """
-        spread = any(port in STATION_PORTS for port in ports)
-        return {name: row for name, row in self.port_rows.items() if spread or name in PORTS}
-
-    def port_row(self, name: str) -> FloatArray:
-        """Return the row (n,) of a port: "root" [rad], "tip", "span" or a station of the planform [m].
-
-        Raises
-        ------
-        InvalidPatchError
-            If there is no such port.
-        """
-        if name == "root":
-            return self.arrays.flap_row
-        if name == "tip":
-            return self.arrays.load_tip
-        if name == "span":
-            return np.asarray(self.arrays.station_weights @ self.arrays.line_rows[2])
-        if name in STATION_PORTS:
-            distance = float(self.planform.distance[STATION_PORTS.index(name)])
-            return np.asarray(self._along(distance) @ self.arrays.line_rows[2])
-        known = ", ".join((*PORTS, *STATION_PORTS))
-        raise InvalidPatchError(f"The wing has no port {name!r}; it has {known}.")
-
-    def output_row(self, name: str, component: int = 0, patch: ModelPatch = EMPTY) -> FloatArray | None:
-        """Return the row (n,) of an output, None if there is no such output.
-
-        Parameters
-        ----------
-        name : str
-            strain[k] (gauges count from 1, as in the FMU), tip_displacement, load_point_displacement,
-            displacement[y, x].
-        component : int
-            Of a strain: 0 along the span, 1 across, 2 engineering shear strain; zero for displacements.
-        patch : ModelPatch
-            Its local losses act on the strains, see `strain_factors`.
-        """
-        gauge = strain_gauge(name)
-        if gauge >= 0:
-            if gauge >= self.gauge_count:
-                return None
-            factors = self.strain_factors(patch)
-            measured = self.arrays.strain_rows[component, gauge]
-            return measured if factors is None else np.asarray(factors[gauge] * measured)
-        row: FloatArray | None = None
-        if name == "tip_displacement":
-            row = self.arrays.tip_row
-        elif name == "load_point_displacement":
-            row = self.arrays.load_tip
-        else:
-            place = _DISPLACEMENT.fullmatch(name)
-            if place is not None and 0.0 <= float(place.group(1)) <= self.span:
-                row = self.displacement_row(float(place.group(1)), float(place.group(2)))
-        return row if row is None or component == 0 else np.zeros_like(row)
-
-    @cached_property
-    def _skin_share(self) -> FloatArray:
-        """Share (G,) of the bending stiffness at each gauge that the skin has, as the strain shows it."""
-        terms = len(self.arrays.stiffness)
-        softer = np.append(np.full(terms - 1, 0.7), 1.0)
-        whole, less = (
-            self.arrays.strain_rows[0]
-            @ np.linalg.solve(np.tensordot(theta, self.arrays.stiffness, 1), self.arrays.load_lift)
-            for theta in (np.ones(terms), softer)
-        )
-        return np.asarray((1.0 - whole / less) / (1.0 - softer[0]))
-
-    def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
-        """Return factors (G,) on the strain rows by where the edges of local losses lie in their strips.
-
-        `fe.runtime.local_loss.strain_factors` says what they are. They are one where boxes end at edges of
-        strips.
-
-        Returns
-        -------
-        (G,) ndarray or None
-            None: there is no local loss.
-        """
-        boxes = boxes_of(patch)
-        if not boxes:
-            return None
-        arrays = self.arrays
-        skin = remaining_skin(boxes, arrays.strip_lines)
-        return strain_factors(skin, arrays.gauge_stations, arrays.gauge_length, self._skin_share)
+    @property
+    def to_modes(self) -> FloatArray:
+        """Modal coordinates (M, n) of a displacement."""
+        return self.modes.to_modes

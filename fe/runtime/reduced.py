@@ -6,6 +6,7 @@ NumPy and relative imports only: this file is copied into the FMU. The equations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import sqrt
 
 import numpy as np
@@ -79,6 +80,31 @@ class Modes:
     mass: FloatArray
     followed: tuple[int, ...]
     followed_mac: tuple[float, ...]
+
+
+class ReducedState:
+    """A reduced structure in one state, as `fe.runtime.transient` takes it, in Nm + N coordinates.
+
+    These are those of the modal and of the static basis; a motion is in the one and what modes leave out in
+    the other, so that nothing is solved in both.
+    """
+
+    laws = None
+    holding = None
+    on_modes: frozenset[str] = frozenset()
+    components = np.zeros((2, 0, 0))
+
+    def __init__(self, model: "ReducedModel", vector: FloatArray) -> None:
+        self.modes = modes = model.modes(vector)
+        self.acting = model.load_coefficients
+        self.loads, self.outputs, self.accelerations = model.rows
+        stiffness = dense_sum(model.stiffness_coefficients(vector), model.static_stiffness)
+        cross = dense_sum(model.mass_coefficients(vector), model.cross_mass)
+        size, (moving, count) = len(model.static_load.T), modes.shape.shape
+        self.shapes = np.concatenate((modes.shape, np.zeros((size, count))))
+        answers = solve(stiffness, model.static_load.T)
+        self.answers = np.concatenate((np.zeros((moving, answers.shape[1])), answers))
+        self.to_modes = modes.shape.T @ np.concatenate((modes.mass, cross), axis=1)
 
 
 @dataclass(frozen=True, repr=False)
@@ -214,6 +240,24 @@ class ReducedModel(ReducedArrays):
         first = len(self.parameters)
         known = [1.0, *values, *[1.0 - value for value in values[first : first + len(self.regions)]]]
         return np.array([known[one] * known[other] for one, other in self._pairs[number]])
+
+    @cached_property
+    def rows(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Loads (n, L), static outputs (O', n) and accelerations (A, n) in the coordinates of `at`."""
+        static, modal = self.static_output, self.modal_output
+        loads = np.concatenate((self.modal_load, self.static_load), axis=1).T
+        outputs = np.concatenate((modal[: len(static)], static), axis=1)
+        return loads, outputs, np.pad(modal[len(static) :], ((0, 0), (0, static.shape[1])))
+
+    def at(self, vector: FloatArray) -> ReducedState:
+        """Return the structure in motion at values (V,) of all that can be chosen.
+
+        Raises
+        ------
+        OutsideModelError
+            If a value lies outside the validity box or is not finite.
+        """
+        return ReducedState(self, vector)
 
     def stiffness_coefficients(self, vectors: FloatArray) -> FloatArray:
         """Return the coefficients (..., T) of the stiffness terms at values (..., V)."""

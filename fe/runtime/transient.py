@@ -1,23 +1,28 @@
-"""Transient response by modes: exact for a load that is held, with static correction.
+"""A structure in time: at rest, or its first modes moving, with or without forces of laws at its ports.
 
 Kapteyn et al. 2021, eq. (12), in modal coordinates: q'' + 2 zeta omega q' + omega^2 q = shape^T f, one
-equation for each mode, because Rayleigh damping (17) leaves the modes uncoupled. Modes that are not kept
-follow the load without delay (static correction).
+equation for each mode, because Rayleigh damping (17) leaves the modes uncoupled; exact for loads that are
+held. Modes that are not kept follow the load without delay (static correction). Laws at ports couple the
+modes: `fe.runtime.motion` steps them, and omitted modes follow their forces with the lag of the damping.
 
-NumPy and relative imports only: this file is copied into the FMU.
+NumPy and relative imports only: this file is copied into the FMU. Laws are imported where there are any.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import isfinite
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import exp, isfinite
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from .damping import rayleigh_damping_ratio
 from .errors import InvalidStateError
-from .reduced import ReducedModel, dense_sum
+from .modal_system import ModalSystem, exact_step
+
+if TYPE_CHECKING:
+    from .motion import Laws, ModalMotion
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -29,24 +34,33 @@ class TransientState:
     Attributes
     ----------
     displacement : (M,) ndarray
-        Modal coordinates q [m kg^1/2].
+        Modal coordinates q [m kg^1/2]; none of a structure at rest, which has no motion to remember.
     velocity : (M,) ndarray
         Their rates [m kg^1/2 / s].
     load : (L,) ndarray
         Coefficients of the loads at this moment; of a wing the load factor [1] and the tip force [N].
+    forces : (J,) ndarray
+        Forces of laws, as omitted modes follow them.
+    memory : (J, 5 + E) ndarray
+        What the laws remember.
     """
 
     displacement: FloatArray
     velocity: FloatArray
     load: FloatArray
+    forces: FloatArray = field(default_factory=lambda: np.zeros(0))
+    memory: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def to_list(self) -> list[float]:
-        """Return the state as 2 M + L plain floats; `from_list` gives it back to the last bit."""
-        return [*self.displacement.tolist(), *self.velocity.tolist(), *self.load.tolist()]
+        """Return the state as 2 M + L + J (6 + E) plain floats; `from_list` gives it back to the last bit."""
+        parts = (self.displacement, self.velocity, self.load, self.forces, self.memory)
+        return [float(value) for part in parts for value in part.ravel()]
 
     @classmethod
-    def from_list(cls, values: Sequence[float], mode_count: int) -> "TransientState":
-        """Return the state of M modes that `to_list` wrote.
+    def from_list(
+        cls, values: Sequence[float], mode_count: int, laws: "Laws | None" = None
+    ) -> "TransientState":
+        """Return the state of M modes, none at rest, under the same laws, that `to_list` wrote.
 
         Raises
         ------
@@ -58,121 +72,206 @@ class TransientState:
                 f"A transient state of {mode_count} modes needs at least {2 * mode_count} finite numbers, "
                 f"but {len(values)} came, {sum(isfinite(value) for value in values)} of them finite."
             )
+        memory = np.zeros((0, 0)) if laws is None else laws.memory()
+        ends = np.cumsum([mode_count, mode_count, len(values) - 2 * mode_count - len(memory) - memory.size])
         array = np.array(values, dtype=np.float64)
-        return cls(array[:mode_count], array[mode_count : 2 * mode_count], array[2 * mode_count :])
+        place, velocity, load, forces, rest = np.split(array, [*ends, len(array) - memory.size])
+        return cls(place, velocity, load, forces, rest.reshape(memory.shape))
 
 
-class Propagator(NamedTuple):
-    """Exact solution of the free modal equations after one duration; every entry has the shape (M,).
+class StructureState(Protocol):
+    """A structure in one state of health, parameters and masses, in n coordinates of its own.
 
-    q(t) = `displacement_displacement` q(0) + `displacement_velocity` q'(0), and in the same way for q'(t).
-    """
-
-    displacement_displacement: FloatArray
-    displacement_velocity: FloatArray
-    velocity_displacement: FloatArray
-    velocity_velocity: FloatArray
-
-
-def free_propagator(angular_frequency: FloatArray, damping_ratio: FloatArray, duration: float) -> Propagator:
-    """Return the exact free response of uncoupled modes, for any damping ratio.
-
-    Written without differences of large numbers, so that zeta near 1 and zeta >> 1 are accurate.
-
-    Parameters
+    Attributes
     ----------
-    angular_frequency : (M,) ndarray
-        Undamped angular frequencies [rad/s].
-    damping_ratio : (M,) ndarray
-        Damping ratios, zero or positive [1].
-    duration : float
-        Time [s], zero or positive.
+    laws : Laws or None
+        J forces at its ports.
+    loads : (n, L + J) ndarray
+        Unit loads, then those at the ports of the laws; also what their points move by.
+    answers : (n, L + J) ndarray
+        Displacements at rest under them.
+    modes : object
+        M modes, with their `frequency` [Hz].
+    shapes, to_modes : (n, M), (M, n) ndarray
+        Displacements of the modes, mass-normalised, and the modal coordinates of a displacement.
+    outputs, accelerations : (O, n), (A, n) ndarray
+        Rows of what is read; the last of the outputs is where a release is measured.
+    components : (2, G, n) ndarray
+        Rows of the strains across the gauges and in shear; none where no sensor asks for them.
+    holding : int or None
+        Number of the load that acts before a release alone, and whose end omitted modes follow as they do
+        forces of laws; None: there is none, and they follow at once.
+    on_modes : frozenset of str
+        Ports whose position is that of the modes alone.
     """
-    omega, zeta = angular_frequency, damping_ratio
-    decay = zeta * omega
-    root = omega * np.sqrt(
-        np.abs((zeta - 1.0) * (zeta + 1.0))
-    )  # damped frequency, or half the gap of the decays
-    over = zeta > 1.0
-    # oscillating and critical: exp(-decay t) (cos, sin / root)
-    envelope = np.exp(-decay * duration)
-    sine = envelope * duration * np.sinc(root * duration / np.pi)
-    cosine = envelope * np.cos(root * duration)
-    # not oscillating: two decays, slow * fast = omega^2
-    fast = decay + root
-    slow = omega**2 / fast
-    slow_exponential = np.exp(-slow * duration)
-    gap = np.where(over, 2.0 * root, 1.0)
-    with np.errstate(under="ignore"):
-        gap_part = np.where(gap * duration > 0.0, -np.expm1(-gap * duration) / gap, duration)
-        hyperbolic_sine = slow_exponential * gap_part
-        sinus = np.where(over, hyperbolic_sine, sine)
-        displacement_displacement = np.where(over, slow_exponential + slow * sinus, cosine + decay * sine)
-        velocity_velocity = np.where(over, np.exp(-fast * duration) - slow * sinus, cosine - decay * sine)
-    return Propagator(displacement_displacement, sinus, -(omega**2) * sinus, velocity_velocity)
+
+    laws: "Laws | None"
+    loads: FloatArray
+    answers: FloatArray
+    modes: Any
+    shapes: FloatArray
+    to_modes: FloatArray
+    outputs: FloatArray
+    accelerations: FloatArray
+    components: FloatArray
+    holding: int | None
+    on_modes: frozenset[str]
+
+    def acting(self, vector: FloatArray) -> FloatArray:
+        """Return the coefficients (L,) of the loads at values (V,) of all that can be chosen."""
 
 
 class ModalIntegrator:
-    """Transient response of a structure at one state of health, parameters and masses.
+    """Response of a structure in time, at one state of health, parameters and masses.
 
     The integrator itself never changes; what changes is the `TransientState` that its methods take and give.
     When health changes, make another integrator and let it take over the state (`take_over`).
 
     Parameters
     ----------
-    model : ReducedModel
+    model : ReducedModel or PatchedWing
         The structure.
     vector : (V,) ndarray
         Values of all that can be chosen; those of the controls do not matter.
     damping_alpha, damping_beta : float
         Rayleigh damping [1/s], [s].
+    *changes
+        Further arguments of the model's `at`: of a wing for patches its patch and temperature.
 
     Attributes
     ----------
-    modes : Modes
-        The modes at this state.
+    structure : StructureState
+        The structure at this state.
     damping_ratio : (M,) ndarray
-        Their damping ratios, eq. (18).
+        Damping ratios of its modes, eq. (18).
 
     Raises
     ------
     OutsideModelError
         If a value lies outside the model's validity box.
+    InvalidPatchError
+        If the structure cannot carry the patch.
     InvalidStateError
         If a Rayleigh coefficient is negative or not finite.
     """
 
     def __init__(
-        self, model: ReducedModel, vector: FloatArray, damping_alpha: float, damping_beta: float
+        self, model: Any, vector: FloatArray, damping_alpha: float, damping_beta: float, *changes: Any
     ) -> None:
         for name, value in (("damping_alpha", damping_alpha), ("damping_beta", damping_beta)):
             if not (isfinite(value) and value >= 0.0):
                 raise InvalidStateError(f"{name} must be zero or a positive finite number, but is {value!r}.")
-        self.model = model
-        self.modes = model.modes(vector)
-        self.damping_ratio = rayleigh_damping_ratio(damping_alpha, damping_beta, self.modes.frequency)
-        self._omega = 2.0 * np.pi * self.modes.frequency
-        static = [model.static_response(vector, load=load) for load in np.eye(len(model.load_factors))]
-        self._static_coordinates = np.stack([found.coordinates for found in static], axis=1)
-        # outputs per unit load: (O', L)
-        self._static_output = np.stack(
-            [np.append(found.strain, found.displacement) for found in static], axis=1
+        self.structure: StructureState = model.at(vector, *changes)
+        self._rayleigh = damping_alpha, damping_beta
+        self._laws = self.structure.laws
+        self._loads = self.structure.loads.shape[1] - (0 if self._laws is None else len(self._laws))
+        self._cached: tuple[float, FloatArray] | None = None
+
+    @property
+    def modes(self) -> Any:
+        """The modes at this state."""
+        return self.structure.modes
+
+    @cached_property
+    def damping_ratio(self) -> FloatArray:
+        """Damping ratios (M,) of the modes."""
+        return rayleigh_damping_ratio(*self._rayleigh, self.modes.frequency)
+
+    @cached_property
+    def _omega(self) -> FloatArray:
+        return np.asarray(2.0 * np.pi * self.modes.frequency)
+
+    @cached_property
+    def _participation(self) -> FloatArray:
+        """Modal forces (M, L + J) of the unit loads."""
+        return np.asarray(self.structure.shapes.T @ self.structure.loads)
+
+    @cached_property
+    def _modal_static(self) -> FloatArray:
+        return np.asarray(self._participation / self._omega[:, np.newaxis] ** 2)
+
+    @cached_property
+    def _left_out(self) -> FloatArray:
+        """What the modes that are not kept add to the displacements (n, L + J) under the unit loads."""
+        return np.asarray(self.structure.answers - self.structure.shapes @ self._modal_static)
+
+    @cached_property
+    def _seen(self) -> tuple[FloatArray, FloatArray]:
+        """Outputs (O, M) by modal coordinates, and (O, L + J) by what is beyond the modes."""
+        return self.structure.outputs @ self.structure.shapes, self.structure.outputs @ self._left_out
+
+    @cached_property
+    def _port_answers(self) -> FloatArray:
+        """Motion (J, L + J) of the ports of the laws at rest under the unit loads."""
+        return np.asarray(self.structure.loads[:, self._loads :].T @ self.structure.answers)
+
+    @cached_property
+    def _system(self) -> ModalSystem:
+        """The modes with the ports of the laws."""
+        assert self._laws is not None
+        alpha, beta = self._rayleigh
+        rows, names = self._participation[:, self._loads :].T, self._laws.ports
+        whole = np.diag(self._port_answers[:, self._loads :])
+        left_out = whole - np.sum((rows / self._omega) ** 2, axis=1)
+        flexible = np.array([name not in self.structure.on_modes for name in names], dtype=bool)
+        left_out = np.where((left_out > 1e-9 * whole) & flexible, left_out, 0.0)  # less is rounding
+        return ModalSystem(
+            self._omega,
+            np.diag(alpha + beta * self._omega**2),
+            dict(zip(names, rows, strict=True)),
+            np.array(list(dict(zip(names, left_out.tolist(), strict=True)).values())),
+            beta,
         )
-        self._participation = self.modes.participation.T
-        self._modal_static = self._participation / self._omega[:, np.newaxis] ** 2
-        self._modal_output = self.modes.output[: model.static_count]
-        self._acceleration_output = self.modes.output[model.static_count :]
-        # what the modes that are not kept contribute, at once, per unit load
-        self._correction = self._static_output - self._modal_output @ self._modal_static
-        self._cached: tuple[float, Propagator] | None = None
-        self._from_modal = self.modes.shape.T @ self.modes.mass
-        masses = model.mass_coefficients(vector)
-        self._from_static = self.modes.shape.T @ dense_sum(masses, model.cross_mass)
+
+    def _moved(
+        self, state: TransientState, acting: FloatArray, duration: float, time: float
+    ) -> "ModalMotion":
+        """Return the motion under laws and loads (L,) that are held, at the begin and, if any, the end."""
+        from .motion import simulate
+
+        assert self._laws is not None
+        beyond = self.structure.loads[:, self._loads :].T @ (self._left_out[:, : self._loads] @ acting)
+        return simulate(
+            self._system, self._laws, q=state.displacement, v=state.velocity,
+            force=np.zeros(2 if duration else 1), interval=duration or 1.0, memory=state.memory, start=time,
+            constant=self._participation[:, : self._loads] @ acting,
+            feed=np.stack((np.zeros(len(beyond)), beyond)),
+        )  # fmt: skip
+
+    def settled(self, load: npt.ArrayLike, before: TransientState | None = None) -> TransientState:
+        """Return the equilibrium, without motion, under loads (L,) that are reached from those `before`.
+
+        Raises
+        ------
+        SolutionError
+            If laws have no equilibrium on the way.
+        """
+        acting, none = np.array(load, dtype=np.float64), np.zeros(0)
+        if self._laws is None or not len(self._laws):
+            return TransientState(none, none, acting)
+        from .motion import static_solution
+
+        answers = self._port_answers
+        found = static_solution(
+            self._laws,
+            (answers[:, : self._loads] @ acting)[np.newaxis],
+            answers[:, self._loads :],
+            memory=None if before is None else before.memory,
+            start=None if before is None else answers[:, : self._loads] @ before.load,
+        )
+        return TransientState(none, none, acting, found.forces[0], found.memory)
 
     def at_rest(self, load: npt.ArrayLike) -> TransientState:
-        """Return the state of equilibrium under loads (L,)."""
-        acting = np.array(load, dtype=np.float64)
-        return TransientState(self._modal_static @ acting, np.zeros_like(self._omega), acting)
+        """Return the state of equilibrium under loads (L,); raises `SolutionError` as `settled`."""
+        return self._moving(self.settled(load))
+
+    def _moving(self, rest: TransientState) -> TransientState:
+        place = self._modal_static @ self._still(rest)
+        return TransientState(place, np.zeros_like(place), rest.load, rest.forces, rest.memory)
+
+    @staticmethod
+    def _still(state: TransientState) -> FloatArray:
+        return np.concatenate((state.load, -state.forces)) if len(state.forces) else state.load
 
     def released(self, aside: float, load: npt.ArrayLike, point: int) -> TransientState:
         """Return the state just after a structure that was held aside is let go.
@@ -181,20 +280,57 @@ class ModalIntegrator:
         ----------
         aside : float
             How far the holding force had moved the last static output, of a wing its tip, from its
-            equilibrium under the other loads [m].
+            equilibrium under the other loads, but for what laws add: the held point is where it would be
+            without them [m].
         load : (L,) array_like
             The loads that stay.
         point : int
             Number of the load that held it.
-        """
-        rest = self.at_rest(load)
-        holding_force = aside / self._static_output[-1, point]
-        return TransientState(
-            rest.displacement + self._modal_static[:, point] * holding_force, rest.velocity, rest.load
-        )
 
-    def advance(self, state: TransientState, duration: float, load: npt.ArrayLike) -> TransientState:
-        """Return the state after loads that are held; exact for the kept modes.
+        Raises
+        ------
+        SolutionError
+            If laws have no equilibrium on the way.
+        """
+        rest, answers = self.settled(load), self.structure.answers[:, point]
+        held = aside / float(self.structure.outputs[-1] @ answers) if aside else 0.0
+        if self._laws is None or not len(self._laws):
+            return self._let_go(rest, held, point)
+        along, resting = self._port_answers[:, point], self._port_answers[:, : self._loads] @ rest.load
+        if held:
+            from .motion import static_solution
+
+            # with the point held where it is moved to: x = x_linear - (C - a a^T / a_0) F
+            compliance = float(self.structure.loads[:, point] @ answers)
+            before = along / compliance * (along @ rest.forces)
+            moved = static_solution(
+                self._laws,
+                (resting + held * along - before)[np.newaxis],
+                self._port_answers[:, self._loads :] - np.outer(along, along) / compliance,
+                memory=rest.memory,
+                start=resting - before,
+            )
+            held += float(along @ (moved.forces[0] - rest.forces)) / compliance
+            rest = TransientState(rest.displacement, rest.velocity, rest.load, moved.forces[0], moved.memory)
+            # of the ports' positions; fades after the release
+            rest.memory[:, 3] = held * (self.structure.loads[:, self._loads :].T @ self._left_out[:, point])
+        state = self._let_go(rest, held, point)
+        felt = self._moved(state, rest.load, 0.0, 0.0)
+        return TransientState(state.displacement, state.velocity, state.load, felt.lagged[0], state.memory)
+
+    def _let_go(self, rest: TransientState, held: float, point: int) -> TransientState:
+        """Return a state at rest whose modes are where a force at a point holds them."""
+        state = self._moving(rest)
+        fading = np.zeros(self._loads)
+        if self.structure.holding is not None and self._rayleigh[1] > 0.0:
+            fading[self.structure.holding] = held
+        place = state.displacement + self._modal_static[:, point] * held
+        return TransientState(place, state.velocity, state.load + fading, state.forces, state.memory)
+
+    def advance(
+        self, state: TransientState, duration: float, load: npt.ArrayLike, time: float = 0.0
+    ) -> TransientState:
+        """Return the state after loads that are held; exact for the kept modes where there are no laws.
 
         If the loads differ from those of `state`, they jump at once, and the structure overshoots.
 
@@ -206,6 +342,8 @@ class ModalIntegrator:
             Time [s], positive.
         load : (L,) array_like
             Coefficients of the loads.
+        time : float
+            Of the begin of the step since the start, for a stiffness that drifts [s].
 
         Raises
         ------
@@ -218,51 +356,69 @@ class ModalIntegrator:
                 f"A transient step needs a positive duration and a finite load, but got {duration!r} s and "
                 f"{load!r}."
             )
+        if self._laws is None or self._laws.linear:
+            place, velocity = self._free_step(state, duration, acting)
+            forces, memory = state.forces, state.memory
+        else:
+            moved = self._moved(state, acting, duration, time)
+            place, velocity = moved.q[-1], moved.v[-1]
+            forces, memory = moved.lagged[-1], moved.memory
+        holding, (_, beta) = self.structure.holding, self._rayleigh
+        if holding is not None and state.load[holding] != 0.0:
+            acting[holding] = state.load[holding] * exp(-duration / beta)
+        return TransientState(place, velocity, acting, forces, memory)
+
+    def _free_step(
+        self, state: TransientState, duration: float, acting: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         if self._cached is None or self._cached[0] != duration:
-            self._cached = (duration, free_propagator(self._omega, self.damping_ratio, duration))
-        propagator = self._cached[1]
+            damping = np.diag(2.0 * self.damping_ratio * self._omega)
+            self._cached = duration, exact_step(self._omega**2, damping, np.array([duration]))[0][0]
         static = self._modal_static @ acting
-        aside, velocity = state.displacement - static, state.velocity
-        return TransientState(
-            propagator.displacement_displacement * aside
-            + propagator.displacement_velocity * velocity
-            + static,
-            # plus zero: a structure at rest has the velocity 0, not -0
-            propagator.velocity_displacement * aside + propagator.velocity_velocity * velocity + 0.0,
-            acting,
-        )
+        moved = self._cached[1] @ np.concatenate((state.displacement - static, state.velocity))
+        # plus zero: a structure at rest has the velocity 0, not -0
+        return moved[: len(static)] + static, moved[len(static) :] + 0.0
+
+    def displacement(self, state: TransientState) -> FloatArray:
+        """Return the displacement (n,) at a state, in the coordinates of the structure.
+
+        The modes that are not kept follow the loads at once.
+        """
+        still = self._still(state)
+        if not len(state.displacement):
+            return np.asarray(self.structure.answers @ still)
+        return np.asarray(self.structure.shapes @ state.displacement + self._left_out @ still)
 
     def outputs(self, state: TransientState) -> FloatArray:
-        """Return gauges, displacements and accelerations (O,) at a state.
+        """Return gauges, displacements and accelerations (O + A,) at a state.
 
-        The modes that are not kept follow the loads at once; an acceleration is that of the kept modes, since
-        the others follow loads that are held without inertia.
+        An acceleration is that of the kept modes, since the others follow loads that are held without
+        inertia; `settled` states have none.
         """
-        settled = self._modal_output @ state.displacement + self._correction @ state.load
-        if not len(self._acceleration_output):
-            return np.asarray(settled)
+        if not len(state.displacement):
+            return np.asarray(self.structure.outputs @ self.displacement(state))
+        by_modes, beyond = self._seen
+        seen, rows = by_modes @ state.displacement + beyond @ self._still(state), self.structure.accelerations
+        if not len(rows):
+            return np.asarray(seen)
         omega = self._omega
         acceleration = (
-            self._participation @ state.load
+            self._participation @ self._still(state)
             - 2.0 * self.damping_ratio * omega * state.velocity
             - omega**2 * state.displacement
         )
-        return np.concatenate((settled, self._acceleration_output @ acceleration))
+        return np.concatenate((seen, rows @ (self.structure.shapes @ acceleration)))
 
     def point_displacement(self, state: TransientState, point: int) -> float:
         """Return the displacement along the load of a number at its point [m]."""
-        participation = self._participation[:, point]  # also how far each mode moves the point
-        correction = (
-            self.model.static_load[point] @ self._static_coordinates - participation @ self._modal_static
-        )
-        return float(participation @ state.displacement + correction @ state.load)
+        return float(self.structure.loads[:, point] @ self.displacement(state))
 
     def energy(self, state: TransientState) -> float:
         """Return kinetic plus strain energy of the kept modes about the equilibrium under the load [J].
 
         It never grows while the load stays.
         """
-        deviation = self._omega * (state.displacement - self._modal_static @ state.load)
+        deviation = self._omega * (state.displacement - self._modal_static @ self._still(state))
         return float(0.5 * (state.velocity @ state.velocity + deviation @ deviation))
 
     def take_over(self, state: TransientState, before: "ModalIntegrator") -> TransientState:
@@ -270,14 +426,23 @@ class ModalIntegrator:
 
         Displacement and velocity of the structure stay what they were; they are projected on the new modes
         with the new mass matrix (exactly, in reduced coordinates). The part that the new modes cannot hold
-        follows the load without delay, as always.
+        follows the load without delay, as always. The memory of laws stays where these are the same at the
+        same ports; others have been loaded from zero to where they are.
 
         `state` is in the modes of `before`, the integrator of the same model that it belongs to.
         """
-        deviation = state.displacement - before._modal_static @ state.load
-        static = before._static_coordinates @ state.load
-        return TransientState(
-            self._from_modal @ (before.modes.shape @ deviation) + self._from_static @ static,
-            self._from_modal @ (before.modes.shape @ state.velocity),
-            state.load,
-        )
+        load, memory, forces = state.load, state.memory, state.forces
+        if self._laws is not None and not (before._laws is not None and self._laws.alike(before._laws)):
+            memory = self._laws.memory()
+            forces = np.zeros(len(memory))
+            if not len(state.displacement):  # at rest: reached from no load
+                load = np.zeros_like(load)
+        if not len(state.displacement):
+            return TransientState(state.displacement, state.velocity, load, forces, memory)
+        if self.structure.holding is not None:
+            load = load.copy()
+            load[self.structure.holding] = 0.0
+        place = before.structure.shapes @ state.displacement + before._left_out[:, : len(load)] @ load
+        to_modes = self.structure.to_modes
+        velocity = to_modes @ (before.structure.shapes @ state.velocity)
+        return TransientState(to_modes @ place, velocity, load, forces, memory)

@@ -1,20 +1,21 @@
 """What a wing that carries missing effects needs beside the plain one: effects, arrays, behaviour."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.patched_steps import PatchedSteps
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.sensor_stream import needs_structure
+from fe.runtime.transient import ModalIntegrator
 from fmu_asset.errors import PatchFileError
+from fmu_asset.slaves.behaviour import StructureBehaviour
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of
-from fmu_asset.slaves.patched_behaviour import PatchedBehaviour
+from fmu_asset.slaves.effects import Effects
 from fmu_asset.slaves.table import structure_table
 
 from .patch_file import Effect
@@ -84,9 +85,7 @@ def _check_arrays(model: ReducedModel, arrays: PatchArrays, patch: ModelPatch) -
             f"{model.design_hash[:12]}; make both of one design."
         )
     try:
-        alpha, beta = model.damping.tolist()
-        steps = PatchedSteps(model, PatchedWing(arrays), model.nominal, damping=(alpha, beta), patch=patch)
-        steps.modal_data()
+        ModalIntegrator(PatchedWing(arrays), model.nominal, *model.damping.tolist(), patch).modes  # noqa: B018
     except FiniteElementError as cause:
         raise PatchFileError(f"The wing cannot carry the patch: {cause}") from cause
 
@@ -102,8 +101,8 @@ def without_strips(arrays: PatchArrays) -> PatchArrays:
 
 
 def patched_behaviour(
-    model: ReducedModel, effects: Sequence[Mapping[str, Any]], steps: Callable[..., PatchedSteps] | None
-) -> PatchedBehaviour:
+    model: ReducedModel, effects: Sequence[Mapping[str, Any]], arrays: PatchArrays | None
+) -> StructureBehaviour:
     """Return the behaviour of a wing with effects in this process, without an FMU.
 
     Parameters
@@ -112,11 +111,13 @@ def patched_behaviour(
         The wing.
     effects : sequence of mapping
         As `plain_effects` returns them.
-    steps : callable or None
-        Makes the `PatchedSteps`; needed for effects of structure and loads.
+    arrays : PatchArrays or None
+        The wing for patches; needed for effects of structure and loads.
     """
-    table, roles = structure_table(model, {})
-    return PatchedBehaviour(model, table, roles, effects, output_channels(model.gauge_count), steps)
+    wing = None if arrays is None else PatchedWing(arrays)
+    return StructureBehaviour(
+        model, *structure_table(model, {}), Effects(effects, output_channels(model.gauge_count), wing)
+    )
 
 
 def effect_values(effects: Sequence[Mapping[str, Any]], *, active: bool) -> dict[str, float]:

@@ -1,21 +1,29 @@
 """What a structure does in one communication step: static equilibrium, or its modes integrated in time.
 
-Copied into the FMU, where `fe.runtime` is the folder `fe` beside it; `structure_behaviour.c` does the same.
+Missing effects may be switched on and changed between steps: a patch of the structure, and sensors on what it
+shows. Copied into the FMU, where `fe.runtime` is the folder `fe` beside it; `structure_behaviour.c` does the
+same for a structure without effects.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.errors import FiniteElementError
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 
+from .base import UnacceptableValuesError
 from .table import MODE_COUNT, Roles
 from .variables import TRANSIENT, FmuVariable
+
+if TYPE_CHECKING:
+    from .effects import Acting, Effects
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -35,7 +43,8 @@ def later_outputs(table: Sequence[FmuVariable], roles: Roles) -> tuple[slice, ..
 class StructureBehaviour:
     """A structure in time; a call either completes or raises and leaves everything as it was.
 
-    Outputs are gauges, displacements and accelerations.
+    Outputs are gauges, displacements and accelerations. While effects of structure or loads are on, and in
+    every motion of a structure that can have them, it is the wing for patches that rests and moves.
 
     Parameters
     ----------
@@ -45,46 +54,61 @@ class StructureBehaviour:
         Its variables, the inputs first.
     roles : Roles
         Which of them is what.
+    effects : Effects, optional
+        Missing effects of a wing.
     """
 
-    def __init__(self, model: ReducedModel, table: Sequence[FmuVariable], roles: Roles) -> None:
-        self._model, self._roles = model, roles
+    def __init__(
+        self,
+        model: ReducedModel,
+        table: Sequence[FmuVariable],
+        roles: Roles,
+        effects: Effects | None = None,
+    ) -> None:
+        self._model, self._roles, self._effects = model, roles, effects
         inputs = [row.name for row in table if row.causality == "input"]
         self._sources = [(name, inputs.index(name) if name in inputs else None) for name in roles.chosen]
         self._resting = [0.0] * len(model.accelerations)
         self._own = len(model.chosen) - len(model.controls)  # what modes depend on
         self._parameters: Mapping[str, float] = {}
+        self._tuned: tuple[Mapping[str, float], float] = ({}, 0.0)
+        self._moves, self._begun = False, 0.0
+        self._acting: Acting | None = None  # of the effects
         self._vector: FloatArray | None = None
-        self._motion: tuple[ModalIntegrator, TransientState] | None = None
+        self._integrator: ModalIntegrator | None = None
+        self._state: TransientState | None = None  # without an integrator, the model itself is at rest
         self._static: StaticResponse | None = None
+        self._filters: list[float] | None = None
+        self._shown: list[float] = []
+
+    def tune(self, values: Mapping[str, float], start: float) -> None:
+        """Take the variables of the effects by name, and the time at the start of the simulation [s]."""
+        self._tuned = values, start
 
     def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> Sequence[float]:
-        """Begin in equilibrium under the inputs, or just let go of where a force held the structure aside."""
-        kept, motion = dict(parameters), None
-        vector = self._chosen(kept, inputs)
-        if int(kept["response"]) == TRANSIENT:
-            integrator, load = self._integrator(kept, vector), self._model.load_coefficients(vector)
-            state = integrator.at_rest(load)
-            if self._roles.release is not None:
-                state = integrator.released(kept[self._roles.release], load, self._roles.point_load)
-            motion = integrator, state
-        outputs = self._outputs(vector, motion)
-        self._parameters = kept
-        return outputs
+        """Begin in equilibrium under the inputs, or just let go of where a force held the structure aside.
+
+        Raises
+        ------
+        UnacceptableValuesError
+            If the structure cannot have the effects that are on.
+        """
+
+        def begin() -> list[float]:
+            self._keep(parameters)
+            self._begun = self._tuned[1]
+            self._vector = self._state = self._integrator = self._filters = None
+            return self._go(time, 0.0, inputs)
+
+        return self._whole(begin)
 
     def advance(self, time: float, duration: float, inputs: Sequence[float]) -> Sequence[float]:
-        """Advance by one step of `duration` [s] with the inputs held."""
-        before, motion = self._vector, self._motion
-        if before is None:
+        """Advance by one step of `duration` [s] with inputs and effects held; raises as `start`."""
+        if self._vector is None:
             raise RuntimeError("the structure was not initialised")
-        vector = self._chosen(self._parameters, inputs)
-        if motion is not None:
-            integrator, state = motion
-            if vector[: self._own].tobytes() != before[: self._own].tobytes():
-                integrator = self._integrator(self._parameters, vector)
-                state = integrator.take_over(state, motion[0])
-            motion = integrator, integrator.advance(state, duration, self._model.load_coefficients(vector))
-        return self._outputs(vector, motion)
+        if self._effects is None:
+            return self._go(time, duration, inputs)
+        return self._whole(lambda: self._go(time, duration, inputs))
 
     def later(self, group: int) -> list[float]:
         """Return the outputs of a group: the bound, the other bound or the load point, the modes."""
@@ -99,57 +123,164 @@ class StructureBehaviour:
         return [bounds[group]]
 
     def load_point_displacement(self) -> float:
-        """Return the displacement of the point where the load acts that holds the structure aside [m]."""
-        point = self._roles.point_load
-        if self._motion is not None:
-            integrator, state = self._motion
-            return integrator.point_displacement(state, point)
+        """Return the displacement of the point where the load acts that holds the structure aside [m].
+
+        As it is shown, where sensors are on.
+        """
+        return self._shown[-1] if self._shown else self._point()
+
+    def _point(self) -> float:
+        if self._integrator is not None and self._state is not None:
+            return self._integrator.point_displacement(self._state, self._held(self._integrator))
         self._static = self._static or self._model.static_response(self._vector)
-        return float(self._model.static_load[point] @ self._static.coordinates)
+        return float(self._model.static_load[self._roles.point_load] @ self._static.coordinates)
 
     def modal_data(self) -> list[float]:
         """Return natural frequencies [Hz], then damping ratios [1], under the last inputs."""
-        modes = self._model.modes(self._vector) if self._motion is None else self._motion[0].modes
+        modes = self._model.modes(self._vector) if self._integrator is None else self._integrator.modes
         frequency = modes.frequency[:MODE_COUNT]
-        ratio = rayleigh_damping_ratio(*self._damping(self._parameters), frequency)
+        ratio = rayleigh_damping_ratio(*self._damping, frequency)
         return [*frequency.tolist(), *ratio.tolist()]
 
     def state(self) -> list[float]:
         """Return all that is remembered, without the parameters."""
-        vector = [] if self._vector is None else self._vector.tolist()
-        return [*vector, *([] if self._motion is None else self._motion[1].to_list())]
+        parts: tuple[Sequence[float] | None, ...] = (
+            None if self._vector is None else self._vector.tolist(),
+            None if self._acting is None else self._acting.values,
+            None if self._state is None else self._state.to_list(),
+            (self._begun,),
+            self._filters,
+            self._shown,
+        )
+        # a part that is not there has the length -1
+        return [number for part in parts for number in ((-1.0,) if part is None else (len(part), *part))]
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
         """Take back what `state` returned; `parameters` are those of that moment."""
-        count, kept, vector, motion = len(self._model.chosen), dict(parameters), None, None
-        if state:
-            vector = np.array(state[:count])
-        if vector is not None and len(state) > count:
-            found = TransientState.from_list(state[count:], self._model.mode_count)
-            motion = self._integrator(kept, vector), found
-        self._parameters, self._vector, self._motion, self._static = kept, vector, motion, None
+        numbers = iter(state)
+        parts = [
+            None if length < 0.0 else [next(numbers) for _ in range(int(length))]
+            for length in (next(numbers) for _ in range(6))
+        ]
+        vector, values, motion, begun, filters, shown = parts
+        self._keep(parameters)
+        self._static = None
+        self._begun, self._filters, self._shown = (begun or [0.0])[0], filters, shown or []
+        self._vector = None if vector is None else np.array(vector)
+        if self._effects is not None and values is not None:
+            self._acting = self._effects.acting(values)
+        self._integrator = self._state = None
+        if motion is not None and self._vector is not None:
+            self._integrator = self._made(self._vector)
+            count = len(self._integrator.modes.frequency) if self._moves else 0
+            self._state = TransientState.from_list(motion, count, self._integrator.structure.laws)
 
-    def _chosen(self, parameters: Mapping[str, float], inputs: Sequence[float]) -> FloatArray:
+    # ------------------------------------------------------------ parts
+
+    def _keep(self, parameters: Mapping[str, float]) -> None:
+        self._parameters = dict(parameters)
+        self._moves = int(parameters["response"]) == TRANSIENT
+
+    def _whole(self, act: Callable[[], list[float]]) -> list[float]:
+        """Do something completely, or leave everything as it was."""
+        before = dict(self.__dict__)
+        try:
+            return act()
+        except Exception as error:
+            self.__dict__.update(before)
+            if not isinstance(error, FiniteElementError):
+                raise
+            sentence = str(error)
+            raise UnacceptableValuesError(sentence if sentence.endswith(".") else f"{sentence}.") from error
+
+    def _go(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
+        """Begin, where there is no state yet, or advance; return the outputs."""
+        changed = self._effects is not None and self._take_effects(self._effects)
+        before, vector, own = self._vector, self._chosen(inputs), self._own
+        integrator, state, static = self._integrator, self._state, None
+        if not (self._moves or (self._acting is not None and self._acting.changes_structure)):
+            integrator = state = None
+            static = self._model.static_response(vector)
+            values = [*static.strain.tolist(), *static.displacement.tolist(), *self._resting]
+        else:
+            if (
+                integrator is None
+                or before is None
+                or changed
+                or vector[:own].tobytes() != before[:own].tobytes()
+            ):
+                integrator = self._made(vector)
+                if self._integrator is not None and state is not None:
+                    state = integrator.take_over(state, self._integrator)
+            state = self._next(integrator, state, vector, time, duration)
+            values = integrator.outputs(state).tolist()
+        self._vector, self._integrator, self._state, self._static = vector, integrator, state, static
+        return values if self._acting is None else self._show(values, duration, time + duration)
+
+    def _next(
+        self,
+        integrator: ModalIntegrator,
+        state: TransientState | None,
+        vector: FloatArray,
+        time: float,
+        duration: float,
+    ) -> TransientState:
+        """Return the state under the loads of all that is chosen; where there is none, the first one."""
+        load = integrator.structure.acting(vector)
+        if not self._moves:
+            return integrator.settled(load, state)
+        if state is not None:
+            return integrator.advance(state, duration, load, time - self._begun)
+        if self._roles.release is None:
+            return integrator.at_rest(load)
+        return integrator.released(self._parameters[self._roles.release], load, self._held(integrator))
+
+    def _held(self, integrator: ModalIntegrator) -> int:
+        """Return the number of the load that holds the structure aside."""
+        holding = integrator.structure.holding
+        return self._roles.point_load if holding is None else holding
+
+    def _take_effects(self, effects: Effects) -> bool:
+        """Take the effects as they are tuned; return whether they changed."""
+        values = effects.values(self._tuned[0])
+        old = self._acting
+        if old is not None and old.values == values:
+            return False
+        self._acting = effects.acting(values)
+        if old is None or old.filters != self._acting.filters:
+            self._filters = None
+        return True
+
+    def _show(self, values: list[float], duration: float, end: float) -> list[float]:
+        """Return what sensors make of outputs."""
+        assert self._acting is not None
+        if not len(self._acting.patch):
+            self._filters, self._shown = None, []
+            return values
+        across = None
+        if self._integrator is not None and self._state is not None and self._acting.changes_structure:
+            seen = self._integrator.structure.components @ self._integrator.displacement(self._state)
+            across = np.pad(seen, ((0, 0), (0, len(values) + 1 - seen.shape[1])))
+        release = self._parameters.get(self._roles.release or "", 0.0) if self._moves else 0.0
+        self._shown, self._filters = self._acting.shown(
+            np.array([*values, self._point()]), across, self._filters, duration, end,
+            begun=self._begun, release=release, dynamic=self._moves,
+        )  # fmt: skip
+        return self._shown[:-1]
+
+    def _chosen(self, inputs: Sequence[float]) -> FloatArray:
+        parameters = self._parameters
         return np.array(
             [parameters[name] if number is None else inputs[number] for name, number in self._sources]
         )
 
-    @staticmethod
-    def _damping(parameters: Mapping[str, float]) -> tuple[float, float]:
-        return parameters["damping.alpha"], parameters["damping.beta"]
+    @property
+    def _damping(self) -> tuple[float, float]:
+        return self._parameters["damping.alpha"], self._parameters["damping.beta"]
 
-    def _integrator(self, parameters: Mapping[str, float], vector: FloatArray) -> ModalIntegrator:
-        return ModalIntegrator(self._model, vector, *self._damping(parameters))
-
-    def _outputs(
-        self, vector: FloatArray, motion: tuple[ModalIntegrator, TransientState] | None
-    ) -> list[float]:
-        """Take what is chosen and the motion, and return the outputs."""
-        static = None
-        if motion is not None:
-            values: list[float] = motion[0].outputs(motion[1]).tolist()
-        else:
-            static = self._model.static_response(vector)
-            values = static.strain.tolist() + static.displacement.tolist() + self._resting
-        self._vector, self._motion, self._static = vector, motion, static
-        return values
+    def _made(self, vector: FloatArray) -> ModalIntegrator:
+        """Return the structure in time; that of a wing with effects in its basis for patches."""
+        if self._effects is None or self._effects.wing is None:
+            return ModalIntegrator(self._model, vector, *self._damping)
+        assert self._acting is not None
+        return self._effects.integrator(vector, self._damping, self._acting)

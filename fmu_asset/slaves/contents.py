@@ -4,7 +4,6 @@ This file is copied into the FMU, as `behaviour`.
 """
 
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +24,19 @@ def load_contents(resources: Path) -> Contents:
         return Contents(table, lambda: StructureBehaviour(model, table, roles), later)
     # a plain structure needs nothing of these
     from .effect_variables import effect_rows
-    from .patched_behaviour import PatchedBehaviour
+    from .effects import Effects
 
-    record = _read(resources / "effects.json")
-    effects, channels = record["effects"], tuple((name, quantity) for name, quantity in record["channels"])
-    steps = None
+    record, wing = _read(resources / "effects.json"), None
+    channels = tuple((name, quantity) for name, quantity in record["channels"])
     arrays = resources / "patch_arrays.npz"
     if arrays.is_file():
         from fe.runtime.patch_arrays import PatchArrays
-        from fe.runtime.patched_steps import PatchedSteps
         from fe.runtime.patched_wing import PatchedWing
 
-        steps = partial(PatchedSteps, model, PatchedWing(PatchArrays.load(arrays)))
+        wing = PatchedWing(PatchArrays.load(arrays))
     return Contents(
-        table + effect_rows(effects, len(table), start),
-        lambda: PatchedBehaviour(model, table, roles, effects, channels, steps),
+        table + effect_rows(record["effects"], len(table), start),
+        lambda: StructureBehaviour(model, table, roles, Effects(record["effects"], channels, wing)),
         later,
     )
 

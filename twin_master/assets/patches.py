@@ -1,14 +1,11 @@
 """Missing effects in a mission: in the asset that flies, and in the model that the twin believes."""
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fe.runtime.patch import PortForce, SensorDrift
-from fe.runtime.patched_steps import PatchedSteps
-from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign
 from fmu_asset.packing.patch_file import PatchFile, load_patch
@@ -74,9 +71,7 @@ def model_observation_table(
     check_wing_scenario(scenario, wing.regions, wing.gauge_count)
     check_model_patch(patch, wing.gauge_count, where)
     effects = plain_effects(patch.for_outputs(output_channels(wing.gauge_count)))
-    arrays = arrays_for(design, patch)
-    steps = None if arrays is None else partial(PatchedSteps, wing, PatchedWing(arrays))
-    behaviour = patched_behaviour(wing, effects, steps)
+    behaviour = patched_behaviour(wing, effects, arrays_for(design, patch))
     behaviour.tune(effect_values(effects, active=True), 0.0)
     rows = structure_table(wing, {})[0]
     nominal = {row.name: row.start or 0.0 for row in rows}

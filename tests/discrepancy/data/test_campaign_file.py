@@ -61,7 +61,7 @@ file = "tip_up.csv"
 run = "A"
 start = 30.0
 load_place = [1.0, 0.35]
-health = { z1 = 0.2, deviation = 0.05 }
+health = { z1 = 0.2, flange = 0.1, deviation = 0.05 }
 [[trial]]
 name = "release"
 kind = "ringdown"
@@ -78,7 +78,8 @@ TABLES = {
     "noise.csv": "time,g17\n" + "".join(f"{k * 0.01:.2f},{(-1) ** k * 1.5 + 0.5}\n" for k in range(40)),
     "tip_up.csv": "# by hand\nforce,g17,w [mm]\n0,0.5,0.1\n# pause\n5,120.25,7.3\n10,,14.6\n",
     "release.csv": "time,w [mm]\n" + "".join(f"{k * 0.002:.3f},{50 * math.cos(k / 10)}\n" for k in range(60)),
-    "turn.csv": "time,load_factor,g17,temperature,z1,z2\n100,1,900,20,0,0\n160,2.5,2250,18.5,0.1,0.2\n",
+    "turn.csv": "time,load_factor,g17,temperature,z1,z2,health.flange\n100,1,900,20,0,0,0\n"
+    "160,2.5,2250,18.5,0.1,0.2,0.3\n",
 }
 
 
@@ -110,8 +111,9 @@ def test_everything_comes_out_in_si(tmp_path: Path) -> None:
     assert "1 of 3 readings of 'g17' in the trial 'tip load up' is empty" in campaign.remarks[0]
     assert up.time.tolist() == [30.0] * 3
     assert up.load_place == (1.0, 0.35)
-    assert up.health.tolist() == [[0.2, 0.0]] * 3
-    assert up.health_deviation.tolist() == [[0.05, 0.05]] * 3
+    assert up.regions == turn.regions == ("z1", "z2", "flange")
+    assert up.health.tolist() == [[0.2, 0.0, 0.1]] * 3
+    assert up.health_deviation.tolist() == [[0.05] * 3] * 3
     assert up.temperature.tolist() == [0.0] * 3
     assert release.channels == ("tip",)
     assert release.release == Release(0.05)
@@ -120,7 +122,7 @@ def test_everything_comes_out_in_si(tmp_path: Path) -> None:
     assert turn.held_out
     assert (turn.start, turn.load_factor.tolist()) == (100.0, [1.0, 2.5])
     assert turn.temperature.tolist() == [0.0, -1.5]
-    assert turn.health.tolist() == [[0.0, 0.0], [0.1, 0.2]]
+    assert turn.health.tolist() == [[0.0, 0.0, 0.0], [0.1, 0.2, 0.3]]
     assert campaign.parameters == {"young_modulus_factor": (1.0073, 0.0103)}
     assert len(campaign.data_hash) == 64
     assert [trial.name for trial in campaign.fitted] == ["tip load up", "release"]

@@ -1,4 +1,4 @@
-"""A structure's FMU as a model of the search, by the file that is written beside it."""
+"""A structure as a model of the search, and its FMU by the file that is written beside it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
+from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_excitation import Excitation
-from discrepancy.models.interface import Conditions
+from discrepancy.models.interface import Conditions, Model
+from discrepancy.models.reduced_structure import structure_model
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch import ModelPatch, PowerStiffness
 from fe.runtime.reduced import ReducedModel
@@ -49,9 +51,16 @@ def pair(
     model.close()
 
 
-def test_it_is_the_structure_at_rest(pair: tuple[FmuModel, ReducedModel]) -> None:
-    """Static trials at other parameters and masses; without a recorded load factor there is no weight."""
+@pytest.fixture(params=["structure", "FMU"])
+def either(request: pytest.FixtureRequest, pair: tuple[FmuModel, ReducedModel]) -> tuple[Model, ReducedModel]:
+    """The structure itself, and its FMU."""
     model, reduced = pair
+    return (structure_model(reduced) if request.param == "structure" else model), reduced
+
+
+def test_it_is_the_structure_at_rest(either: tuple[Model, ReducedModel]) -> None:
+    """Static trials at other parameters and masses; without a recorded load factor there is no weight."""
+    model, reduced = either
     assert [parameter.name for parameter in model.parameters] == ["e", "pump"]
     assert model.ports() == ("tip",)
     seen = model.respond(TRIAL, OUTPUTS[:2], ModelPatch(), Conditions(np.array([1.04, 0.06]))).values
@@ -61,9 +70,9 @@ def test_it_is_the_structure_at_rest(pair: tuple[FmuModel, ReducedModel]) -> Non
         np.testing.assert_allclose(values, [found.displacement[0], found.strain[0]], rtol=1e-10, atol=1e-15)
 
 
-def test_it_is_the_structure_in_motion(pair: tuple[FmuModel, ReducedModel]) -> None:
+def test_it_is_the_structure_in_motion(either: tuple[Model, ReducedModel]) -> None:
     """A tip that is held aside and let go, with its acceleration."""
-    model, reduced = pair
+    model, reduced = either
     trial = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4))
     seen = model.respond(trial, OUTPUTS, ModelPatch(), Conditions(np.array([1.0, 0.05]))).values
     unit = reduced.static_response({"load_factor": 0.0, "push": 1.0}).displacement[0]
@@ -79,6 +88,43 @@ def test_it_is_the_structure_in_motion(pair: tuple[FmuModel, ReducedModel]) -> N
     )
     largest = np.abs(wanted).max(axis=0)
     np.testing.assert_allclose(seen[1:] / largest, wanted / largest, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.FLIGHT, TrialKind.RINGDOWN, TrialKind.FORCED])
+@pytest.mark.parametrize("law", [None, PowerStiffness("tip", 10.0, 3.0, 0, 1e-4)])
+def test_it_is_its_fmu(
+    kind: TrialKind, law: PowerStiffness | None, pair: tuple[FmuModel, ReducedModel]
+) -> None:
+    """All kinds of trials, with and without a spring at the tip."""
+    fmu, reduced = pair
+    zero, own = np.zeros(40), structure_model(reduced)
+    assert (own.ports(), [(p.name, p.mean, p.deviation, p.low, p.high) for p in own.parameters]) == (
+        fmu.ports(), [(p.name, p.mean, pytest.approx(p.deviation), p.low, p.high) for p in fmu.parameters],
+    )  # fmt: skip
+    release = Release(1e-4, mode_count=1) if kind is TrialKind.RINGDOWN else None
+    load = np.sin(np.arange(40) / 4.0) * (kind is not TrialKind.RINGDOWN)
+    flight = kind is TrialKind.FLIGHT
+    trial = replace(
+        TRIAL, kind=kind, release=release, force=zero if flight else 50.0 * load,
+        load_factor=load if flight else zero, time=2e-5 * np.arange(40),
+    )  # fmt: skip
+    patch, conditions = ModelPatch(() if law is None else (law,)), Conditions(np.array([1.02, 0.07]))
+    wanted, seen = (m.respond(trial, OUTPUTS[:2], patch, conditions).values for m in (fmu, own))
+    exact = kind in (TrialKind.STATIC, TrialKind.FLIGHT)
+    np.testing.assert_allclose(
+        seen / np.abs(wanted).max(axis=0), wanted / np.abs(wanted).max(axis=0), atol=1e-8 if exact else 5e-3
+    )
+
+
+def test_any_region_is_known_by_its_name(pair: tuple[FmuModel, ReducedModel]) -> None:
+    own, reduced = structure_model(pair[1]), pair[1]
+    health, conditions = np.array([[0.0, 0.2, 0.3]]), np.array([1.0, 0.05])
+    named = replace(TRIAL, regions=("other", "z2", "z1"))
+    seen = own.respond(named, OUTPUTS[:1], ModelPatch(), Conditions(conditions, health=health)).values[-1]
+    found = reduced.static_response({"load_factor": 0.0, "push": 200.0}, {"z1": 0.3, "z2": 0.2})
+    np.testing.assert_allclose(seen, found.displacement, rtol=1e-10)
+    with pytest.raises(ModelError, match="a loss of the damage region 'other', but beam has z1, z2"):
+        own.respond(named, OUTPUTS[:1], ModelPatch(), Conditions(conditions, health=health[:, ::-1]))
 
 
 def test_systems_of_small_steps_come_from_steps_that_tell_all_modes(
