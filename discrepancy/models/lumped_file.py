@@ -1,6 +1,7 @@
 """A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -94,7 +95,7 @@ class LumpedDescription(ModelDescription):
         """States m of first order."""
         return len(self.capacity)
 
-    @property
+    @cached_property
     def is_plain(self) -> bool:
         """Whether it is a structure at rest on springs under one force at a time."""
         motion = any(item.quantity.moving or item.through for item in self.input)

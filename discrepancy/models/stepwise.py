@@ -8,13 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from math import factorial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.models.compiled_motion import compiled_steps
-from discrepancy.models.input_course import SMOOTH_PARTS, Course
 from discrepancy.models.memory import Memory
 from discrepancy.models.stepwise_kernel import Structure
 from fe.runtime.modal_system import ModalSystem
@@ -30,8 +30,9 @@ ALIKE = 1e-9
 KEPT_STEPS = 16
 STEPS_AT_LEAST = 8
 """Substeps of an interval with laws where nothing in the structure has a pace of its own."""
-_TAYLOR = 14
-_kept = Memory(KEPT_STEPS)
+_TAYLOR = np.array([[1.0 / factorial(4 * part + power) for power in range(4)] for part in range(4)])
+"""Of e^A, by powers of A within parts that go with powers of A^4 (Paterson and Stockmeyer 1973)."""
+_kept, _divided = Memory(KEPT_STEPS), Memory(KEPT_STEPS)
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,17 @@ class CoupledModes(ModalSystem):
         )
 
     @cached_property
+    def whole(self) -> FloatArray:
+        """S, a matrix where no coordinate is coupled too."""
+        return np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
+
+    @cached_property
     def paces(self) -> FloatArray:
-        """Magnitudes (2M,) of the eigenvalues [1/s] of the motion, without those that are zero."""
+        """Frequencies, or magnitudes (2M,) of the eigenvalues [1/s] of the motion that are not zero."""
         count = len(self.angular_frequency)
-        stiffness = np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
-        matrix = np.block([[np.zeros((count, count)), np.eye(count)], [-stiffness, -self.damping]])
+        if self.stiffness_matrix is None and np.all(self.angular_frequency > 0.0):
+            return self.angular_frequency
+        matrix = np.block([[np.zeros((count, count)), np.eye(count)], [-self.whole, -self.damping]])
         found = np.abs(np.linalg.eigvals(matrix))
         return np.asarray(found[found > 1e-7 * np.max(found, initial=0.0)])
 
@@ -98,124 +105,67 @@ class ExactSteps:
         )
 
 
-def exact_steps(system: ModalSystem, lengths: FloatArray) -> ExactSteps:
-    """Return the exact steps of lengths (K,) [s]."""
-    usual = float(np.median(lengths))
-    _, first, which = np.unique(np.round(lengths / (ALIKE * usual)), return_index=True, return_inverse=True)
-    distinct = np.ascontiguousarray(lengths[first])
-    stiffness = _stiffness_of(system)
-    key = (stiffness.tobytes(), system.damping.tobytes(), distinct.tobytes())
-    transition, begin, end = _kept.get(key, lambda: _exponentials(system, distinct))
-    return ExactSteps(distinct, np.asarray(which, dtype=np.int64).ravel(), transition, begin, end)
+def exact_steps(system: CoupledModes, boundaries: "Boundaries") -> ExactSteps:
+    """Return the exact steps between boundaries."""
+    lengths, which = boundaries.alike
+    key = (system.whole.tobytes(), system.damping.tobytes(), lengths.tobytes())
+    return ExactSteps(lengths, which, *_kept.get(key, lambda: exponentials(system, lengths)))
 
 
-def _exponentials(system: ModalSystem, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return transitions (S, 2M, 2M) and the parts of the force at both ends (S, 2M, M)."""
-    if not system.coupled:
-        return _by_mode(system, lengths)
-    return _whole(_stiffness_of(system), np.asarray(system.damping), lengths)
+def exponentials(system: CoupledModes, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return transitions (S, 2M, 2M) and the parts of the force at both ends (S, 2M, M), of lengths [s].
 
-
-def _stiffness_of(system: ModalSystem) -> FloatArray:
-    given = system.stiffness_matrix if isinstance(system, CoupledModes) else None
-    return np.diag(system.stiffness) if given is None else given
-
-
-def _by_mode(system: ModalSystem, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the same for modes that do not act on each other, each by itself."""
+    Modes that do not act on each other are taken each by itself.
+    """
     count, size = len(system.angular_frequency), len(lengths)
-    transition = np.zeros((size, 2 * count, 2 * count))
-    begin, end = np.zeros((2, size, 2 * count, count))
+    if system.coupled:
+        whole, begin, end = _exponentials(system.whole[None], system.damping[None], lengths)
+        return whole[0], begin[0], end[0]
+    one = _exponentials(system.stiffness[:, None, None], np.diag(system.damping)[:, None, None], lengths)
+    transition, begin, end = np.zeros((size, 2 * count, 2 * count)), *np.zeros((2, size, 2 * count, count))
     for mode in range(count):
         at = np.array([mode, count + mode])
-        one = _whole(system.stiffness[mode].reshape(1, 1), system.damping[mode, mode].reshape(1, 1), lengths)
-        transition[:, at[:, None], at] = one[0]
-        begin[:, at, mode], end[:, at, mode] = one[1][:, :, 0], one[2][:, :, 0]
+        transition[:, at[:, None], at] = one[0][mode]
+        begin[:, at, mode], end[:, at, mode] = one[1][mode, :, :, 0], one[2][mode, :, :, 0]
     return transition, begin, end
 
 
-def _whole(
+def _exponentials(
     stiffness: FloatArray, damping: FloatArray, lengths: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the same for coordinates that act on each other."""
-    count = len(stiffness)
+    """Return the same (B, S, ...) of B groups of c coordinates that act on each other, (B, c, c)."""
+    groups, count = stiffness.shape[:2]
     own = np.eye(count)
-    longest = float(lengths.max())
     # Velocities are measured in units of the highest frequency, which balances the matrix.
-    unit = max(float(np.sqrt(np.max(np.abs(stiffness)))), float(np.max(np.abs(damping))), 1.0 / longest)
+    highest = np.maximum(
+        np.sqrt(np.max(np.abs(stiffness), axis=(1, 2))), np.max(np.abs(damping), axis=(1, 2))
+    )
+    unit = np.maximum(highest, 1.0 / float(lengths.max()))[:, None, None]
     q, v = slice(0, count), slice(count, 2 * count)
     f, s = slice(2 * count, 3 * count), slice(3 * count, 4 * count)
-    matrix = np.zeros((4 * count, 4 * count))
-    matrix[q, v] = unit * own
-    matrix[v, q] = -stiffness / unit
-    matrix[v, v] = -damping
-    matrix[v, f] = own / unit
-    scaled = matrix * lengths[:, None, None]
-    scaled[:, f, s] = own  # the force changes by one over the step
-    norm = float(np.max(np.sum(np.abs(scaled[:, : 2 * count, : 2 * count]), axis=2), initial=0.0))
+    matrix = np.zeros((groups, 4 * count, 4 * count))
+    matrix[:, q, v] = unit * own
+    matrix[:, v, q] = -stiffness / unit
+    matrix[:, v, v] = -damping
+    matrix[:, v, f] = own / unit
+    scaled = matrix[:, None] * lengths[:, None, None]
+    scaled[:, :, f, s] = own  # the force changes by one over the step
+    state = slice(0, 2 * count)
+    norm = float(np.max(np.sum(np.abs(scaled[:, :, state, state]), axis=3), initial=0.0))
     squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))
     scaled /= 2.0**squarings
-    unity = np.eye(4 * count)
-    result = np.broadcast_to(unity, scaled.shape)
-    for order in range(_TAYLOR, 0, -1):
-        result = unity + scaled @ result / order
+    second = scaled @ scaled
+    powers = np.stack((np.broadcast_to(np.eye(4 * count), scaled.shape), scaled, second, second @ scaled))
+    *parts, result = np.tensordot(_TAYLOR, powers, 1)
+    for part in reversed(parts):
+        result = part + second @ (second @ result)
     for _ in range(squarings):
         result = result @ result
-    scale = np.repeat((1.0, unit), count)
-    state = slice(0, 2 * count)
-    slope = result[:, state, s] * scale[:, None]
-    whole = result[:, state, f] * scale[:, None]
-    transition = result[:, state, state] * scale[:, None] / scale
+    scale = np.ones((groups, 1, 2 * count, 1))
+    scale[:, 0, v] = unit
+    slope, whole = result[:, :, state, s] * scale, result[:, :, state, f] * scale
+    transition = result[:, :, state, state] * scale / scale.transpose(0, 1, 3, 2)
     return np.ascontiguousarray(transition), np.ascontiguousarray(whole - slope), np.ascontiguousarray(slope)
-
-
-def simulate_at(
-    system: ModalSystem,
-    laws: Laws,
-    *,
-    q: FloatArray,
-    v: FloatArray,
-    time: FloatArray,
-    course: Course,
-    shape: FloatArray,
-    memory: FloatArray | None = None,
-    feed: FloatArray | None = None,
-    refinement: int = 1,
-) -> ModalMotion:
-    """Return the motion at time stamps under a force, from a state at the first of them.
-
-    Parameters
-    ----------
-    system : ModalSystem
-        The linear structure.
-    laws : Laws
-        Its internal forces.
-    q, v : (M,) ndarray
-        State at the first stamp.
-    time : (N,) ndarray
-        Stamps since the begin of the record [s], strictly increasing.
-    course : Course
-        The force, linear, held or smooth between its samples.
-    shape : (M,) ndarray
-        Modal forces by a unit of it.
-    memory : (J, 5 + E) ndarray, optional
-        Of the laws; left out, each law has been loaded from zero to its first position without turning back.
-    feed : (J,) ndarray, optional
-        What a unit of the force adds to the positions of the laws' ports beyond the modes.
-    refinement : int
-        Steps are this many times smaller than usual.
-
-    Returns
-    -------
-    ModalMotion
-        At the stamps, the first included.
-    """
-    boundaries = substeps(system, laws, time, refinement, SMOOTH_PARTS if course.is_smooth else 1, laws.edges)
-    begin, end = (np.outer(force, shape) for force in course.ends(boundaries.time))
-    found = exact_steps(system, boundaries.lengths)
-    fed = np.outer(course.at(boundaries.time), np.zeros(len(laws)) if feed is None else feed)
-    push = found.push(begin, end)
-    return advance(system, laws, found, boundaries, q, v, push, begin, end, fed, memory)
 
 
 @dataclass(frozen=True)
@@ -236,9 +186,19 @@ class Boundaries:
     sample: IntArray
     lengths: FloatArray
 
+    @cached_property
+    def alike(self) -> tuple[FloatArray, IntArray]:
+        """Distinct lengths (S,) [s], and which (K,) each step has."""
+        usual = float(np.median(self.lengths))
+        if np.ptp(self.lengths) <= ALIKE * usual:
+            return self.lengths[:1], np.zeros(len(self.lengths), dtype=np.int64)
+        rounded = np.round(self.lengths / (ALIKE * usual))
+        _, first, which = np.unique(rounded, return_index=True, return_inverse=True)
+        return np.ascontiguousarray(self.lengths[first]), np.asarray(which, dtype=np.int64).ravel()
+
 
 def substeps(
-    system: ModalSystem,
+    system: CoupledModes,
     laws: Laws,
     time: FloatArray,
     refinement: int = 1,
@@ -255,6 +215,11 @@ def substeps(
         found = substeps(system, laws, moments, refinement, least)
         return replace(found, sample=found.sample[np.searchsorted(moments, time)])
     parts = np.maximum(_substeps(system, laws, np.diff(time)), least) * refinement
+    return _divided.get((time.tobytes(), parts.tobytes()), lambda: _boundaries(time, parts))
+
+
+def _boundaries(time: FloatArray, parts: IntArray) -> Boundaries:
+    """Return the steps by which each interval between stamps (N,) is divided into parts (N - 1,)."""
     sample = np.concatenate(([0], np.cumsum(parts))).astype(np.int64)
     lengths = np.repeat(np.diff(time) / parts, parts)
     interval = np.repeat(np.arange(len(parts)), parts)
@@ -265,7 +230,7 @@ def substeps(
 
 
 def advance(
-    system: ModalSystem,
+    system: CoupledModes,
     laws: Laws,
     steps: ExactSteps,
     boundaries: Boundaries,
@@ -277,7 +242,7 @@ def advance(
     feed: FloatArray,
     memory: FloatArray | None,
 ) -> ModalMotion:
-    """Return the motion at the stamps of known steps; for arguments see `simulate_at` and `Steps`.
+    """Return the motion at the stamps of known steps; for arguments see `Steps` and `ModalMotion`.
 
     Where laws begin or end, a new section does: modes and the laws that go on keep their state, a law that
     begins has been loaded from zero to where its port is.
@@ -289,9 +254,7 @@ def advance(
     )  # fmt: skip
     state = State(np.array(q, dtype=float), np.array(v, dtype=float), result.memory, np.zeros(len(laws)))
     rows = laws.rows(system.ports, modes)
-    acts = rows
-    if isinstance(system, CoupledModes) and system.actions:
-        acts = laws.rows(system.actions, modes)
+    acts = laws.rows(system.actions, modes) if system.actions else rows
     flexibility = port_flexibility(system, laws)
     before = np.ones(len(laws), dtype=bool)
     for section in _sections(laws, boundaries):
@@ -335,15 +298,15 @@ class _Section(NamedTuple):
     last: int
     acts: BoolArray
     record: IntArray
-    kept: IntArray
-    samples: IntArray
+    kept: IntArray | slice
+    samples: IntArray | slice
 
 
 def _sections(laws: Laws, boundaries: Boundaries) -> Iterator[_Section]:
     """Yield the sections; one where all laws always act. A stamp at an edge belongs to what begins there."""
     time, count = boundaries.time, len(boundaries.lengths)
-    every = np.arange(len(boundaries.sample))
     if not laws.spans:
+        every = slice(None)
         yield _Section(0, count, np.ones(len(laws), dtype=bool), boundaries.sample, every, every)
         return
     inside = np.array([moment for moment in laws.edges if time[0] < moment < time[-1]])
@@ -358,12 +321,11 @@ def _sections(laws: Laws, boundaries: Boundaries) -> Iterator[_Section]:
         yield _Section(first, last, acts, record, np.searchsorted(record, sample), np.flatnonzero(own))
 
 
-def _substeps(system: ModalSystem, laws: Laws, lengths: FloatArray) -> IntArray:
+def _substeps(system: CoupledModes, laws: Laws, lengths: FloatArray) -> IntArray:
     """Return how many steps each interval (K,) is divided into, as `fe.runtime.motion.substeps_for` does."""
     if laws.linear:
         return np.ones(len(lengths), dtype=np.int64)
-    paces = system.paces if isinstance(system, CoupledModes) else system.angular_frequency
-    paces = paces[paces > 0.0]
+    paces = system.paces
     if not len(paces):
         return np.full(len(lengths), STEPS_AT_LEAST, dtype=np.int64)
     rate = max(float(paces.min()) / SLOWEST_PHASE, float(paces.max()) / FASTEST_PHASE)
