@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu_excitation import State
+from discrepancy.models.fmu_excitation import Run, State
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_patch import NOTHING, SortedPatch, carries, sorted_patch
@@ -16,20 +16,24 @@ from discrepancy.models.fmu_ports import SAFE_TURN
 from discrepancy.models.fmu_rest import port_flexibility, rest_with_laws
 from discrepancy.models.fmu_runs import FmuRuns
 from discrepancy.models.fmu_samples import sampled
-from discrepancy.models.fmu_trials import DEFAULT_PLACE, FmuTrials
+from discrepancy.models.fmu_trials import FmuTrials
 from discrepancy.models.interface import (
     Conditions,
     ModelParameter,
     PortScale,
     Response,
     Scales,
+    campaign_sizes,
+    check_outputs,
+    check_parameters,
     check_plain,
+    prior_mean,
 )
 from discrepancy.models.port_system import PortSystem
 from discrepancy.models.ported import NO_PATCH, PortedSystem
+from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import ModelPatch, Primitive
 from fmu_asset.errors import FmuError
-from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -61,10 +65,7 @@ class FmuModel:
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description = description
         self.runs = FmuRuns(description, Path(folder))
-        self._parameters = tuple(
-            ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
-            for item in description.parameter
-        )
+        self._parameters = tuple(item.calibrated for item in description.parameter)
         self._ports = tuple(port.name for port in description.port)
         self._trials = FmuTrials(description, self.runs)
         self._check_settings()
@@ -146,15 +147,14 @@ class FmuModel:
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
         given = self.description.scales
-        values = np.array([campaign.parameters.get(p.name, (p.mean, 0.0))[0] for p in self._parameters])
+        values = prior_mean(campaign, self._parameters)
         dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
         still = [trial for trial in campaign.trials if not trial.is_dynamic]
         largest = dict.fromkeys(self._ports, 0.0)
         port_columns = [self.runs.columns[f"port.{port}.displacement"] for port in self._ports]
         for trial in campaign.trials:
-            state = self._trials.state(trial, Conditions(values), (), 0)
             if trial.is_dynamic:
-                moved = self._free(trial, Conditions(values), state, NOTHING, 1)[0]
+                moved = self.motion.free(self._trials.run(trial, Conditions(values), NOTHING, self.motion, 1))
             else:
                 moved = self._at_rest_values(trial, Conditions(values, health=trial.health), NOTHING)
             for port, column in zip(self._ports, port_columns, strict=True):
@@ -196,17 +196,12 @@ class FmuModel:
             None,
         )
         tip, modal = seen.get(at_force, (1.0, 1.0)) if at_force else next(iter(seen.values()), (1.0, 1.0))
-        moments = [t.start + t.time if t.is_dynamic else t.time for t in campaign.trials]
-        span = float(max(map(np.max, moments)) - min(map(np.min, moments))) if moments else 0.0
         return Scales(
             length=given.length or 1.0,
             tip_stiffness=given.tip_stiffness or modal,
             modal_mass=given.modal_mass or tip / frequency**2,
             angular_frequency=frequency,
-            force=max((float(np.max(np.abs(t.force))) for t in campaign.trials), default=0.0),
-            load_factor=max((float(np.max(np.abs(t.load_factor))) for t in campaign.trials), default=0.0),
-            duration=max((float(t.time[-1] - t.time[0]) for t in dynamic), default=1.0),
-            campaign_time=span if span > 0.0 else 1.0,
+            **campaign_sizes(campaign),
             ports={
                 port: PortScale(largest[port] or 1.0, seen[port][0], frequency, seen[port][1])
                 for port in self._ports
@@ -230,11 +225,7 @@ class FmuModel:
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
         check_plain(trial, f"the FMU model {self.name!r}")
-        if conditions.parameters.shape != (len(self._parameters),):
-            raise ModelError(
-                f"The FMU model {self.name!r} has {counted(len(self._parameters), 'parameter')}, but "
-                f"{conditions.parameters.size} came."
-            )
+        check_parameters(f"The FMU model {self.name!r}", self._parameters, conditions.parameters)
         columns = self._columns(outputs)
         parts = sorted_patch(patch, self.description)
         if not trial.is_dynamic:
@@ -243,8 +234,7 @@ class FmuModel:
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
             return Response(self._at_rest_values(trial, conditions, parts)[:, columns])
-        state = self._trials.state(trial, conditions, parts.settings, 0)
-        values, step = self._moving(trial, conditions, state, parts, refinement, columns)
+        values, step = self._moving(trial, conditions, parts, refinement, columns)
         rate, zero = conditions.clock
         quantities = self.runs.quantities
         derivatives = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
@@ -254,28 +244,19 @@ class FmuModel:
         self,
         trial: Trial,
         conditions: Conditions,
-        state: State,
         patch: SortedPatch,
-        refinement: int,
-        columns: Sequence[int],
+        refinement: int = 1,
+        columns: Sequence[int] = (),
     ) -> tuple[FloatArray, float]:
         """Return all outputs (K, C) on the grid of the communication step [s], and the step."""
-        if not len(patch.laws):
-            return self._free(trial, conditions, state, patch, refinement)
-        return self.motion.with_laws(
-            patch.laws,
-            lambda refined: self._trials.excitations(trial, conditions, patch, self.motion, refined),
-            trial,
-            state,
-            refinement,
-            columns,
-        )
 
-    def _free(
-        self, trial: Trial, conditions: Conditions, state: State, patch: SortedPatch, refinement: int
-    ) -> tuple[FloatArray, float]:
-        step, steps, loads = self._trials.excitations(trial, conditions, patch, self.motion, refinement)
-        return self.motion.free(state, step, steps, loads), step
+        def excite(refined: int) -> Run:
+            return self._trials.run(trial, conditions, patch, self.motion, refined)
+
+        if len(patch.laws):
+            return self.motion.with_laws(patch.laws, excite, trial, refinement, columns)
+        run = excite(refinement)
+        return self.motion.free(run), run.step
 
     # ------------------------------------------------------------ ports
 
@@ -323,9 +304,8 @@ class FmuModel:
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
     ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        parts = sorted_patch(patch, self.description)
-        state = self._trials.state(trial, conditions, parts.settings, 0)
-        values, step = self._free(trial, conditions, state, parts, 1)
+        parts = sorted_patch(patch, self.description)._replace(laws=NO_LAWS)
+        values, step = self._moving(trial, conditions, parts)
         rate, zero = conditions.clock
         moved = values[:, self.motion.ports.x]
         found = sampled(moved, step, (1.0 + rate) * trial.time + zero, [0] * len(self._ports))
@@ -354,29 +334,10 @@ class FmuModel:
     # ------------------------------------------------------------ parts
 
     def _columns(self, outputs: Sequence[tuple[str, Quantity]]) -> list[int]:
-        columns = []
-        for output, quantity in outputs:
-            own = self.output_quantity(output)
-            if own is None:
-                raise ModelError(
-                    f"The FMU model {self.name!r} has no output {output!r}; it has "
-                    f"{', '.join(self.runs.quantities)}."
-                )
-            if not quantity.shows(own):
-                raise ModelError(
-                    f"The output {output!r} of {self.name!r} is a {own.value}, but a channel measures "
-                    f"{quantity.value}."
-                )
-            columns.append(self.runs.columns[output])
-        return columns
+        check_outputs(f"The FMU model {self.name!r}", self.runs.quantities, outputs)
+        return [self.runs.columns[output] for output, _ in outputs]
 
 
 def _any_trial(kind: TrialKind, interval: float) -> Trial:
     """Return a trial that asks for nothing, for scales without a campaign."""
-    count = 1 if kind is TrialKind.STATIC else 400
-    zeros, empty = np.zeros(count), np.zeros((count, 0))
-    time = np.asarray(interval * np.arange(count), dtype=np.float64)
-    return Trial(
-        "", kind, (), empty, empty.astype(bool), time, zeros, zeros, DEFAULT_PLACE, zeros,
-        0.0, "", np.zeros((1, 2)), np.zeros((1, 2)),
-    )  # fmt: skip
+    return Trial.plain("", kind, (), interval * np.arange(1.0 if kind is TrialKind.STATIC else 400.0))

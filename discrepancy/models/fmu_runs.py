@@ -4,6 +4,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from math import pi
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
+from discrepancy.models.fmu_excitation import State
 from discrepancy.models.fmu_file import FmuModelDescription
+from discrepancy.models.memory import Memory
 from fmu_asset.door.binding import Binding, Input, Parameter, Vector, expand, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuError
@@ -61,8 +64,7 @@ class FmuRuns:
         self._description = description
         self._path = folder / description.fmu
         self._assets: OrderedDict[float, FmiAsset] = OrderedDict()
-        self._kept: OrderedDict[Hashable, FloatArray] = OrderedDict()
-        self._kept_bytes = 0
+        self._kept = Memory(KEPT_BYTES, lambda found: found.nbytes)
         self.run_count = self.step_count = 0
         try:
             self._base = self._base_binding(folder)
@@ -70,6 +72,7 @@ class FmuRuns:
             self._first = FmiAsset(self._path, self._binding, isolated=description.isolated)
         except FmuError as cause:
             raise ModelError(f"The FMU model {description.name!r}: {cause}") from cause
+        self._none = dict.fromkeys(self._first.binding.load, 0.0)
 
     # ------------------------------------------------------------ names
 
@@ -189,17 +192,13 @@ class FmuRuns:
 
     def remembered(self, key: Hashable, make: Callable[[], FloatArray]) -> FloatArray:
         """Return what `make` returned for `key`; the oldest results are forgotten."""
-        found = self._kept.get(key)
-        if found is not None:
-            self._kept.move_to_end(key)
+
+        def made() -> FloatArray:
+            found = make()
+            found.setflags(write=False)
             return found
-        found = make()
-        found.setflags(write=False)
-        self._kept[key] = found
-        self._kept_bytes += found.nbytes
-        while self._kept_bytes > KEPT_BYTES and len(self._kept) > 1:
-            self._kept_bytes -= self._kept.popitem(last=False)[1].nbytes
-        return found
+
+        return self._kept.get(key, made)
 
     def open(self, step: float) -> FmiAsset:
         """Return the instance of a step size [s], as it was left."""
@@ -218,6 +217,13 @@ class FmuRuns:
         """End all instances; they are opened again when they are needed."""
         while self._assets:
             self._assets.popitem()[1].close()
+
+    def inputs(self, state: State, more: Mapping[str, float] = MappingProxyType({})) -> dict[str, float]:
+        """Return all inputs in a state, by the FMU's names, with more on some of them."""
+        found = {**self._none, **dict(state.inputs)}
+        for name, value in more.items():
+            found[name] = found.get(name, 0.0) + value
+        return found
 
     def started(
         self, step: float, parameters: Mapping[str, float], inputs: Mapping[str, float], *, settle: bool

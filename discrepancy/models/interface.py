@@ -1,6 +1,6 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from fe.runtime.patch import ModelPatch, Primitive
+from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -255,6 +256,31 @@ class Model(Protocol):
         ModelError
             If the model lacks an output or cannot carry a primitive.
         """
+
+
+def prior_mean(campaign: Campaign, parameters: Sequence[ModelParameter]) -> FloatArray:
+    """Return the means (P,) of parameters, those of the campaign where it says them."""
+    return np.array([campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in parameters])
+
+
+def check_parameters(what: str, parameters: Sequence[ModelParameter], values: FloatArray) -> None:
+    """Refuse values of another number than a model, `what`, has parameters."""
+    if values.shape != (len(parameters),):
+        raise ModelError(f"{what} has {counted(len(parameters), 'parameter')}, but {values.size} came.")
+
+
+def check_outputs(
+    what: str, quantities: Mapping[str, Quantity], outputs: Sequence[tuple[str, Quantity]]
+) -> None:
+    """Refuse outputs that a model, `what`, does not have, and such as a channel cannot measure."""
+    for output, quantity in outputs:
+        own = quantities.get(output)
+        if own is None:
+            raise ModelError(f"{what} has no output {output!r}; it has {', '.join(quantities)}.")
+        if not quantity.shows(own):
+            raise ModelError(
+                f"{what}: the output {output!r} is a {own.value}, but a channel measures {quantity.value}."
+            )
 
 
 def check_no_inputs(trial: Trial, what: str) -> None:

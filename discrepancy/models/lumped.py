@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Conditions, ModelParameter, Response, Scales, check_lumped
+from discrepancy.models.interface import (
+    Conditions,
+    ModelParameter,
+    Response,
+    Scales,
+    check_lumped,
+    check_outputs,
+    check_parameters,
+    prior_mean,
+)
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped
 from discrepancy.models.lumped_rig import LumpedRig
 from discrepancy.models.lumped_scales import lumped_scales, state_sizes
@@ -31,7 +40,6 @@ from fe.runtime.patch import (
     RootCompliance,
     StiffnessDrift,
 )
-from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -60,10 +68,7 @@ class LumpedModel:
         self._quantities = {item.name: item.quantity for item in description.output}
         self._ports = {item.name: np.array(item.vector) for item in description.port}
         self._stations = sorted(place.station for place in description.place)
-        self._parameters = tuple(
-            ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
-            for item in description.parameter
-        )
+        self._parameters = tuple(item.calibrated for item in description.parameter)
         self._rigs = Memory(KEPT_RIGS)
 
     @classmethod
@@ -117,7 +122,7 @@ class LumpedModel:
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
-        mean = self._prior_mean(campaign)
+        mean = prior_mean(campaign, self._parameters)
         return lumped_scales(self.rig(mean), mean, campaign, self.stations())
 
     # ------------------------------------------------------------ response
@@ -137,7 +142,7 @@ class LumpedModel:
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
         check_lumped(trial, f"the lumped model {self.name!r}")
-        self._check_outputs(outputs)
+        check_outputs(f"The lumped model {self.name!r}", self._quantities, outputs)
         structure, forces, change, loads = sorted_lumped(patch.in_trial(trial.name), self)
         forces = self.description.own_laws(self._factors(conditions.parameters)) + forces
         laws = laws_at(forces, self._ports)
@@ -193,7 +198,7 @@ class LumpedModel:
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
-        mean = self._prior_mean(campaign)
+        mean = prior_mean(campaign, self._parameters)
         return state_sizes(self.rig(mean), campaign, trial, Conditions(mean))
 
     # ------------------------------------------------------------ ports
@@ -236,24 +241,6 @@ class LumpedModel:
     def _mean(self) -> FloatArray:
         return np.array([item.mean for item in self._parameters])
 
-    def _prior_mean(self, campaign: Campaign) -> FloatArray:
-        given = campaign.parameters
-        return np.array([given.get(item.name, (item.mean, 0.0))[0] for item in self._parameters])
-
-    def _check_outputs(self, outputs: Sequence[tuple[str, Quantity]]) -> None:
-        for output, quantity in outputs:
-            own = self._quantities.get(output)
-            if own is None:
-                raise ModelError(
-                    f"The lumped model {self.name!r} has no output {output!r}; it has "
-                    f"{', '.join(self._quantities)}."
-                )
-            if not quantity.shows(own):
-                raise ModelError(
-                    f"The output {output!r} of {self.name!r} is a {own.value}, but a channel measures "
-                    f"{quantity.value}."
-                )
-
     def rig(
         self, parameters: FloatArray, structure: tuple[Primitive, ...] = (), temperature: float = 0.0
     ) -> LumpedRig:
@@ -270,11 +257,7 @@ class LumpedModel:
 
     def _factors(self, parameters: FloatArray) -> dict[str, float]:
         """Return the factors of the terms at values of the parameters."""
-        if parameters.shape != (len(self._parameters),):
-            raise ModelError(
-                f"The lumped model {self.name!r} has {counted(len(self._parameters), 'parameter')}, but "
-                f"{parameters.size} came."
-            )
+        check_parameters(f"The lumped model {self.name!r}", self._parameters, parameters)
         factors: dict[str, float] = {}
         for item, value in zip(self.description.parameter, parameters, strict=True):
             for term in item.scaled:

@@ -4,6 +4,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from discrepancy.models.interface import ModelParameter
+
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0, strict=True)]
 Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0, strict=True)]
@@ -27,6 +29,11 @@ class ParameterSection(Section):
     low: Number
     high: Number
     unit: str = "1"
+
+    @property
+    def calibrated(self) -> ModelParameter:
+        """The parameter of the model."""
+        return ModelParameter(self.name, self.mean, self.deviation, self.unit, self.low, self.high)
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:

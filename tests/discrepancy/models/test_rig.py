@@ -463,7 +463,7 @@ matrix = [[0.0, 0.0], [0.0, 0.08]]
             DAMPER,
             'reaction = "actuator"',
             'reaction = "hand"',
-            "is the reaction of 'hand', which is no input",
+            "is the reaction of the prescribed motion 'hand', but there are actuator",
         ),
         (DAMPER, 'quantity = "force"', 'quantity = "level"', "is a reaction: give it quantity"),
         (DAMPER, 'reaction = "actuator"\n', "", "needs one of a vector, a reaction and a controller"),
