@@ -47,7 +47,7 @@ class FmuMotion:
 
     def __init__(self, description: FmuModelDescription, runs: FmuRuns, nominal: State) -> None:
         self.nominal = nominal
-        self._description, self._runs = description, runs
+        self.description, self._runs = description, runs
         self._ports = description.port
         self.ports = FmuPorts(description, runs, self._run)
         self._linear: dict[Hashable, bool] = {}
@@ -69,13 +69,13 @@ class FmuMotion:
             names = [part.name for part, _ in parts]
             return self._rest(state, dict(zip(names, values, strict=True)))
 
-        if not self._description.static.settle:
+        if not self.description.static.settle:
             key = ("rest", state, tuple(sorted(given.items())))
             return self._runs.remembered(key, lambda: answer([value for _, value in parts]))
         return self._superposed(("rest", state), answer, parts)
 
     def _rest(self, state: State, loads: Mapping[str, float]) -> FloatArray:
-        table = self._description.static
+        table = self.description.static
         inputs = self._runs.inputs(state, loads)
         if table.settle:
             return self._runs.started(table.step, dict(state.parameters), inputs, settle=True)[1]
@@ -90,8 +90,8 @@ class FmuMotion:
 
     def step(self, trial: Trial, refinement: int) -> float:
         """Return the communication step [s] of a dynamic trial: a whole part of its sampling interval."""
-        if self._description.motion.step is not None:
-            return self._description.motion.step
+        if self.description.motion.step is not None:
+            return self.description.motion.step
         frequency = self.angular_frequency(trial)
         return trial.interval / (ceil(frequency * trial.interval / PHASE[trial.kind]) * refinement)
 
@@ -100,8 +100,8 @@ class FmuMotion:
 
         That of the nominal state, so that steps do not change while parameters are fitted.
         """
-        if self._description.scales.angular_frequency is not None:
-            return self._description.scales.angular_frequency
+        if self.description.scales.angular_frequency is not None:
+            return self.description.scales.angular_frequency
         key = (trial.interval, len(trial.time))
         if key not in self._frequencies:
             self._frequencies[key] = self.measured_frequency(trial, self.nominal)
@@ -109,13 +109,13 @@ class FmuMotion:
 
     def measured_frequency(self, trial: Trial, state: State) -> float:
         """Return what `angular_frequency` does, measured in a state at a trial's interval."""
-        step = self._description.motion.step or trial.interval
+        step = self.description.motion.step or trial.interval
         system = self.ports.system(state, step, len(trial.time)) if self._ports else None
         if system is not None:
             frequency, shape = system.modes(system.outputs[self.ports.x[0]], 0)
             if len(frequency):
                 return float(frequency[np.argmax(shape / frequency**2)])
-        way = self._description.release
+        way = self.description.release
         if way is not None:
             kind = "displacement" if way.displacement is not None else "hold"
             size = trial.release.displacement if trial.release is not None else 1e-3
@@ -128,8 +128,7 @@ class FmuMotion:
         spectrum = np.abs(np.fft.rfft(moving * np.hanning(len(moving))[:, None], 4 * len(moving), axis=0))
         if not np.any(spectrum):
             raise ModelError(
-                f"The FMU model {self._description.name!r} does not move; state angular_frequency in "
-                "[scales]."
+                f"The FMU model {self.description.name!r} does not move; state angular_frequency in [scales]."
             )
         best = int(np.argmax(spectrum[:, np.argmax(spectrum.max(axis=0))]))
         return 2.0 * np.pi * max(best, 1) / (4 * len(moving) * step)
@@ -154,7 +153,7 @@ class FmuMotion:
         parameters = dict(state.parameters)
         histories = {name: np.full(steps, value) for name, value in self._runs.inputs(state).items()}
         held: dict[str, float] = {}
-        way = self._description.release
+        way = self.description.release
         for part, value in loads:
             if part.kind in ("displacement", "velocity"):
                 amount = value if part.kind == "velocity" else self._released(state, step, value)
@@ -178,7 +177,7 @@ class FmuMotion:
         ModelError
             If there is none.
         """
-        way = self._description.release
+        way = self.description.release
         assert way is not None
         if way.output is None:
             return displacement
@@ -217,7 +216,7 @@ class FmuMotion:
             return amount
         raise ModelError(
             f"Nothing that [release] names puts {way.output!r} of the FMU model "
-            f"{self._description.name!r} at {displacement:g} m; correct displacement, hold or output there."
+            f"{self.description.name!r} at {displacement:g} m; correct displacement, hold or output there."
         )
 
     def _superposed(
@@ -230,7 +229,7 @@ class FmuMotion:
             full = (key, tuple((part.key, value) for (part, _), value in zip(loads, values, strict=True)))
             return self._runs.remembered(full, lambda: answer(values))
 
-        if not loads or not self._description.superposition or self._linear.get(kind) is False:
+        if not loads or not self.description.superposition or self._linear.get(kind) is False:
             return asked([value for _, value in loads])
         units = [
             self._units.setdefault((part.kind, part.name), 2.0 ** round(log2(abs(value))))
@@ -273,7 +272,7 @@ class FmuMotion:
         ModelError
             If the steps do not converge.
         """
-        if self._description.motion.step is not None:
+        if self.description.motion.step is not None:
             run = excite(1)
             return self._coupled(laws, run), run.step
         strength = float(np.max(np.abs(laws.values[:, 0])))
@@ -312,7 +311,7 @@ class FmuMotion:
             refinement, coarse = 2 * refinement, fine
         raise ModelError(
             f"The internal force at {', '.join(dict.fromkeys(laws.ports))} does not converge in the "
-            f"co-simulation with the FMU model {self._description.name!r}: halving steps of "
+            f"co-simulation with the FMU model {self.description.name!r}: halving steps of "
             f"{2.0 * run.step:.2g} s still changes the motion by {change:.1g} of its size; the force is too "
             f"stiff for the port."
         )
@@ -378,7 +377,7 @@ class FmuMotion:
         without = [self._ports[p].name for p in port_of if self.ports.v[p] < 0]
         if without:
             raise ModelError(
-                f"The FMU model {self._description.name!r} is not linear, so its port {without[0]!r} needs a "
+                f"The FMU model {self.description.name!r} is not linear, so its port {without[0]!r} needs a "
                 f"velocity output; name it in [[port]]."
             )
         gain = self._runs.remembered(

@@ -105,7 +105,8 @@ class FmuPorts:
         self._confirmed_to[base.step] = max(ratio, known)
         return finer
 
-    def _size(self, number: int) -> float:
+    def size(self, number: int) -> float:
+        """Return a force at a port that its input can have."""
         return min(1.0, 0.1 * self._runs.input_limit(self._ports[number].force))
 
     def records(self, state: State, step: float, count: int) -> FloatArray:
@@ -117,7 +118,7 @@ class FmuPorts:
         pulse = np.eye(1, count).ravel()
         parts = []
         for number, name in enumerate(self.forces):
-            size = self._size(number)
+            size = self.size(number)
             moved = self._run(Run(state, step, count, [(Excitation("input", name, pulse), size)]))
             parts.append((moved - zero)[1:] / size)
         return np.stack(parts, axis=2)
@@ -125,7 +126,7 @@ class FmuPorts:
     def _confirmed(self, system: PortSystem, state: State, step: float, count: int) -> bool:
         """Whether the FMU answers to many forces as the system says that was made of single ones."""
         signs = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self._ports)))
-        sizes = np.array([self._size(number) for number in range(len(self._ports))])
+        sizes = np.array([self.size(number) for number in range(len(self._ports))])
         loads = [
             (Excitation("input", name, signs[:, number].copy()), float(sizes[number]))
             for number, name in enumerate(self.forces)
@@ -140,7 +141,7 @@ class FmuPorts:
         system = self.system(state, step, RECORD)
         column = self.x[number]
         if system is None:
-            size = self._size(number)
+            size = self.size(number)
             still = []
             for force in (0.0, size):
                 inputs = self._runs.inputs(state, {self.forces[number]: force})

@@ -120,18 +120,18 @@ class FmuRuns:
             if name is not None:
                 variable = self.variable(name)
                 inputs[variable] = Input(variable=variable, unit=unit)
-        parameters: dict[str, Parameter] = {}
-        if base is not None:
-            parameters = {
-                key: Parameter(variable=item.variable, unit=item.unit, value=item.value)
-                for key, item in base.parameter.items()
-            }
-        own = [(item.variable or item.name, item.unit) for item in given.parameter]
-        if given.release is not None and given.release.displacement is not None:
-            own.append((given.release.displacement, "m"))
-        if given.release is not None and given.release.velocity is not None:
-            own.append((given.release.velocity, "m/s"))
+        parameters = {
+            key: Parameter(variable=item.variable, unit=item.unit, value=item.value)
+            for key, item in (base.parameter if base is not None else {}).items()
+        }
+        own: list[tuple[str | None, str]] = [
+            (item.variable or item.name, item.unit) for item in given.parameter
+        ]
+        if given.release is not None:
+            own += [(given.release.displacement, "m"), (given.release.velocity, "m/s")]
         for name, unit in own:
+            if name is None:
+                continue
             key = self.parameter(name)
             known = parameters.get(key)
             parameters[key] = Parameter(
@@ -140,8 +140,11 @@ class FmuRuns:
                 value=None if known is None or known.unit != unit else known.value,
             )
         columns: dict[tuple[str, str], int] = {}
-        self.columns = {}
-        self.quantities = {}
+        self.columns, self.quantities = dict[str, int](), dict[str, Quantity]()
+
+        def column(variable: str, unit: str) -> int:
+            return columns.setdefault((self.variable(variable), unit), len(columns))
+
         for item in given.output:
             names = expand(item.name)
             variables = expand(item.variable or item.name)
@@ -152,19 +155,16 @@ class FmuRuns:
                 )
             for name, variable in zip(names, variables, strict=True):
                 unit = "" if item.quantity is Quantity.SIGNAL else _si(item.quantity)
-                at = columns.setdefault((self.variable(variable), unit), len(columns))
-                self.columns[name], self.quantities[name] = at, item.quantity
+                self.columns[name], self.quantities[name] = column(variable, unit), item.quantity
         for port in given.port:
             for quantity, name, unit in (
                 ("displacement", port.displacement, "rad" if port.rotation else "m"),
                 ("velocity", port.velocity, "rad/s" if port.rotation else "m/s"),
             ):
                 if name is not None:
-                    at = columns.setdefault((self.variable(name), unit), len(columns))
-                    self.columns[f"port.{port.name}.{quantity}"] = at
+                    self.columns[f"port.{port.name}.{quantity}"] = column(name, unit)
         if given.release is not None and given.release.output is not None:
-            at = columns.setdefault((self.variable(given.release.output), "m"), len(columns))
-            self.columns["release"] = at
+            self.columns["release"] = column(given.release.output, "m")
         header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
         header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
         content: dict[str, Any] = {"binding": header, "load": inputs, "parameter": parameters}

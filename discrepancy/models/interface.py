@@ -192,6 +192,10 @@ class Response:
     shear: FloatArray | None = None
 
 
+Outputs = tuple[tuple[str, Quantity], ...]
+"""Outputs, and the quantity wanted of each."""
+
+
 class Model(Protocol):
     """A model that can be patched."""
 
@@ -221,7 +225,7 @@ class Model(Protocol):
     def respond(
         self,
         trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
+        outputs: Outputs,
         patch: ModelPatch,
         conditions: Conditions,
         *,

@@ -7,11 +7,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import (
     Conditions,
-    ModelParameter,
+    Outputs,
     Response,
     Scales,
     check_lumped,
@@ -23,6 +23,7 @@ from discrepancy.models.lumped_file import LumpedDescription, load_lumped
 from discrepancy.models.lumped_rig import LumpedRig
 from discrepancy.models.lumped_scales import lumped_scales, state_sizes
 from discrepancy.models.memory import Memory
+from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.patch_parts import LoadChange, laws_at, sorted_lumped
 from discrepancy.models.ported import NO_PATCH, PortedSystem
 from fe.runtime.laws import LAWS
@@ -49,7 +50,7 @@ LEAST_STIFFNESS = 0.05
 """A temperature that leaves less than this share of the stiffness is refused."""
 
 
-class LumpedModel:
+class LumpedModel(DescribedModel):
     """A lumped model (`discrepancy.models.interface.Model`).
 
     Parameters
@@ -65,10 +66,10 @@ class LumpedModel:
 
     def __init__(self, description: LumpedDescription) -> None:
         self.description = description
-        self._quantities = {item.name: item.quantity for item in description.output}
+        quantities = {item.name: item.quantity for item in description.output}
+        super().__init__(description.name, description.parameter, description.port, quantities)
         self._ports = {item.name: np.array(item.vector) for item in description.port}
         self._stations = sorted(place.station for place in description.place)
-        self._parameters = tuple(item.calibrated for item in description.parameter)
         self._rigs = Memory(KEPT_RIGS)
 
     @classmethod
@@ -77,20 +78,6 @@ class LumpedModel:
         return cls(load_lumped(path))
 
     # ------------------------------------------------------------ what it is
-
-    @property
-    def name(self) -> str:
-        """Name for people."""
-        return self.description.name
-
-    @property
-    def parameters(self) -> tuple[ModelParameter, ...]:
-        """Calibrated parameters."""
-        return self._parameters
-
-    def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if the model has no such output."""
-        return self._quantities.get(output)
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
@@ -112,17 +99,13 @@ class LumpedModel:
 
     follows_windows: ClassVar[bool] = True
 
-    def ports(self) -> tuple[str, ...]:
-        """Names of the ports."""
-        return tuple(self._ports)
-
     def stations(self) -> tuple[float, float] | None:
         """Return the least and largest station [m] of the places, None without places."""
         return (self._stations[0], self._stations[-1]) if self._stations else None
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
-        mean = prior_mean(campaign, self._parameters)
+        mean = prior_mean(campaign, self.parameters)
         return lumped_scales(self.rig(mean), mean, campaign, self.stations())
 
     # ------------------------------------------------------------ response
@@ -130,7 +113,7 @@ class LumpedModel:
     def respond(
         self,
         trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
+        outputs: Outputs,
         patch: ModelPatch,
         conditions: Conditions,
         *,
@@ -142,7 +125,7 @@ class LumpedModel:
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
         check_lumped(trial, f"the lumped model {self.name!r}")
-        check_outputs(f"The lumped model {self.name!r}", self._quantities, outputs)
+        check_outputs(f"The lumped model {self.name!r}", self.quantities, outputs)
         structure, forces, change, loads = sorted_lumped(patch.in_trial(trial.name), self)
         forces = self.description.own_laws(self._factors(conditions.parameters)) + forces
         laws = laws_at(forces, self._ports)
@@ -162,7 +145,7 @@ class LumpedModel:
     def _static(
         self,
         trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
+        outputs: Outputs,
         structure: tuple[Primitive, ...],
         laws: Laws,
         change: LoadChange,
@@ -198,17 +181,13 @@ class LumpedModel:
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
-        mean = prior_mean(campaign, self._parameters)
+        mean = prior_mean(campaign, self.parameters)
         return state_sizes(self.rig(mean), campaign, trial, Conditions(mean))
 
     # ------------------------------------------------------------ ports
 
     def ported(
-        self,
-        trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
-        parameters: FloatArray,
-        patch: ModelPatch = NO_PATCH,
+        self, trial: Trial, outputs: Outputs, parameters: FloatArray, patch: ModelPatch = NO_PATCH
     ) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the modes of the prior means."""
         warm, structure = float(trial.temperature[0]), sorted_lumped(patch, self).structure
@@ -239,7 +218,7 @@ class LumpedModel:
 
     @property
     def _mean(self) -> FloatArray:
-        return np.array([item.mean for item in self._parameters])
+        return np.array([item.mean for item in self.parameters])
 
     def rig(
         self, parameters: FloatArray, structure: tuple[Primitive, ...] = (), temperature: float = 0.0
@@ -257,7 +236,7 @@ class LumpedModel:
 
     def _factors(self, parameters: FloatArray) -> dict[str, float]:
         """Return the factors of the terms at values of the parameters."""
-        check_parameters(f"The lumped model {self.name!r}", self._parameters, parameters)
+        check_parameters(f"The lumped model {self.name!r}", self.parameters, parameters)
         factors: dict[str, float] = {}
         for item, value in zip(self.description.parameter, parameters, strict=True):
             for term in item.scaled:

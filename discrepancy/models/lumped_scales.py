@@ -65,53 +65,53 @@ class PortSizes:
 
     def __init__(self, lumped: LumpedRig, *, driven_only: bool = False) -> None:
         self._open, self._driven_only = lumped.open(), driven_only
-        self._turns = dict.fromkeys(self._open.ports, False)
-        self._follows = dict.fromkeys(self._open.ports, True)
-        self._sizes = {name: np.zeros(3) for name in self._open.ports}
-        self._forces: dict[str, list[FloatArray]] = {name: [] for name in self._open.ports}
+        self.rows = np.array(list(self._open.ports.values())).reshape(-1, lumped.width)
+        self._turns, self._follows = np.zeros(len(self.rows), bool), np.ones(len(self.rows), bool)
+        self._sizes = np.zeros((3, len(self.rows)))
+        self._squares: list[FloatArray] = []
+        self._counts: list[int] = []
 
     def add(self, motion: Motion, measured: float, fitted: bool) -> None:
         """Take up the motion of a trial, and the largest force that was measured in it [N]."""
-        system, free = motion.system, len(motion.system.angular_frequency)
-        shapes = system.shapes
+        system, shapes = motion.system, motion.system.shapes
+        free, modal = shapes.shape[1], self.rows @ system.all_shapes
         pushed = (
             motion.acceleration[:, :free] @ (system.mass @ shapes).T,
             motion.velocity[:, :free] @ (self._open.damping @ shapes).T,
             motion.acting.load_at(motion.time, np.eye(len(system.mass))),
         )
-        for name, row in system.ports.items():
-            modal = row @ system.all_shapes
-            lent = float((row @ shapes) @ (row @ shapes))
-            self._follows[name] &= lent == 0.0
-            if lent > 0.0:  # modal force along the port, over what a unit force there gives
-                along = shapes @ (shapes.T @ row) / lent
-                force = float(np.sqrt(max(np.mean((item @ along) ** 2) for item in pushed)))
-            else:
-                force = measured / FORCES
-            self._forces[name].append(np.array([len(motion.time), force**2]))
-            self.see(name, motion.q @ modal, fitted, speed := motion.velocity @ modal)
-            v = float(np.max(np.abs(speed)))
-            self._turns[name] |= bool(np.min(speed) < -TURNS * v and np.max(speed) > TURNS * v)
+        # modal force along the port, over what a unit force there gives
+        lent = np.sum((self.rows @ shapes) ** 2, axis=1)
+        along = shapes @ (shapes.T @ self.rows.T) / np.where(lent > 0.0, lent, 1.0)
+        largest = np.max([np.mean((item @ along) ** 2, axis=0) for item in pushed], axis=0)
+        self._squares.append(np.where(lent > 0.0, largest, (measured / FORCES) ** 2))
+        self._counts.append(len(motion.time))
+        self._follows &= lent == 0.0
+        speed = motion.velocity @ modal.T
+        self.see(motion.q @ modal.T, fitted, speed)
+        least = TURNS * np.max(np.abs(speed), axis=0)
+        self._turns |= (np.min(speed, axis=0) < -least) & (np.max(speed, axis=0) > least)
 
-    def see(self, name: str, position: FloatArray, fitted: bool, speed: FloatArray | float = 0.0) -> None:
-        """Take up where a port was, and its speed."""
-        x, v = float(np.max(np.abs(position))), float(np.max(np.abs(speed)))
-        self._sizes[name] = np.maximum(self._sizes[name], (x * fitted, x, v))
+    def see(self, position: FloatArray, fitted: bool, speed: FloatArray | None = None) -> None:
+        """Take up where the ports were (N, P), and their speeds."""
+        x = np.max(np.abs(position), axis=0)
+        v = 0.0 * x if speed is None else np.max(np.abs(speed), axis=0)
+        self._sizes = np.maximum(self._sizes, (x * fitted, x, v))
 
     def scale(self, name: str) -> PortScale:
         """Return the natural scales of a port."""
-        usual, largest, speed = self._sizes[name].tolist()
-        rig = self._open
+        rig, number = self._open, list(self._open.ports).index(name)
+        usual, largest, speed = self._sizes[:, number].tolist()
         along = (rig.ports[name] @ rig.shapes)[: rig.moving]
         frequency, weight = rig.angular_frequency[: rig.moving], along**2
         seen = weight > 1e-6 * float(weight.sum())
         amount = usual or largest or 1.0
-        table = np.array(self._forces[name]).reshape(-1, 2)
-        force = FORCES * float(np.sqrt(np.average(table[:, 1], weights=table[:, 0]))) if len(table) else 0.0
+        squares = [square[number] for square in self._squares]
+        force = FORCES * float(np.sqrt(np.average(squares, weights=self._counts))) if squares else 0.0
         if np.any(seen) and np.all(frequency[seen] > 0.0):
             first = int(np.flatnonzero(seen)[0])
             still = 1.0 / float(np.sum(weight[seen] / frequency[seen] ** 2))
-            if self._driven_only and self._follows[name] and force > 0.0 < speed:
+            if self._driven_only and self._follows[number] and force > 0.0 < speed:
                 return PortScale(
                     amount, force / amount, speed / amount, still, largest or amount, driven=True
                 )
@@ -121,7 +121,7 @@ class PortSizes:
         of_state = not np.any(rig.ports[name][: rig.displacements])
         return PortScale(
             amount, (force or 1.0) / amount, (speed or 1.0) / amount, None, largest or amount,
-            free=free, turns=self._turns[name] or not (free and self._driven_only and np.any(seen)),
+            free=free, turns=bool(self._turns[number]) or not (free and self._driven_only and np.any(seen)),
             of_state=of_state,
         )  # fmt: skip
 
@@ -143,8 +143,7 @@ def lumped_scales(
     peak, speed, weight = 0.0, 0.0, 0.0
     for trial in trials:
         if held and trial.kind in (TrialKind.STATIC, TrialKind.RINGDOWN):
-            for name, row in system.ports.items():
-                ports.see(name, lumped.held(trial) @ row, trial.is_dynamic and not trial.held_out)
+            ports.see(lumped.held(trial) @ ports.rows.T, trial.is_dynamic and not trial.held_out)
         if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
             continue
         try:

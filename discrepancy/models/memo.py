@@ -1,9 +1,9 @@
 """A model that remembers its latest responses: sensors are tried by the dozen on one motion."""
 
-from discrepancy.campaign.records import Quantity, Trial
+from discrepancy.campaign.records import Trial
 from fe.runtime.patch import ModelPatch
 
-from .interface import Conditions, Model, Response
+from .interface import Conditions, Model, Outputs, Response
 from .memory import Memory
 from .wrapped import WrappedModel
 
@@ -27,7 +27,7 @@ class MemoModel(WrappedModel):
     def respond(
         self,
         trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
+        outputs: Outputs,
         patch: ModelPatch,
         conditions: Conditions,
         *,
