@@ -13,11 +13,9 @@ from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_patch import SortedPatch
 from discrepancy.models.fmu_runs import FmuRuns
 from discrepancy.models.input_course import Course, acting_force
-from discrepancy.models.interface import Conditions
+from discrepancy.models.interface import DEFAULT_PLACE, Conditions
 
 FloatArray = NDArray[np.float64]
-
-DEFAULT_PLACE = "tip_load"
 
 
 class FmuTrials:

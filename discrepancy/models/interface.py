@@ -14,6 +14,9 @@ from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
+DEFAULT_PLACE = "tip_load"
+"""What a campaign says when it does not say where the force acts; a model with one input takes that one."""
+
 
 @dataclass(frozen=True)
 class ModelParameter:

@@ -136,11 +136,8 @@ class LumpedModel(DescribedModel):
                 )
             return self._static(trial, outputs, structure, laws, change, conditions)
         rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
-        try:
-            motion, drives = rig.moved(trial, conditions, laws, change, loads, refinement)
-            return motion.seen(rig.shown(outputs, drives, motion.acting.references))
-        except ModelError as cause:
-            raise ModelError(f"The trial {trial.name!r} of {self.name!r}: {cause}") from cause
+        motion, drives = rig.moved(trial, conditions, laws, change, loads, refinement)
+        return motion.seen(rig.shown(outputs, drives, motion.acting.references))
 
     def _static(
         self,

@@ -12,7 +12,7 @@ from scipy.linalg import eigh
 from discrepancy.campaign.records import Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.input_course import Course, Drive, FormulaCourse, acting_force
-from discrepancy.models.interface import Conditions
+from discrepancy.models.interface import DEFAULT_PLACE, Conditions
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
 from discrepancy.models.lumped_sections import InputSection
@@ -25,8 +25,6 @@ from fe.runtime.patch import PointMass, PortLoad, Primitive, RootCompliance, cou
 
 FloatArray = NDArray[np.float64]
 
-DEFAULT_PLACE = "tip_load"
-"""What a campaign says when it does not say where the force acts; a model with one input takes that one."""
 MOST_MODES = 8
 """Modes that move of a structure on springs; the others follow without inertia."""
 UNCHANGED = LoadChange()
@@ -174,7 +172,7 @@ class LumpedRig:
             drives=np.array([self.padded(self._inputs[name].vector) for name in drives]),
             actions={item.name: self.padded(item.acts) for item in description.port if item.acts is not None},
         )  # fmt: skip
-        if self._eigen is not None and description.is_plain and n <= MOST_MODES:
+        if self._eigen is not None and description.is_plain and n <= MOST_MODES and self._eigen[0][0] > 0.0:
             vars(system)["_modes"] = self._eigen  # known already
         return system
 
@@ -313,7 +311,11 @@ class LumpedRig:
             acting = replace(acting, loads=[*acting.loads, *pushed])
         if still:
             acting = replace(acting, begins=Start.STILL)
-        return system.motion(acting, laws, refinement), drives
+        try:
+            return system.motion(acting, laws, refinement), drives
+        except ModelError as cause:
+            name = self.description.name
+            raise ModelError(f"The trial {trial.name!r} of {name!r}: {cause}") from cause
 
     def _check_released(self, trial: Trial, at_ports: Sequence[PortLoad]) -> None:
         """Refuse a ring-down that the model cannot begin."""

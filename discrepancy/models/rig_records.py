@@ -54,23 +54,19 @@ class Acting:
         """Times (N,) at which the samples show the motion [s]."""
         return (1.0 + self.clock[0]) * self.time + self.clock[1]
 
-    def rows(self, base: FloatArray) -> FloatArray:
-        """Return the constant load and the rows of the others (1 + L, B) in a base (n + m, B)."""
-        return np.asarray(np.array([self.constant, *(row for row, _ in self.loads)]) @ base)
-
     def load_at(self, time: FloatArray, base: FloatArray) -> FloatArray:
-        """Return the loads (T, B) at times, those that are held as they were just before."""
+        """Return the loads (T, B) in a base (n + m, B) at times, held ones as they were just before."""
         return self.total([course.at(time) for _, course in self.loads], base, len(time))
 
     def ends(self, time: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the loads (K, B) at the begin and at the end of the steps between times (K + 1,)."""
+        """Return the loads (K, B) at the begin and the end of the steps between times (K + 1,)."""
         found = [course.ends(time) for _, course in self.loads]
         begin, end = ([pair[side] for pair in found] for side in (0, 1))
         return self.total(begin, base, len(time) - 1), self.total(end, base, len(time) - 1)
 
     def total(self, amounts: Sequence[FloatArray], base: FloatArray, count: int) -> FloatArray:
-        """Return the loads (T, B) of amounts (T,) of each."""
-        constant, *rows = self.rows(base)
+        """Return the loads (T, B) of amounts (T,) of each beside the constant one."""
+        constant, *rows = np.array([self.constant, *(row for row, _ in self.loads)]) @ base
         if not rows:
             return np.tile(constant, (count, 1))
         found: FloatArray = np.array(amounts).T @ np.array(rows)

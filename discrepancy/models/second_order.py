@@ -42,11 +42,6 @@ class Begin(NamedTuple):
 class SecondOrderSystem(LinearSystem):
     """A linear system that moves."""
 
-    @property
-    def state_count(self) -> int:
-        """How many numbers a state has: displacement and speed of each mode, and the states."""
-        return len(self.angular_frequency) + self.moving
-
     def motion(self, acting: Acting, laws: Laws, refinement: int = 1) -> Motion:
         """Return the motion of a trial; a record that the clock makes begin late is followed from its begin.
 
@@ -169,8 +164,8 @@ class SecondOrderSystem(LinearSystem):
                 q[:moving], v[moving:count] = amounts[:moving], amounts[moving:]
                 memory = None if found.memory is None else laws.filled(found.memory, acts)
         elif acting.begins is Start.UNKNOWN:
-            given = np.zeros(self.state_count)
-            given[: len(acting.initial)] = acting.initial[: self.state_count]
+            given = np.zeros(count + moving)  # displacement and speed of each mode, and the states
+            given[: len(acting.initial)] = acting.initial[: len(given)]
             q[:moving], v[:count] = given[:moving], given[moving:]
         if len(drive):
             q[count:], v[count:] = self.heaviness * drive, self.heaviness * np.array(speeds)
