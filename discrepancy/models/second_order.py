@@ -5,7 +5,6 @@ it for a `Motion`, which says what outputs show. Between the stamps the linear p
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,8 @@ from discrepancy.models.linear_system import LinearSystem, solved
 from discrepancy.models.ported import PortedSystem
 from discrepancy.models.rig_records import Acting, shown_rows
 from discrepancy.models.second_order_motion import Motion
-from discrepancy.models.stepwise import Boundaries, ExactSteps, advance, exact_steps, exponentials, substeps
+from discrepancy.models.stepwise import Begin, Boundaries, advance, exact_steps, exponentials, substeps
+from discrepancy.models.stepwise_kernel import Steps
 from fe.runtime.motion import Laws, ModalMotion, simulate
 
 FloatArray = NDArray[np.float64]
@@ -29,14 +29,6 @@ LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point less than this share of the most moving one is scaled by the share."""
 LEAST_LEAD = 1e-9
 """A first sample that is later than the begin by less than this share of the record is at the begin."""
-
-
-class Begin(NamedTuple):
-    """Modal displacements and speeds (M + P,), and the laws' memory; None: loaded from zero at once."""
-
-    q: FloatArray
-    v: FloatArray
-    memory: FloatArray | None = None
 
 
 class SecondOrderSystem(LinearSystem):
@@ -257,13 +249,10 @@ class SecondOrderSystem(LinearSystem):
         smooth = bool(acting.drives) or any(course.is_smooth for _, course in acting.loads)
         edges = (*laws.edges, *(moment for _, course in acting.loads for moment in course.edges))
         boundaries = substeps(self.modal, laws, stamps, refinement, SMOOTH_PARTS if smooth else 1, edges)
-        first, last = self._modal_forces(acting, boundaries)
-        steps = exact_steps(self.free, boundaries)
         feed = np.zeros((len(boundaries.time), len(laws)))
         if self.truncated and len(laws) and acting.loads:
             feed = acting.load_at(boundaries.time, self.residual(rows.T))
-        steps, push = self._with_drives(acting, boundaries, steps, first, last)
-        return advance(self.modal, laws, steps, boundaries, q, v, push, first, last, feed, memory)
+        return advance(self.modal, laws, self._steps(acting, boundaries, feed), begin)
 
     def _is_plain(self, acting: Acting, laws: Laws) -> bool:
         """Whether one force at most acts, straight between its samples, on modes that any steps suit."""
@@ -274,23 +263,23 @@ class SecondOrderSystem(LinearSystem):
             and all(isinstance(load, Course) and load.hold is Hold.LINEAR for _, load in acting.loads)
         )
 
-    def _with_drives(
-        self, acting: Acting, boundaries: Boundaries, steps: ExactSteps, begin: FloatArray, end: FloatArray
-    ) -> tuple[ExactSteps, FloatArray]:
-        """Return steps and push of all coordinates; the drives follow from nothing but what is prescribed."""
+    def _steps(self, acting: Acting, boundaries: Boundaries, feed: FloatArray) -> Steps:
+        """Return the steps of all coordinates; the drives follow from nothing but what is prescribed."""
+        begin, end = self._modal_forces(acting, boundaries)
+        exact, time = exact_steps(self.free, boundaries), boundaries.time
         count, whole = len(self.angular_frequency), begin.shape[1]
-        moved = steps.push(begin[:, :count], end[:, :count])
-        if not acting.drives:
-            return steps, moved
-        at = np.r_[0:count, whole : whole + count]
-        transition = np.zeros((len(steps.length), 2 * whole, 2 * whole))
-        transition[:, at[:, None], at] = steps.transition
-        push = np.zeros((len(begin), 2 * whole))
-        push[:, at] = moved
+        transition, push = exact.transition, exact.push(begin[:, :count], end[:, :count])
+        if acting.drives:
+            at, moved = np.r_[0:count, whole : whole + count], push
+            transition, push = (
+                np.zeros((len(transition), 2 * whole, 2 * whole)),
+                np.zeros((len(push), 2 * whole)),
+            )
+            transition[:, at[:, None], at], push[:, at] = exact.transition, moved
         for number, drive in enumerate(acting.drives):
             for first, order in ((count, 0), (whole + count, 1)):
-                push[:, first + number] = self.heaviness * drive.at(boundaries.time[1:], order)
-        return ExactSteps(steps.length, steps.which, transition, steps.begin, steps.end), push
+                push[:, first + number] = self.heaviness * drive.at(time[1:], order)
+        return Steps(transition, exact.length, exact.which, push, begin, end, feed, time, boundaries.sample)
 
     def _modal_forces(self, acting: Acting, boundaries: Boundaries) -> tuple[FloatArray, FloatArray]:
         """Return the modal forces (K, M + P) at both ends of each step, those of splines made good for it.

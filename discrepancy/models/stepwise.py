@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from discrepancy.models.compiled_motion import compiled_steps
 from discrepancy.models.memory import Memory
-from discrepancy.models.stepwise_kernel import Structure
+from discrepancy.models.stepwise_kernel import Steps, Structure
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import FASTEST_PHASE, SLOWEST_PHASE, Laws, ModalMotion, port_flexibility
 from fe.runtime.motion_arrays import Samples, State
@@ -229,25 +229,21 @@ def _boundaries(time: FloatArray, parts: IntArray) -> Boundaries:
     return Boundaries(moments, sample, lengths)
 
 
-def advance(
-    system: CoupledModes,
-    laws: Laws,
-    steps: ExactSteps,
-    boundaries: Boundaries,
-    q: FloatArray,
-    v: FloatArray,
-    push: FloatArray,
-    begin: FloatArray,
-    end: FloatArray,
-    feed: FloatArray,
-    memory: FloatArray | None,
-) -> ModalMotion:
-    """Return the motion at the stamps of known steps; for arguments see `Steps` and `ModalMotion`.
+class Begin(NamedTuple):
+    """Modal displacements and speeds (M + P,), and the laws' memory; None: loaded from zero at once."""
+
+    q: FloatArray
+    v: FloatArray
+    memory: FloatArray | None = None
+
+
+def advance(system: CoupledModes, laws: Laws, steps: Steps, begin: Begin) -> ModalMotion:
+    """Return the motion at the samples of known steps.
 
     Where laws begin or end, a new section does: modes and the laws that go on keep their state, a law that
     begins has been loaded from zero to where its port is.
     """
-    modes, count = len(q), len(boundaries.sample)
+    (q, v, memory), modes, count = begin, len(begin.q), len(steps.sample)
     result = ModalMotion(
         np.empty((count, modes)), np.empty((count, modes)), np.empty((count, len(laws))),
         laws.memory() if memory is None else memory.copy(), np.empty((count, len(laws))),
@@ -257,7 +253,7 @@ def advance(
     acts = laws.rows(system.actions, modes) if system.actions else rows
     flexibility = port_flexibility(system, laws)
     before = np.ones(len(laws), dtype=bool)
-    for section in _sections(laws, boundaries):
+    for section in _sections(laws, steps):
         first, last = section.first, section.last
         now = section.acts[:, None]
         ports = laws.at(rows * now, flexibility, system.relaxation, np.zeros((2, len(laws))), acts * now)
@@ -266,10 +262,10 @@ def advance(
         moving = started & (laws.of_speed == 1)
         state.memory[moving, 1] = rows[moving] @ state.q
         state.current[:] = 0.0
-        between = slice(first, last)
+        between = (steps.which, steps.push, steps.begin, steps.end)
         arrays = (
-            steps.transition, steps.length, steps.which[between], push[between], begin[between], end[between],
-            feed[first : last + 1], boundaries.time[first : last + 1],
+            steps.transition, steps.length, *(item[first:last] for item in between),
+            steps.feed[first : last + 1], steps.time[first : last + 1],
         )  # fmt: skip
         given = (*(np.ascontiguousarray(item) for item in arrays), section.record)  # fields of `Steps`
         structure = Structure(
@@ -302,23 +298,21 @@ class _Section(NamedTuple):
     samples: IntArray | slice
 
 
-def _sections(laws: Laws, boundaries: Boundaries) -> Iterator[_Section]:
+def _sections(laws: Laws, steps: Steps) -> Iterator[_Section]:
     """Yield the sections; one where all laws always act. A stamp at an edge belongs to what begins there."""
-    time, count = boundaries.time, len(boundaries.lengths)
+    time, sample, count = steps.time, steps.sample, len(steps.which)
     if not laws.spans:
         every = slice(None)
-        yield _Section(0, count, np.ones(len(laws), dtype=bool), boundaries.sample, every, every)
+        yield _Section(0, count, np.ones(len(laws), dtype=bool), sample, every, every)
         return
     inside = np.array([moment for moment in laws.edges if time[0] < moment < time[-1]])
     cuts = np.unique(np.concatenate(([0, count], np.searchsorted(time, inside)))).tolist()
     for first, last in pairwise(cuts):
-        own = (boundaries.sample >= first) & (
-            (boundaries.sample < last) | ((boundaries.sample == last) & (last == count))
-        )
-        sample = boundaries.sample[own] - first
-        record = np.unique(np.concatenate(([0], sample, [last - first]))).astype(np.int64)
+        own = (sample >= first) & ((sample < last) | ((sample == last) & (last == count)))
+        kept = sample[own] - first
+        record = np.unique(np.concatenate(([0], kept, [last - first]))).astype(np.int64)
         acts = laws.act_at(0.5 * float(time[first] + time[first + 1]))
-        yield _Section(first, last, acts, record, np.searchsorted(record, sample), np.flatnonzero(own))
+        yield _Section(first, last, acts, record, np.searchsorted(record, kept), np.flatnonzero(own))
 
 
 def _substeps(system: CoupledModes, laws: Laws, lengths: FloatArray) -> IntArray:
