@@ -235,7 +235,7 @@ class SecondOrderSystem(LinearSystem):
         """Return the motion at stamps from a state at the first of them."""
         q, v, memory = begin
         shapes, rows = self.shapes, self.port_rows(laws)
-        if self._is_plain(acting, laws) and is_even(stamps) and len(stamps) > 1:
+        if self._is_plain(acting, laws) and (len(stamps) == 1 or is_even(stamps)):
             force, shape, feed = np.zeros(len(stamps)), np.zeros(len(q)), np.zeros((2, len(laws)))
             for row, course in acting.loads:
                 force, shape = course.at(stamps), row @ shapes
@@ -243,8 +243,8 @@ class SecondOrderSystem(LinearSystem):
                     feed[0] = rows @ self.residual(row)
             return simulate(
                 self.modal, laws, q=q, v=v, memory=memory, force=force, shape=shape, feed=feed,
-                interval=float(stamps[-1] - stamps[0]) / (len(stamps) - 1), start=float(stamps[0]),
-                refinement=refinement, kernel=compiled_kernel(),
+                interval=float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1) or 1.0,
+                start=float(stamps[0]), refinement=refinement, kernel=compiled_kernel(),
             )  # fmt: skip
         smooth = bool(acting.drives) or any(course.is_smooth for _, course in acting.loads)
         edges = (*laws.edges, *(moment for _, course in acting.loads for moment in course.edges))

@@ -77,7 +77,7 @@ def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
 @pytest.mark.parametrize("laws", [(), (COULOMB,), (QUADRATIC, CUBIC)])
 def test_even_stamps_are_those_of_the_even_stepper(laws: tuple[Primitive, ...]) -> None:
     ports = {"joint": np.array([0.7, -1.1])}
-    system = SecondOrderSystem(np.eye(2), np.diag([0.1, 0.4]), np.diag([81.0, 961.0]), ports, 2)
+    system = SecondOrderSystem(np.eye(2), np.diag([0.1, 0.4]), np.diag([81.0, 961.0]), ports)
     internal = laws_of(ModelPatch(laws), system.ports) if laws else NO_LAWS
     time, shape = 0.01 * np.arange(300), np.array([0.4, 0.9])
     force = np.random.default_rng(0).normal(size=300)
