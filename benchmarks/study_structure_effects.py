@@ -150,7 +150,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             moved = system.ringdown(end, release, initial, time, laws)
             values = moved.response(rows, quantities).values
         else:
-            values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws) @ rows.T
+            values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws).values @ rows.T
         for column, (name, quantity) in enumerate(zip(names, quantities, strict=True)):
             values[:, column] = hidden.readings(name, time, values[:, column])
             values[:, column] += NOISE[quantity] * random.standard_normal(len(time))

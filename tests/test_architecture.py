@@ -67,7 +67,6 @@ LONGER: dict[str, str] = {
         "Newton's method within the halving of its steps shares its arrays throughout, compiled as one."
     ),
     "discrepancy/workflow.py:investigate": "The whole way, one stage after the other.",
-    "discrepancy/models/fmu.py:scales": "One scale after the other, each from those before.",
     "discrepancy/models/fmu_runs.py:_made_binding": "One binding, its tables in the order of the file.",
     "fmu_asset/slaves/table.py:structure_table": "A table: one call a variable.",
 }

@@ -10,6 +10,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
+from discrepancy.models.interface import Response
 from discrepancy.models.sensing import observe_response
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
@@ -135,7 +136,7 @@ class Columns:
                 pace = pace - np.outer(force, trial.system.actions[port])
             slope = rates + (pace @ trial.system.outputs.T)[:: trial.parts] / gains
         conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(shared), local)
-        with_it = observe_response(problem.campaign, data.trial, sensors, conditions, true, slope)
+        with_it = observe_response(problem.campaign, data.trial, sensors, conditions, Response(true, slope))
         changed = with_it.values - true
         rate, zero = clock_of(sensors)
         if slope is not None:

@@ -1,6 +1,7 @@
 """Any FMU with a binding as a model: its inputs loaded, its outputs read, internal forces at its ports."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu_excitation import State
+from discrepancy.models.fmu_excitation import Run, State
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_patch import NOTHING, SortedPatch, carries, sorted_patch
@@ -16,20 +17,25 @@ from discrepancy.models.fmu_ports import SAFE_TURN
 from discrepancy.models.fmu_rest import port_flexibility, rest_with_laws
 from discrepancy.models.fmu_runs import FmuRuns
 from discrepancy.models.fmu_samples import sampled
-from discrepancy.models.fmu_trials import DEFAULT_PLACE, FmuTrials
+from discrepancy.models.fmu_trials import FmuTrials
 from discrepancy.models.interface import (
     Conditions,
-    ModelParameter,
+    Outputs,
     PortScale,
     Response,
     Scales,
+    campaign_sizes,
+    check_outputs,
+    check_parameters,
     check_plain,
+    prior_mean,
 )
+from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.port_system import PortSystem
 from discrepancy.models.ported import NO_PATCH, PortedSystem
+from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import ModelPatch, Primitive
 from fmu_asset.errors import FmuError
-from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -37,7 +43,7 @@ FINER = (1, 2, 4, 8, 16)
 """Refinements of the step at which the system of the ports is looked for."""
 
 
-class FmuModel:
+class FmuModel(DescribedModel):
     """An FMU (`discrepancy.models.interface.Model`).
 
     Parameters
@@ -59,16 +65,12 @@ class FmuModel:
     """
 
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
-        self.description = description
+        self.description: FmuModelDescription = description
         self.runs = FmuRuns(description, Path(folder))
-        self._parameters = tuple(
-            ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
-            for item in description.parameter
-        )
-        self._ports = tuple(port.name for port in description.port)
+        super().__init__(description.name, description.parameter, description.port, self.runs.quantities)
         self._trials = FmuTrials(description, self.runs)
         self._check_settings()
-        means = Conditions(np.array([item.mean for item in self._parameters]))
+        means = Conditions(np.array([item.mean for item in self.parameters]))
         nominal = self._trials.state(_any_trial(TrialKind.RINGDOWN, 1.0), means, (), 0)
         self.motion = FmuMotion(description, self.runs, nominal)
 
@@ -116,27 +118,9 @@ class FmuModel:
 
     # ------------------------------------------------------------ what it is
 
-    @property
-    def name(self) -> str:
-        """Name for people."""
-        return self.description.name
-
-    @property
-    def parameters(self) -> tuple[ModelParameter, ...]:
-        """Calibrated parameters."""
-        return self._parameters
-
-    def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if the model has no such output."""
-        return self.runs.quantities.get(output)
-
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
         return carries(self.description, primitive)
-
-    def ports(self) -> tuple[str, ...]:
-        """Names of the ports."""
-        return self._ports
 
     def stations(self) -> tuple[float, float] | None:
         """Return 0 and the length [m] if the file states one, else None."""
@@ -145,80 +129,59 @@ class FmuModel:
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
-        given = self.description.scales
-        values = np.array([campaign.parameters.get(p.name, (p.mean, 0.0))[0] for p in self._parameters])
-        dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
-        still = [trial for trial in campaign.trials if not trial.is_dynamic]
-        largest = dict.fromkeys(self._ports, 0.0)
-        port_columns = [self.runs.columns[f"port.{port}.displacement"] for port in self._ports]
+        given, conditions = self.description.scales, Conditions(prior_mean(campaign, self.parameters))
+        largest = np.zeros(len(self.ports()))
         for trial in campaign.trials:
-            state = self._trials.state(trial, Conditions(values), (), 0)
             if trial.is_dynamic:
-                moved = self._free(trial, Conditions(values), state, NOTHING, 1)[0]
+                moved = self.motion.free(self._trials.run(trial, conditions, NOTHING, self.motion, 1))
             else:
-                moved = self._at_rest_values(trial, Conditions(values, health=trial.health), NOTHING)
-            for port, column in zip(self._ports, port_columns, strict=True):
-                largest[port] = max(largest[port], float(np.max(np.abs(moved[:, column]))))
-        frequency = given.angular_frequency
-        seen: dict[str, tuple[float, float]] = {}  # modal and static stiffness
-        if dynamic:
-            trial = dynamic[0]
-            state = self._trials.state(trial, Conditions(values), (), 0)
-            step = self.motion.step(trial, 1)
-            seen = {
-                port: self.motion.ports.stiffness(number, state, step)
-                for number, port in enumerate(self._ports)
-            }
-            frequency = frequency or self.motion.measured_frequency(trial, state)
-        else:
-            some = still[0] if still else _any_trial(TrialKind.STATIC, 1.0)
-            state = self._trials.state(some, Conditions(values, health=some.health), (), 0)
-            for number, port in enumerate(self._ports):
-                flexible = float(
-                    port_flexibility(self.motion, self.description, self.runs, state)[number, number]
-                )
-                seen[port] = (1.0 / flexible, 1.0 / flexible)
-            if not still and frequency is None:
-                interval = 0.01
-                for _ in range(3):  # until the interval suits the frequency
-                    trial = _any_trial(TrialKind.RINGDOWN, interval)
-                    frequency = self.motion.measured_frequency(
-                        trial, self._trials.state(trial, Conditions(values), (), 0)
-                    )
-                    interval = 0.3 / frequency
-        frequency = frequency or 1.0
-        at_force = next(
-            (
-                p.name
-                for p in self.description.port
-                if self.runs.variable(p.force) in self._trials.forces and p.name in seen
-            ),
-            None,
-        )
-        tip, modal = seen.get(at_force, (1.0, 1.0)) if at_force else next(iter(seen.values()), (1.0, 1.0))
-        moments = [t.start + t.time if t.is_dynamic else t.time for t in campaign.trials]
-        span = float(max(map(np.max, moments)) - min(map(np.min, moments))) if moments else 0.0
+                moved = self._at_rest_values(trial, replace(conditions, health=trial.health), NOTHING)
+            largest = np.maximum(largest, np.max(np.abs(moved[:, self.motion.ports.x]), axis=0))
+        stiffness, frequency = self._stiffness(campaign, conditions)
+        forces = zip(self.motion.ports.forces, stiffness, strict=True)
+        pushed = [pair for force, pair in forces if force in self._trials.forces]
+        modal, tip = (pushed or stiffness or [(1.0, 1.0)])[0]
+        frequency = given.angular_frequency or frequency or 1.0
         return Scales(
             length=given.length or 1.0,
-            tip_stiffness=given.tip_stiffness or modal,
-            modal_mass=given.modal_mass or tip / frequency**2,
+            tip_stiffness=given.tip_stiffness or tip,
+            modal_mass=given.modal_mass or modal / frequency**2,
             angular_frequency=frequency,
-            force=max((float(np.max(np.abs(t.force))) for t in campaign.trials), default=0.0),
-            load_factor=max((float(np.max(np.abs(t.load_factor))) for t in campaign.trials), default=0.0),
-            duration=max((float(t.time[-1] - t.time[0]) for t in dynamic), default=1.0),
-            campaign_time=span if span > 0.0 else 1.0,
+            **campaign_sizes(campaign),
             ports={
-                port: PortScale(largest[port] or 1.0, seen[port][0], frequency, seen[port][1])
-                for port in self._ports
+                port: PortScale(float(most) or 1.0, own[0], frequency, own[1])
+                for port, most, own in zip(self.ports(), largest, stiffness, strict=True)
             },
         )
+
+    def _stiffness(
+        self, campaign: Campaign, conditions: Conditions
+    ) -> tuple[list[tuple[float, float]], float | None]:
+        """Return modal and static stiffness at each port, and the frequency if the FMU was asked for it."""
+        given, ports = self.description.scales.angular_frequency, range(len(self.ports()))
+        for trial in campaign.trials:
+            if trial.is_dynamic:
+                state = self._trials.state(trial, conditions, (), 0)
+                step = self.motion.step(trial, 1)
+                found = [self.motion.ports.stiffness(number, state, step) for number in ports]
+                return found, given or self.motion.measured_frequency(trial, state)
+        still = campaign.trials[0] if campaign.trials else _any_trial(TrialKind.STATIC, 1.0)
+        state = self._trials.state(still, replace(conditions, health=still.health), (), 0)
+        flexible = port_flexibility(self.motion, state)
+        frequency, interval = given, 0.01
+        for _ in range(0 if campaign.trials or given else 3):  # until the interval suits the frequency
+            trial = _any_trial(TrialKind.RINGDOWN, interval)
+            state = self._trials.state(trial, conditions, (), 0)
+            frequency = self.motion.measured_frequency(trial, state)
+            interval = 0.3 / frequency
+        return [(1.0 / float(flexible[port, port]),) * 2 for port in ports], frequency
 
     # ------------------------------------------------------------ response
 
     def respond(
         self,
         trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
+        outputs: Outputs,
         patch: ModelPatch,
         conditions: Conditions,
         *,
@@ -230,11 +193,7 @@ class FmuModel:
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
         check_plain(trial, f"the FMU model {self.name!r}")
-        if conditions.parameters.shape != (len(self._parameters),):
-            raise ModelError(
-                f"The FMU model {self.name!r} has {counted(len(self._parameters), 'parameter')}, but "
-                f"{conditions.parameters.size} came."
-            )
+        check_parameters(f"The FMU model {self.name!r}", self.parameters, conditions.parameters)
         columns = self._columns(outputs)
         parts = sorted_patch(patch, self.description)
         if not trial.is_dynamic:
@@ -243,8 +202,7 @@ class FmuModel:
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
             return Response(self._at_rest_values(trial, conditions, parts)[:, columns])
-        state = self._trials.state(trial, conditions, parts.settings, 0)
-        values, step = self._moving(trial, conditions, state, parts, refinement, columns)
+        values, step = self._moving(trial, conditions, parts, refinement, columns)
         rate, zero = conditions.clock
         quantities = self.runs.quantities
         derivatives = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
@@ -254,37 +212,24 @@ class FmuModel:
         self,
         trial: Trial,
         conditions: Conditions,
-        state: State,
         patch: SortedPatch,
-        refinement: int,
-        columns: Sequence[int],
+        refinement: int = 1,
+        columns: Sequence[int] = (),
     ) -> tuple[FloatArray, float]:
         """Return all outputs (K, C) on the grid of the communication step [s], and the step."""
-        if not len(patch.laws):
-            return self._free(trial, conditions, state, patch, refinement)
-        return self.motion.with_laws(
-            patch.laws,
-            lambda refined: self._trials.excitations(trial, conditions, patch, self.motion, refined),
-            trial,
-            state,
-            refinement,
-            columns,
-        )
 
-    def _free(
-        self, trial: Trial, conditions: Conditions, state: State, patch: SortedPatch, refinement: int
-    ) -> tuple[FloatArray, float]:
-        step, steps, loads = self._trials.excitations(trial, conditions, patch, self.motion, refinement)
-        return self.motion.free(state, step, steps, loads), step
+        def excite(refined: int) -> Run:
+            return self._trials.run(trial, conditions, patch, self.motion, refined)
+
+        if len(patch.laws):
+            return self.motion.with_laws(patch.laws, excite, trial, refinement, columns)
+        run = excite(refinement)
+        return self.motion.free(run), run.step
 
     # ------------------------------------------------------------ ports
 
     def ported(
-        self,
-        trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
-        parameters: FloatArray,
-        patch: ModelPatch = NO_PATCH,
+        self, trial: Trial, outputs: Outputs, parameters: FloatArray, patch: ModelPatch = NO_PATCH
     ) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the state of that of the prior means.
 
@@ -293,7 +238,7 @@ class FmuModel:
         ModelError
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
-        means = np.array([item.mean for item in self._parameters])
+        means = np.array([item.mean for item in self.parameters])
         settings = sorted_patch(patch, self.description).settings
         base, found = (self._port_system(trial, values, settings) for values in (means, parameters))
         if base is None or found is None or len(base.transition) != len(found.transition):
@@ -304,7 +249,7 @@ class FmuModel:
         quantities = self.runs.quantities
         orders = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
         shown = list(zip(self._columns(outputs), orders, strict=True))
-        return found.in_state_of(base).ported(self._ports, self.motion.ports.x, self.motion.ports.v, shown)
+        return found.in_state_of(base).ported(self.ports(), self.motion.ports.x, self.motion.ports.v, shown)
 
     def _port_system(
         self, trial: Trial, parameters: FloatArray, settings: tuple[tuple[str, float], ...]
@@ -314,7 +259,7 @@ class FmuModel:
         state = self._trials.state(trial, conditions, settings, 0)
         for refinement in FINER:
             step = self.motion.step(trial, refinement)
-            found = self.motion.ports.system(state, step, len(trial.time)) if self._ports else None
+            found = self.motion.ports.system(state, step, len(trial.time)) if self.ports() else None
             if found is None or found.largest_turn <= SAFE_TURN:
                 return found
         return None
@@ -323,12 +268,11 @@ class FmuModel:
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
     ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        parts = sorted_patch(patch, self.description)
-        state = self._trials.state(trial, conditions, parts.settings, 0)
-        values, step = self._free(trial, conditions, state, parts, 1)
+        parts = sorted_patch(patch, self.description)._replace(laws=NO_LAWS)
+        values, step = self._moving(trial, conditions, parts)
         rate, zero = conditions.clock
         moved = values[:, self.motion.ports.x]
-        found = sampled(moved, step, (1.0 + rate) * trial.time + zero, [0] * len(self._ports))
+        found = sampled(moved, step, (1.0 + rate) * trial.time + zero, [0] * len(self.ports()))
         assert found.rates is not None  # of a motion there are
         return found.values, found.rates
 
@@ -342,7 +286,7 @@ class FmuModel:
             return np.stack(
                 [self._rest(trial, row, *held) for row, held in enumerate(zip(states, loads, strict=True))]
             )
-        return rest_with_laws(self.motion, self.description, self.runs, trial.name, states, loads, patch.laws)
+        return rest_with_laws(self.motion, trial.name, states, loads, patch.laws)
 
     def _rest(self, trial: Trial, row: int, state: State, loads: dict[str, float]) -> FloatArray:
         """Return all outputs (C,) of a row; what the FMU refuses is said with its place."""
@@ -354,29 +298,10 @@ class FmuModel:
     # ------------------------------------------------------------ parts
 
     def _columns(self, outputs: Sequence[tuple[str, Quantity]]) -> list[int]:
-        columns = []
-        for output, quantity in outputs:
-            own = self.output_quantity(output)
-            if own is None:
-                raise ModelError(
-                    f"The FMU model {self.name!r} has no output {output!r}; it has "
-                    f"{', '.join(self.runs.quantities)}."
-                )
-            if not quantity.shows(own):
-                raise ModelError(
-                    f"The output {output!r} of {self.name!r} is a {own.value}, but a channel measures "
-                    f"{quantity.value}."
-                )
-            columns.append(self.runs.columns[output])
-        return columns
+        check_outputs(f"The FMU model {self.name!r}", self.runs.quantities, outputs)
+        return [self.runs.columns[output] for output, _ in outputs]
 
 
 def _any_trial(kind: TrialKind, interval: float) -> Trial:
     """Return a trial that asks for nothing, for scales without a campaign."""
-    count = 1 if kind is TrialKind.STATIC else 400
-    zeros, empty = np.zeros(count), np.zeros((count, 0))
-    time = np.asarray(interval * np.arange(count), dtype=np.float64)
-    return Trial(
-        "", kind, (), empty, empty.astype(bool), time, zeros, zeros, DEFAULT_PLACE, zeros,
-        0.0, "", np.zeros((1, 2)), np.zeros((1, 2)),
-    )  # fmt: skip
+    return Trial.plain("", kind, (), interval * np.arange(1.0 if kind is TrialKind.STATIC else 400.0))

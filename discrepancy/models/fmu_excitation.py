@@ -3,6 +3,7 @@
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,3 +49,12 @@ class Excitation:
 
 Loads = Sequence[tuple[Excitation, float]]
 """Excitations with their factors."""
+
+
+class Run(NamedTuple):
+    """A motion that is asked of an FMU: in which state, communication step [s], how many, what excites it."""
+
+    state: State
+    step: float
+    steps: int
+    loads: Loads

@@ -1,6 +1,7 @@
 """Rest and motion of an FMU: superposed where it proves to be linear, stepped with the laws where not."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import partial
 from math import ceil, log2
 
 import numpy as np
@@ -9,11 +10,12 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu_excitation import Excitation, Loads, State
+from discrepancy.models.fmu_excitation import Excitation, Loads, Run, State
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_ports import LINEAR, FmuPorts
 from discrepancy.models.fmu_runs import FmuRuns, is_affine
-from discrepancy.models.port_coupling import LawStepper, PortMotion, coupled_motion
+from discrepancy.models.port_coupling import LawStepper, coupled_motion
+from discrepancy.models.port_system import PortSystem
 from fe.runtime.motion import Laws
 from fmu_asset.door.session import FmiAsset
 
@@ -26,7 +28,8 @@ CONVERGED = 1e-4
 MOST_REFINEMENT = 64
 """Steps that do not converge at this refinement are given up."""
 
-Excite = Callable[[int], tuple[float, int, list[tuple[Excitation, float]]]]
+Excite = Callable[[int], Run]
+"""The run of a trial with steps that are so many times smaller."""
 
 
 class FmuMotion:
@@ -44,10 +47,9 @@ class FmuMotion:
 
     def __init__(self, description: FmuModelDescription, runs: FmuRuns, nominal: State) -> None:
         self.nominal = nominal
-        self._description, self._runs = description, runs
+        self.description, self._runs = description, runs
         self._ports = description.port
         self.ports = FmuPorts(description, runs, self._run)
-        self._zero_inputs = dict.fromkeys(runs.asset.binding.load, 0.0)
         self._linear: dict[Hashable, bool] = {}
         self._units: dict[Hashable, float] = {}
         self._refinements: dict[Hashable, tuple[int, float]] = {}
@@ -67,14 +69,14 @@ class FmuMotion:
             names = [part.name for part, _ in parts]
             return self._rest(state, dict(zip(names, values, strict=True)))
 
-        if not self._description.static.settle:
+        if not self.description.static.settle:
             key = ("rest", state, tuple(sorted(given.items())))
             return self._runs.remembered(key, lambda: answer([value for _, value in parts]))
         return self._superposed(("rest", state), answer, parts)
 
     def _rest(self, state: State, loads: Mapping[str, float]) -> FloatArray:
-        table = self._description.static
-        inputs = self._zero_inputs | dict(state.inputs) | dict(loads)
+        table = self.description.static
+        inputs = self._runs.inputs(state, loads)
         if table.settle:
             return self._runs.started(table.step, dict(state.parameters), inputs, settle=True)[1]
         only = State(state.parameters, ())
@@ -88,8 +90,8 @@ class FmuMotion:
 
     def step(self, trial: Trial, refinement: int) -> float:
         """Return the communication step [s] of a dynamic trial: a whole part of its sampling interval."""
-        if self._description.motion.step is not None:
-            return self._description.motion.step
+        if self.description.motion.step is not None:
+            return self.description.motion.step
         frequency = self.angular_frequency(trial)
         return trial.interval / (ceil(frequency * trial.interval / PHASE[trial.kind]) * refinement)
 
@@ -98,8 +100,8 @@ class FmuMotion:
 
         That of the nominal state, so that steps do not change while parameters are fitted.
         """
-        if self._description.scales.angular_frequency is not None:
-            return self._description.scales.angular_frequency
+        if self.description.scales.angular_frequency is not None:
+            return self.description.scales.angular_frequency
         key = (trial.interval, len(trial.time))
         if key not in self._frequencies:
             self._frequencies[key] = self.measured_frequency(trial, self.nominal)
@@ -107,55 +109,51 @@ class FmuMotion:
 
     def measured_frequency(self, trial: Trial, state: State) -> float:
         """Return what `angular_frequency` does, measured in a state at a trial's interval."""
-        step = self._description.motion.step or trial.interval
+        step = self.description.motion.step or trial.interval
         system = self.ports.system(state, step, len(trial.time)) if self._ports else None
         if system is not None:
             frequency, shape = system.modes(system.outputs[self.ports.x[0]], 0)
             if len(frequency):
                 return float(frequency[np.argmax(shape / frequency**2)])
-        way = self._description.release
+        way = self.description.release
         if way is not None:
             kind = "displacement" if way.displacement is not None else "hold"
             size = trial.release.displacement if trial.release is not None else 1e-3
             loads: Loads = [(Excitation(kind), size)]
         else:
-            name = self.ports.forces[0] if self.ports.forces else next(iter(self._zero_inputs))
+            name = self.ports.forces[0] if self.ports.forces else next(iter(self._runs.asset.binding.load))
             loads = [(Excitation("input", name, np.eye(1, len(trial.time)).ravel()), 1.0)]
-        values = self.free(state, step, len(trial.time), loads)
+        values = self.free(Run(state, step, len(trial.time), loads))
         moving = values - values[-len(values) // 4 :].mean(axis=0)
         spectrum = np.abs(np.fft.rfft(moving * np.hanning(len(moving))[:, None], 4 * len(moving), axis=0))
         if not np.any(spectrum):
             raise ModelError(
-                f"The FMU model {self._description.name!r} does not move; state angular_frequency in "
-                "[scales]."
+                f"The FMU model {self.description.name!r} does not move; state angular_frequency in [scales]."
             )
         best = int(np.argmax(spectrum[:, np.argmax(spectrum.max(axis=0))]))
         return 2.0 * np.pi * max(best, 1) / (4 * len(moving) * step)
 
-    def free(self, state: State, step: float, steps: int, loads: Loads) -> FloatArray:
+    def free(self, run: Run) -> FloatArray:
         """Return the outputs (steps + 1, C) without laws."""
-        given = [(part, value) for part, value in loads if value != 0.0]
+        given = [(part, value) for part, value in run.loads if value != 0.0]
         parts = [part for part, _ in given]
         return self._superposed(
-            ("free", state, step, steps),
-            lambda values: self._run(state, step, steps, list(zip(parts, values, strict=True))),
+            ("free", *run[:3]),
+            lambda values: self._run(run._replace(loads=list(zip(parts, values, strict=True)))),
             given,
         )
 
-    def _run(self, state: State, step: float, steps: int, loads: Loads) -> FloatArray:
-        asset, first, histories = self._begin(state, step, steps, loads)
-        return np.vstack((first, self._runs.advanced(asset, histories, steps)))
+    def _run(self, run: Run) -> FloatArray:
+        asset, first, histories = self._begin(run)
+        return np.vstack((first, self._runs.advanced(asset, histories, run.steps)))
 
-    def _begin(
-        self, state: State, step: float, steps: int, loads: Loads
-    ) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
+    def _begin(self, run: Run) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
         """Return an instance at the begin of a motion, its outputs there, and the inputs (steps,) to come."""
+        state, step, steps, loads = run
         parameters = dict(state.parameters)
-        histories: dict[str, FloatArray] = {
-            name: np.full(steps, value) for name, value in (self._zero_inputs | dict(state.inputs)).items()
-        }
+        histories = {name: np.full(steps, value) for name, value in self._runs.inputs(state).items()}
         held: dict[str, float] = {}
-        way = self._description.release
+        way = self.description.release
         for part, value in loads:
             if part.kind in ("displacement", "velocity"):
                 amount = value if part.kind == "velocity" else self._released(state, step, value)
@@ -167,11 +165,8 @@ class FmuMotion:
             else:
                 histories[part.name][: len(part.series)] += value * part.series[:steps]
                 held[part.name] = held.get(part.name, 0.0) + value * part.begin
-        inputs = self._zero_inputs | dict(state.inputs)
-        for name, value in held.items():
-            inputs[name] = inputs.get(name, 0.0) + value
         settle = any(value != 0.0 for value in held.values())
-        asset, first = self._runs.started(step, parameters, inputs, settle=settle)
+        asset, first = self._runs.started(step, parameters, self._runs.inputs(state, held), settle=settle)
         return asset, first, histories
 
     def _released(self, state: State, step: float, displacement: float) -> float:
@@ -182,22 +177,21 @@ class FmuMotion:
         ModelError
             If there is none.
         """
-        way = self._description.release
+        way = self.description.release
         assert way is not None
         if way.output is None:
             return displacement
         column = self._runs.columns["release"]
-        inputs = self._zero_inputs | dict(state.inputs)
-        parameters = dict(state.parameters)
 
         def shown(amount: float) -> float:
             def start() -> FloatArray:
+                parameters, held = dict(state.parameters), {}
                 if way.hold is not None:
-                    name = self._runs.variable(way.hold)
-                    given = inputs | {name: inputs[name] + amount}
-                    return self._runs.started(step, parameters, given, settle=True)[1]
-                key = self._runs.parameter(str(way.displacement))
-                return self._runs.started(step, parameters | {key: amount}, inputs, settle=False)[1]
+                    held = {self._runs.variable(way.hold): amount}
+                else:
+                    parameters[self._runs.parameter(str(way.displacement))] = amount
+                inputs = self._runs.inputs(state, held)
+                return self._runs.started(step, parameters, inputs, settle=bool(held))[1]
 
             return float(self._runs.remembered(("released", state, amount), start)[column])
 
@@ -222,33 +216,29 @@ class FmuMotion:
             return amount
         raise ModelError(
             f"Nothing that [release] names puts {way.output!r} of the FMU model "
-            f"{self._description.name!r} at {displacement:g} m; correct displacement, hold or output there."
+            f"{self.description.name!r} at {displacement:g} m; correct displacement, hold or output there."
         )
 
     def _superposed(
-        self, key: Hashable, answer: Callable[[Sequence[float]], FloatArray], loads: Loads
+        self, key: tuple[Hashable, ...], answer: Callable[[Sequence[float]], FloatArray], loads: Loads
     ) -> FloatArray:
         """Return the answer to loads, put together from answers to units where that is proven to be right."""
-        names = tuple((part.kind, part.name) for part, _ in loads)
-        kind = (key[0], names) if isinstance(key, tuple) else names
+        kind = (key[0], tuple((part.kind, part.name) for part, _ in loads))
 
         def asked(values: Sequence[float]) -> FloatArray:
             full = (key, tuple((part.key, value) for (part, _), value in zip(loads, values, strict=True)))
             return self._runs.remembered(full, lambda: answer(values))
 
-        if not loads or not self._description.superposition or self._linear.get(kind) is False:
+        if not loads or not self.description.superposition or self._linear.get(kind) is False:
             return asked([value for _, value in loads])
         units = [
             self._units.setdefault((part.kind, part.name), 2.0 ** round(log2(abs(value))))
             for part, value in loads
         ]
 
-        def unit(number: int, factor: float = 1.0) -> FloatArray:
-            part = loads[number][0]
-            full = (key, "unit", part.key, factor)
-            return self._runs.remembered(
-                full, lambda: answer([factor * units[k] * (k == number) for k in range(len(loads))])
-            )
+        def unit(number: int) -> FloatArray:
+            one = [size * (k == number) for k, size in enumerate(units)]
+            return self._runs.remembered((key, "unit", loads[number][0].key), lambda: answer(one))
 
         parts = [unit(number) for number in range(len(loads))]
         if self._silent.get(kind):  # an FMU that shows nothing without excitation, at any parameters
@@ -269,7 +259,7 @@ class FmuMotion:
     # ------------------------------------------------------------ laws
 
     def with_laws(
-        self, laws: Laws, excite: Excite, trial: Trial, state: State, refinement: int, seen: Sequence[int]
+        self, laws: Laws, excite: Excite, trial: Trial, refinement: int, seen: Sequence[int]
     ) -> tuple[FloatArray, float]:
         """Return the outputs (K, C) of a dynamic trial with laws at ports, and the step [s].
 
@@ -282,9 +272,9 @@ class FmuMotion:
         ModelError
             If the steps do not converge.
         """
-        if self._description.motion.step is not None:
-            step, steps, loads = excite(1)
-            return self._coupled(laws, state, step, steps, loads), step
+        if self.description.motion.step is not None:
+            run = excite(1)
+            return self._coupled(laws, run), run.step
         strength = float(np.max(np.abs(laws.values[:, 0])))
         exponents = np.round(np.clip(laws.values[:, 1:3], -9.0, 9.0), 1)  # what is rough needs shorter steps
         watched = sorted({*seen, *self.ports.x})
@@ -298,20 +288,17 @@ class FmuMotion:
         )
         known, tried = self._refinements.get(key, (1, 0.0))
         if strength > 2.0 * tried:
-            known = self._converged(laws, excite, state, known, watched)
+            known = self._converged(laws, excite, known, watched)
             self._refinements[key] = (known, strength)
         refinement *= known
-        step, steps, loads = excite(refinement)
-        return self._coupled(laws, state, step, steps, loads, refinement), step
+        run = excite(refinement)
+        return self._coupled(laws, run, refinement), run.step
 
-    def _converged(self, laws: Laws, excite: Excite, state: State, begin: int, watched: Sequence[int]) -> int:
-        refinement, change, coarse = begin, np.inf, None
+    def _converged(self, laws: Laws, excite: Excite, begin: int, watched: Sequence[int]) -> int:
+        refinement, change, coarse = begin, np.inf, self._coupled(laws, excite(begin), begin)
         while refinement <= MOST_REFINEMENT:
-            step, steps, loads = excite(refinement)
-            if coarse is None:
-                coarse = self._coupled(laws, state, step, steps, loads, refinement)
-            step, steps, loads = excite(2 * refinement)
-            fine = self._coupled(laws, state, step, steps, loads, 2 * refinement)
+            run = excite(2 * refinement)
+            fine = self._coupled(laws, run, 2 * refinement)
             shared = fine[::2, watched][: len(coarse)]
             with np.errstate(all="ignore"):  # an unstable coupling grows beyond all numbers
                 size = np.max(np.abs(shared - shared.mean(axis=0)), axis=0)
@@ -324,109 +311,87 @@ class FmuMotion:
             refinement, coarse = 2 * refinement, fine
         raise ModelError(
             f"The internal force at {', '.join(dict.fromkeys(laws.ports))} does not converge in the "
-            f"co-simulation with the FMU model {self._description.name!r}: halving steps of "
-            f"{2.0 * step:.2g} s still changes the motion by {change:.1g} of its size; the force is too "
+            f"co-simulation with the FMU model {self.description.name!r}: halving steps of "
+            f"{2.0 * run.step:.2g} s still changes the motion by {change:.1g} of its size; the force is too "
             f"stiff for the port."
         )
 
-    def _coupled(
-        self, laws: Laws, state: State, step: float, steps: int, loads: Loads, refinement: int = 1
-    ) -> FloatArray:
-        free = self._refined_free(state, step, steps, loads, refinement)
+    def _coupled(self, laws: Laws, run: Run, refinement: int = 1) -> FloatArray:
+        free = self._refined_free(run, refinement)
         port_of = [[port.name for port in self._ports].index(name) for name in laws.ports]
-        system = self.ports.system(state, step, steps, refinement)
+        system = self.ports.system(run.state, run.step, run.steps, refinement)
         if system is None:
-            return self._stepped(laws, port_of, state, step, steps, loads, free)
-        x_rows, x_direct = system.outputs[self.ports.x], system.direct[self.ports.x]
-        v_rows, v_direct = x_rows @ system.generator, np.zeros_like(x_direct)
-        key = ("velocity", state, step, steps, tuple((part.key, value) for part, value in loads))
-        grid = step * np.arange(steps + 1)
+            return self._stepped(laws, port_of, run, free)
+        key = ("velocity", *run[:3], tuple((part.key, value) for part, value in run.loads))
+        grid = run.step * np.arange(run.steps + 1)
         velocity = self._runs.remembered(
             key, lambda: np.asarray(CubicSpline(grid, free[:, self.ports.x])(grid, 1))
         ).copy()
         for number, column in enumerate(self.ports.v):
             if column >= 0:
-                v_rows[number], v_direct[number] = system.outputs[column], system.direct[column]
                 velocity[:, number] = free[:, column]
-        gain = v_rows @ system.drive + v_direct
-        motion = PortMotion(free[:, self.ports.x], velocity, gain)
+        rows = system.port_rows(self.ports.x, self.ports.v)
         with np.errstate(all="ignore"):
-            states, applied = coupled_motion(
-                system, motion, x_rows, x_direct, v_rows, v_direct, laws, port_of
-            )
+            states, applied = coupled_motion(system, rows, free[:, self.ports.x], velocity, laws, port_of)
             return free + system.seen(states, applied)
 
-    def _refined_free(
-        self, state: State, step: float, steps: int, loads: Loads, refinement: int
-    ) -> FloatArray:
+    def _refined_free(self, run: Run, refinement: int) -> FloatArray:
         """Return the free motion with small steps; of a release by the ports' system if that has it all."""
-        loads = [(part, value) for part, value in loads if value != 0.0]
-        kind = tuple(part.kind for part, _ in loads)
-        kind_names = tuple((part.kind, part.name) for part, _ in loads)
-        released = all(name in ("displacement", "velocity", "hold") for name in kind)
-        fine = self.ports.system(state, step, steps, refinement)
-        parts = self.ports.parts(step * refinement)
-        ratio, larger = refinement // parts, step * refinement / parts
+        loads = [(part, value) for part, value in run.loads if value != 0.0]
+        kind = tuple((part.kind, part.name) for part, _ in loads)
+        fine = self.ports.system(run.state, run.step, run.steps, refinement)
+        parts = self.ports.parts(run.step * refinement)
+        ratio = refinement // parts
         possible = (
-            fine is not None
-            and ratio > 1
-            and released
+            all(name in ("displacement", "velocity", "hold") for name, _ in kind)
             and self.ports.quiet
-            and self._linear.get(("free", kind_names)) is True
+            and self._linear.get(("free", kind)) is True
+            and self._free_linear.get(kind, True)
         )
-        if not possible or not self._free_linear.get(kind, True):
-            return self.free(state, step, steps, loads)
-        result = np.zeros(0)
+        if fine is None or ratio < 2 or not loads or not possible:
+            return self.free(run)
+        larger = run._replace(step=run.step * refinement / parts, steps=ceil(run.steps / ratio))
+        moved = []
         for part, value in loads:
             size = self._units[part.kind, part.name]
-
-            def moved(part: Excitation = part, size: float = size) -> FloatArray:
-                base = self.ports.system(state, larger, ceil(steps / ratio), parts)
-                if base is None:
-                    return np.zeros(0)
-                coarse = self.free(state, larger, ceil(steps / ratio), [(part, size)])
-                start = base.start_of(coarse, LINEAR)
-                if start is None or fine is None:
-                    return np.zeros(0)
-                return np.vstack((coarse[:1], fine.free(start, steps)[1:]))
-
-            unit = self._runs.remembered(("refined", state, step, steps, refinement, part.key, size), moved)
+            one = larger._replace(loads=[(part, size)])
+            unit = self._runs.remembered(
+                ("refined", *run[:3], refinement, part.key, size),
+                partial(self._continued, one, fine, run.steps, parts),
+            )
             if not len(unit):
                 self._free_linear[kind] = False
-                return self.free(state, step, steps, loads)
-            result = value / size * unit if not len(result) else result + value / size * unit
-        if len(result):
-            return result
-        return self.free(state, step, steps, loads)
+                return self.free(run)
+            moved.append(value / size * unit)
+        return np.asarray(sum(moved))
 
-    def _stepped(
-        self,
-        laws: Laws,
-        port_of: list[int],
-        state: State,
-        step: float,
-        steps: int,
-        loads: Loads,
-        free: FloatArray,
-    ) -> FloatArray:
+    def _continued(self, larger: Run, fine: PortSystem, steps: int, parts: int) -> FloatArray:
+        """Return a release by the system of small steps, from its own with larger ones; else nothing."""
+        base = self.ports.system(larger.state, larger.step, larger.steps, parts)
+        coarse = self.free(larger)
+        start = None if base is None else base.start_of(coarse, LINEAR)
+        return np.zeros(0) if start is None else np.vstack((coarse[:1], fine.free(start, steps)[1:]))
+
+    def _stepped(self, laws: Laws, port_of: list[int], run: Run, free: FloatArray) -> FloatArray:
         """Return the outputs of the FMU stepped with the laws beside it."""
         without = [self._ports[p].name for p in port_of if self.ports.v[p] < 0]
         if without:
             raise ModelError(
-                f"The FMU model {self._description.name!r} is not linear, so its port {without[0]!r} needs a "
+                f"The FMU model {self.description.name!r} is not linear, so its port {without[0]!r} needs a "
                 f"velocity output; name it in [[port]]."
             )
-        key = ("gain", state, step)
-        gain = self._runs.remembered(key, lambda: self.ports.records(state, step, 1)[0])[self.ports.v]
-        push = (free[1] - free[0])[self.ports.v] / step
-        stepper = LawStepper(laws, port_of, gain, step, free[0, self.ports.x], push)
-        asset, first, histories = self._begin(state, step, steps, loads)
-        values = np.empty((steps + 1, len(first)))
+        gain = self._runs.remembered(
+            ("gain", *run[:2]), lambda: self.ports.records(run.state, run.step, 1)[0]
+        )[self.ports.v]
+        push = (free[1] - free[0])[self.ports.v] / run.step
+        stepper = LawStepper(laws, port_of, gain, run.step, free[0, self.ports.x], push)
+        asset, first, histories = self._begin(run)
+        values = np.empty((run.steps + 1, len(first)))
         values[0] = first
         names = list(histories)
         rows = np.column_stack([histories[name] for name in names])
         at = [names.index(name) for name in self.ports.forces]
-        for k in range(steps):
+        for k in range(run.steps):
             now = rows[k].copy()
             np.add.at(now, at, stepper.forces(values[k, self.ports.x], values[k, self.ports.v]))
             values[k + 1] = self._runs.stepped(asset, dict(zip(names, now.tolist(), strict=True)))

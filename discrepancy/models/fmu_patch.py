@@ -1,6 +1,6 @@
 """What of a patch an FMU carries itself, what acts at its ports, and what changes the loads that it gets."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
@@ -17,8 +17,7 @@ from fe.runtime.patch import (
 )
 
 
-@dataclass(frozen=True)
-class SortedPatch:
+class SortedPatch(NamedTuple):
     """A patch by what is done with it.
 
     Attributes

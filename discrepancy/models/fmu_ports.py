@@ -1,19 +1,18 @@
 """What forces at the ports of an FMU do; as a system of its own where the FMU proves to be linear."""
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.models.fmu_excitation import Excitation, Loads, State
+from discrepancy.models.fmu_excitation import Excitation, Run, State
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_runs import FmuRuns
+from discrepancy.models.memory import Memory
 from discrepancy.models.port_system import PortSystem, port_system
 
 FloatArray = NDArray[np.float64]
-Run = Callable[[State, float, int, Loads], FloatArray]
 
 LINEAR = 1e-6
 """Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""
@@ -34,7 +33,7 @@ class FmuPorts:
     runs : FmuRuns
         Its FMU.
     run : callable
-        Takes a state, a step [s], the number of steps and excitations; returns the outputs (steps + 1, C).
+        Takes a `Run`; returns the outputs (steps + 1, C).
 
     Attributes
     ----------
@@ -46,7 +45,9 @@ class FmuPorts:
         Whether the FMU was seen to show nothing without excitation.
     """
 
-    def __init__(self, description: FmuModelDescription, runs: FmuRuns, run: Run) -> None:
+    def __init__(
+        self, description: FmuModelDescription, runs: FmuRuns, run: Callable[[Run], FloatArray]
+    ) -> None:
         self._description, self._runs, self._run = description, runs, run
         self._ports = description.port
         self.forces = [runs.variable(port.force) for port in self._ports]
@@ -55,8 +56,7 @@ class FmuPorts:
         self.quiet = False
         self._parts: dict[float, int] = {}
         self._confirmed_to: dict[float, int] = {}
-        self._zero_inputs = dict.fromkeys(runs.asset.binding.load, 0.0)
-        self._systems: OrderedDict[Hashable, PortSystem | None] = OrderedDict()
+        self._systems = Memory(KEPT_SYSTEMS)
         self._linear: bool | None = None
 
     def parts(self, whole: float) -> int:
@@ -73,10 +73,9 @@ class FmuPorts:
         """
         if not self._description.superposition or self._linear is False:
             return None
-        key = (state, step)
-        if key in self._systems:
-            self._systems.move_to_end(key)
-            return self._systems[key]
+        return self._systems.get((state, step), lambda: self._found(state, step, steps, refinement))
+
+    def _found(self, state: State, step: float, steps: int, refinement: int) -> PortSystem | None:
         system = self._from_larger(state, step, steps, refinement)
         if system is None:
             count = max(min(steps, RECORD), 64)
@@ -84,9 +83,6 @@ class FmuPorts:
             if system is not None and self._linear is None:
                 self._linear = self._confirmed(system, state, step, count)
                 system = system if self._linear else None
-        self._systems[key] = system
-        if len(self._systems) > KEPT_SYSTEMS:
-            self._systems.popitem(last=False)
         return system
 
     def _from_larger(self, state: State, step: float, steps: int, refinement: int) -> PortSystem | None:
@@ -109,32 +105,33 @@ class FmuPorts:
         self._confirmed_to[base.step] = max(ratio, known)
         return finer
 
-    def _size(self, number: int) -> float:
+    def size(self, number: int) -> float:
+        """Return a force at a port that its input can have."""
         return min(1.0, 0.1 * self._runs.input_limit(self._ports[number].force))
 
     def records(self, state: State, step: float, count: int) -> FloatArray:
         """Return the outputs (count, C, P) after unit forces over the first step, less those without."""
         zero: FloatArray | float = 0.0
         if not self.quiet:
-            zero = self._run(state, step, count, [])
+            zero = self._run(Run(state, step, count, []))
             self.quiet = not np.any(zero)
         pulse = np.eye(1, count).ravel()
         parts = []
         for number, name in enumerate(self.forces):
-            size = self._size(number)
-            moved = self._run(state, step, count, [(Excitation("input", name, pulse), size)])
+            size = self.size(number)
+            moved = self._run(Run(state, step, count, [(Excitation("input", name, pulse), size)]))
             parts.append((moved - zero)[1:] / size)
         return np.stack(parts, axis=2)
 
     def _confirmed(self, system: PortSystem, state: State, step: float, count: int) -> bool:
         """Whether the FMU answers to many forces as the system says that was made of single ones."""
         signs = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self._ports)))
-        sizes = np.array([self._size(number) for number in range(len(self._ports))])
+        sizes = np.array([self.size(number) for number in range(len(self._ports))])
         loads = [
             (Excitation("input", name, signs[:, number].copy()), float(sizes[number]))
             for number, name in enumerate(self.forces)
         ]
-        moved = self._run(state, step, count, loads) - self._run(state, step, count, [])
+        moved = self._run(Run(state, step, count, loads)) - self._run(Run(state, step, count, []))
         expected = system.motion(signs * sizes)
         error = np.max(np.abs(moved - expected), axis=0)
         return bool(np.all(error <= LINEAR * np.max(np.abs(moved), axis=0) + 1e-300))
@@ -144,16 +141,13 @@ class FmuPorts:
         system = self.system(state, step, RECORD)
         column = self.x[number]
         if system is None:
-            size = self._size(number)
-            inputs = self._zero_inputs | dict(state.inputs)
-            still = [
-                self._runs.started(
-                    step, dict(state.parameters),
-                    inputs | {self.forces[number]: inputs[self.forces[number]] + force}, settle=True,
-                )[1][column]
-                for force in (0.0, size)
-            ]  # fmt: skip
-            stiffness = size / float(still[1] - still[0])
+            size = self.size(number)
+            still = []
+            for force in (0.0, size):
+                inputs = self._runs.inputs(state, {self.forces[number]: force})
+                found = self._runs.started(step, dict(state.parameters), inputs, settle=True)[1]
+                still.append(float(found[column]))
+            stiffness = size / (still[1] - still[0])
             return stiffness, stiffness
         at_rest = 1.0 / float(system.gain()[column, number])
         frequency, shape = system.modes(system.outputs[column], number)

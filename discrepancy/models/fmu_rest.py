@@ -6,9 +6,7 @@ from numpy.typing import NDArray
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.fmu_excitation import State
-from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
-from discrepancy.models.fmu_runs import FmuRuns
 from fe.runtime.errors import SolutionError
 from fe.runtime.motion import Laws, static_solution
 
@@ -19,13 +17,7 @@ STATIC_TOLERANCE = 1e-9
 
 
 def rest_with_laws(
-    motion: FmuMotion,
-    description: FmuModelDescription,
-    runs: FmuRuns,
-    trial: str,
-    states: list[State],
-    loads: list[dict[str, float]],
-    laws: Laws,
+    motion: FmuMotion, trial: str, states: list[State], loads: list[dict[str, float]], laws: Laws
 ) -> FloatArray:
     """Return all outputs (N, C) where laws follow the load path; the FMU itself is asked at the end.
 
@@ -34,15 +26,14 @@ def rest_with_laws(
     ModelError
         If the law has no solution, or the FMU does not confirm it.
     """
-    ports = [port.name for port in description.port]
-    index = [ports.index(port) for port in laws.ports]
-    columns = [runs.columns[f"port.{ports[p]}.displacement"] for p in index]
-    inputs = [runs.variable(description.port[p].force) for p in index]
-    values = np.empty((len(states), max(runs.columns.values()) + 1))
+    names, ports, found = [port.name for port in motion.description.port], motion.ports, []
+    name = motion.description.name
+    index = [names.index(port) for port in laws.ports]
+    columns, inputs = np.array(ports.x)[index], [ports.forces[number] for number in index]
     memory: FloatArray | None = None
     before = np.zeros(len(laws))
     for row, (state, load) in enumerate(zip(states, loads, strict=True)):
-        compliance = port_flexibility(motion, description, runs, state)[np.ix_(index, index)]
+        compliance = port_flexibility(motion, state)[np.ix_(index, index)]
         linear = motion.rest(state, load)[columns]
         for _ in range(STATIC_ITERATIONS):
             try:
@@ -53,34 +44,31 @@ def rest_with_laws(
                 raise ModelError(str(cause)) from cause
             forces = solution.forces[0]
             given = dict(load)
-            for name, force in zip(inputs, forces, strict=True):
-                given[name] = given.get(name, 0.0) - float(force)
-            values[row] = motion.rest(state, given)
+            for at, force in zip(inputs, forces, strict=True):
+                given[at] = given.get(at, 0.0) - float(force)
+            values = motion.rest(state, given)
             # where the FMU is not linear, the law is solved again about the point that was reached
-            again = values[row, columns] + compliance @ forces
+            again = values[columns] + compliance @ forces
             change = np.max(np.abs(again - linear))
             linear = again
             if change <= STATIC_TOLERANCE * max(np.max(np.abs(again)), 1e-300):
                 break
         else:
             raise ModelError(
-                f"The law at {', '.join(dict.fromkeys(laws.ports))} and the FMU model {description.name!r} "
+                f"The law at {', '.join(dict.fromkeys(laws.ports))} and the FMU model {name!r} "
                 f"did not agree at load level {row + 1} of {trial!r} within {STATIC_ITERATIONS} "
                 f"iterations; the force is too strong for the FMU."
             )
         memory, before = solution.memory, linear
-    return values
+        found.append(values)
+    return np.array(found)
 
 
-def port_flexibility(
-    motion: FmuMotion, description: FmuModelDescription, runs: FmuRuns, state: State
-) -> FloatArray:
+def port_flexibility(motion: FmuMotion, state: State) -> FloatArray:
     """Return the displacements (P, P) of the ports at rest under unit forces at each."""
-    columns = [runs.columns[f"port.{port.name}.displacement"] for port in description.port]
-    zero = motion.rest(state, {})[columns]
-    result = np.empty((len(columns), len(columns)))
-    for number, port in enumerate(description.port):
-        name = runs.variable(port.force)
-        size = min(1.0, 0.1 * runs.input_limit(port.force))
-        result[:, number] = (motion.rest(state, {name: size})[columns] - zero) / size
-    return result
+    ports, zero = motion.ports, motion.rest(state, {})
+    moved = []
+    for number, name in enumerate(ports.forces):
+        size = ports.size(number)
+        moved.append((motion.rest(state, {name: size}) - zero)[ports.x] / size)
+    return np.array(moved).T

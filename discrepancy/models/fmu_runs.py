@@ -4,6 +4,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from math import pi
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
+from discrepancy.models.fmu_excitation import State
 from discrepancy.models.fmu_file import FmuModelDescription
+from discrepancy.models.memory import Memory
 from fmu_asset.door.binding import Binding, Input, Parameter, Vector, expand, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuError
@@ -61,8 +64,7 @@ class FmuRuns:
         self._description = description
         self._path = folder / description.fmu
         self._assets: OrderedDict[float, FmiAsset] = OrderedDict()
-        self._kept: OrderedDict[Hashable, FloatArray] = OrderedDict()
-        self._kept_bytes = 0
+        self._kept = Memory(KEPT_BYTES, lambda found: found.nbytes)
         self.run_count = self.step_count = 0
         try:
             self._base = self._base_binding(folder)
@@ -70,6 +72,7 @@ class FmuRuns:
             self._first = FmiAsset(self._path, self._binding, isolated=description.isolated)
         except FmuError as cause:
             raise ModelError(f"The FMU model {description.name!r}: {cause}") from cause
+        self._none = dict.fromkeys(self._first.binding.load, 0.0)
 
     # ------------------------------------------------------------ names
 
@@ -117,18 +120,18 @@ class FmuRuns:
             if name is not None:
                 variable = self.variable(name)
                 inputs[variable] = Input(variable=variable, unit=unit)
-        parameters: dict[str, Parameter] = {}
-        if base is not None:
-            parameters = {
-                key: Parameter(variable=item.variable, unit=item.unit, value=item.value)
-                for key, item in base.parameter.items()
-            }
-        own = [(item.variable or item.name, item.unit) for item in given.parameter]
-        if given.release is not None and given.release.displacement is not None:
-            own.append((given.release.displacement, "m"))
-        if given.release is not None and given.release.velocity is not None:
-            own.append((given.release.velocity, "m/s"))
+        parameters = {
+            key: Parameter(variable=item.variable, unit=item.unit, value=item.value)
+            for key, item in (base.parameter if base is not None else {}).items()
+        }
+        own: list[tuple[str | None, str]] = [
+            (item.variable or item.name, item.unit) for item in given.parameter
+        ]
+        if given.release is not None:
+            own += [(given.release.displacement, "m"), (given.release.velocity, "m/s")]
         for name, unit in own:
+            if name is None:
+                continue
             key = self.parameter(name)
             known = parameters.get(key)
             parameters[key] = Parameter(
@@ -137,8 +140,11 @@ class FmuRuns:
                 value=None if known is None or known.unit != unit else known.value,
             )
         columns: dict[tuple[str, str], int] = {}
-        self.columns = {}
-        self.quantities = {}
+        self.columns, self.quantities = dict[str, int](), dict[str, Quantity]()
+
+        def column(variable: str, unit: str) -> int:
+            return columns.setdefault((self.variable(variable), unit), len(columns))
+
         for item in given.output:
             names = expand(item.name)
             variables = expand(item.variable or item.name)
@@ -149,19 +155,16 @@ class FmuRuns:
                 )
             for name, variable in zip(names, variables, strict=True):
                 unit = "" if item.quantity is Quantity.SIGNAL else _si(item.quantity)
-                at = columns.setdefault((self.variable(variable), unit), len(columns))
-                self.columns[name], self.quantities[name] = at, item.quantity
+                self.columns[name], self.quantities[name] = column(variable, unit), item.quantity
         for port in given.port:
             for quantity, name, unit in (
                 ("displacement", port.displacement, "rad" if port.rotation else "m"),
                 ("velocity", port.velocity, "rad/s" if port.rotation else "m/s"),
             ):
                 if name is not None:
-                    at = columns.setdefault((self.variable(name), unit), len(columns))
-                    self.columns[f"port.{port.name}.{quantity}"] = at
+                    self.columns[f"port.{port.name}.{quantity}"] = column(name, unit)
         if given.release is not None and given.release.output is not None:
-            at = columns.setdefault((self.variable(given.release.output), "m"), len(columns))
-            self.columns["release"] = at
+            self.columns["release"] = column(given.release.output, "m")
         header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
         header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
         content: dict[str, Any] = {"binding": header, "load": inputs, "parameter": parameters}
@@ -189,17 +192,13 @@ class FmuRuns:
 
     def remembered(self, key: Hashable, make: Callable[[], FloatArray]) -> FloatArray:
         """Return what `make` returned for `key`; the oldest results are forgotten."""
-        found = self._kept.get(key)
-        if found is not None:
-            self._kept.move_to_end(key)
+
+        def made() -> FloatArray:
+            found = make()
+            found.setflags(write=False)
             return found
-        found = make()
-        found.setflags(write=False)
-        self._kept[key] = found
-        self._kept_bytes += found.nbytes
-        while self._kept_bytes > KEPT_BYTES and len(self._kept) > 1:
-            self._kept_bytes -= self._kept.popitem(last=False)[1].nbytes
-        return found
+
+        return self._kept.get(key, made)
 
     def open(self, step: float) -> FmiAsset:
         """Return the instance of a step size [s], as it was left."""
@@ -218,6 +217,13 @@ class FmuRuns:
         """End all instances; they are opened again when they are needed."""
         while self._assets:
             self._assets.popitem()[1].close()
+
+    def inputs(self, state: State, more: Mapping[str, float] = MappingProxyType({})) -> dict[str, float]:
+        """Return all inputs in a state, by the FMU's names, with more on some of them."""
+        found = {**self._none, **dict(state.inputs)}
+        for name, value in more.items():
+            found[name] = found.get(name, 0.0) + value
+        return found
 
     def started(
         self, step: float, parameters: Mapping[str, float], inputs: Mapping[str, float], *, settle: bool

@@ -7,17 +7,15 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu_excitation import Excitation, State
+from discrepancy.models.fmu_excitation import Excitation, Run, State
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_patch import SortedPatch
 from discrepancy.models.fmu_runs import FmuRuns
 from discrepancy.models.input_course import Course, acting_force
-from discrepancy.models.interface import Conditions
+from discrepancy.models.interface import DEFAULT_PLACE, Conditions
 
 FloatArray = NDArray[np.float64]
-
-DEFAULT_PLACE = "tip_load"
 
 
 class FmuTrials:
@@ -42,18 +40,20 @@ class FmuTrials:
         """The FMU's inputs of applied forces."""
         return tuple(self._forces.values())
 
-    def excitations(
+    def run(
         self, trial: Trial, conditions: Conditions, patch: SortedPatch, motion: FmuMotion, refinement: int
-    ) -> tuple[float, int, list[tuple[Excitation, float]]]:
-        """Return step, number of steps, and what excites the FMU, each with its factor."""
+    ) -> Run:
+        """Return the run by which the FMU follows a dynamic trial."""
         step = motion.step(trial, refinement)
         rate, zero = conditions.clock
         end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
         # a little longer, so that a clock that is being fitted does not ask for another run
         steps = ceil(end / step * (1.0 + 2e-9) - 1e-6) + (0 if (rate, zero) == (0.0, 0.0) else 1)
         if trial.kind is TrialKind.RINGDOWN:
-            return step, steps, self._release(trial, conditions, motion)
-        return step, steps, self._forced(trial, patch, step, steps)
+            loads = self._release(trial, conditions, motion)
+        else:
+            loads = self._forced(trial, patch, step, steps)
+        return Run(self.state(trial, conditions, patch.settings, 0), step, steps, loads)
 
     def _release(
         self, trial: Trial, conditions: Conditions, motion: FmuMotion

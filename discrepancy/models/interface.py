@@ -1,6 +1,6 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from fe.runtime.patch import ModelPatch, Primitive
+from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
+
+DEFAULT_PLACE = "tip_load"
+"""What a campaign says when it does not say where the force acts; a model with one input takes that one."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,20 @@ class Scales:
     ports: Mapping[str, PortScale]
 
 
+def campaign_sizes(campaign: Campaign) -> dict[str, float]:
+    """Return what `Scales` has of the campaign alone: force, load factor, duration and campaign time."""
+    trials = campaign.trials
+    moments = [trial.start + trial.time if trial.is_dynamic else trial.time for trial in trials]
+    span = float(max(map(np.max, moments)) - min(map(np.min, moments))) if moments else 0.0
+    lengths = (float(trial.time[-1] - trial.time[0]) for trial in trials if trial.is_dynamic)
+    return {
+        "force": max((float(np.max(np.abs(trial.force))) for trial in trials), default=0.0),
+        "load_factor": max((float(np.max(np.abs(trial.load_factor))) for trial in trials), default=0.0),
+        "duration": max(lengths, default=1.0),
+        "campaign_time": span or 1.0,
+    }
+
+
 @dataclass(frozen=True)
 class Conditions:
     """All that a response depends on besides trial and patch.
@@ -177,6 +195,10 @@ class Response:
     shear: FloatArray | None = None
 
 
+Outputs = tuple[tuple[str, Quantity], ...]
+"""Outputs, and the quantity wanted of each."""
+
+
 class Model(Protocol):
     """A model that can be patched."""
 
@@ -206,7 +228,7 @@ class Model(Protocol):
     def respond(
         self,
         trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
+        outputs: Outputs,
         patch: ModelPatch,
         conditions: Conditions,
         *,
@@ -241,6 +263,31 @@ class Model(Protocol):
         ModelError
             If the model lacks an output or cannot carry a primitive.
         """
+
+
+def prior_mean(campaign: Campaign, parameters: Sequence[ModelParameter]) -> FloatArray:
+    """Return the means (P,) of parameters, those of the campaign where it says them."""
+    return np.array([campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in parameters])
+
+
+def check_parameters(what: str, parameters: Sequence[ModelParameter], values: FloatArray) -> None:
+    """Refuse values of another number than a model, `what`, has parameters."""
+    if values.shape != (len(parameters),):
+        raise ModelError(f"{what} has {counted(len(parameters), 'parameter')}, but {values.size} came.")
+
+
+def check_outputs(
+    what: str, quantities: Mapping[str, Quantity], outputs: Sequence[tuple[str, Quantity]]
+) -> None:
+    """Refuse outputs that a model, `what`, does not have, and such as a channel cannot measure."""
+    for output, quantity in outputs:
+        own = quantities.get(output)
+        if own is None:
+            raise ModelError(f"{what} has no output {output!r}; it has {', '.join(quantities)}.")
+        if not quantity.shows(own):
+            raise ModelError(
+                f"{what}: the output {output!r} is a {own.value}, but a channel measures {quantity.value}."
+            )
 
 
 def check_no_inputs(trial: Trial, what: str) -> None:

@@ -12,7 +12,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.input_course import Course
 from discrepancy.models.lumped_file import GAINS
 from discrepancy.models.lumped_sections import ControllerSection
-from discrepancy.models.rig_records import Effort
+from discrepancy.models.rig_records import Load, Shown
 
 FloatArray = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class Loop:
             damping[self.state, n:] += self.sees[n:]
             damping[:, self.state] -= integral * self.acts
 
-    def loads(self, trial: Trial, item: RecordedInput, offset: float) -> list[tuple[FloatArray, Course]]:
+    def loads(self, trial: Trial, item: RecordedInput, offset: float) -> list[Load]:
         """Return what a recorded reference does, as loads.
 
         Raises
@@ -76,7 +76,7 @@ class Loop:
                 f"{trial.name!r} records its reference {item.name!r} as {item.quantity.value}."
             )
         course = Course.of(trial.time, item.values + offset, item.hold)
-        found = [(self.gains[0] * self.acts, course)]
+        found: list[Load] = [(self.gains[0] * self.acts, course)]
         if self._follows_slopes:
             found.append((self.gains[1] * self.acts, _slope(course, trial, section)))
         if self.state is not None:
@@ -87,19 +87,18 @@ class Loop:
     def _follows_slopes(self) -> bool:
         return self.gains[1] != 0.0 and self.section.derivative_of == "error"
 
-    def effort(self, loads: Sequence[tuple[FloatArray, Course]]) -> Effort:
+    def effort(self, loads: Sequence[Load]) -> Shown:
         """Return what it gives, from the `loads` of its reference (none where there is no reference)."""
-        n = self.displacements
-        by_u, by_speed, by_x = np.zeros((3, len(self.acts)))
+        n, row, speed = self.displacements, np.zeros(len(self.acts)), np.zeros(len(self.acts))
         proportional, derivative, integral = self.gains
-        (by_speed if self.of_speed else by_u)[:n] -= proportional * self.sees[:n]
-        by_speed[:n] -= derivative * self.sees[:n]
-        by_x[n:] -= proportional * self.sees[n:]
+        (speed if self.of_speed else row)[:n] -= proportional * self.sees[:n]
+        speed[:n] -= derivative * self.sees[:n]
+        row[n:] -= proportional * self.sees[n:]
         if self.state is not None:
-            by_x[self.state] += integral
+            row[self.state] += integral
         along = self.acts / float(self.acts @ self.acts)
-        courses = tuple((float(row @ along), course) for row, course in loads if row @ along != 0.0)
-        return Effort(by_u[:n], by_speed[:n], by_x[n:], courses)
+        courses = tuple((float(push @ along), course) for push, course in loads if push @ along != 0.0)
+        return Shown(row, speed=speed[:n], courses=courses)
 
 
 def _slope(course: Course, trial: Trial, section: ControllerSection) -> Course:

@@ -1,6 +1,7 @@
 """A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -27,6 +28,7 @@ from discrepancy.models.lumped_sections import (
     ScaledParameter,
 )
 from discrepancy.models.model_file import ModelDescription, Positive, check_unique
+from discrepancy.models.rig_records import order_of
 from fe.runtime.patch import ModelPatch
 from reporting.section import checked
 from reporting.toml_file import read_toml
@@ -94,7 +96,7 @@ class LumpedDescription(ModelDescription):
         """States m of first order."""
         return len(self.capacity)
 
-    @property
+    @cached_property
     def is_plain(self) -> bool:
         """Whether it is a structure at rest on springs under one force at a time."""
         motion = any(item.quantity.moving or item.through for item in self.input)
@@ -108,18 +110,20 @@ class LumpedDescription(ModelDescription):
         self._check_matrices()
         if self.is_plain and not self.input:
             raise ValueError("[[input]] is missing: at least one force must be able to act")
-        for kind, items in (
-            ("input", self.input),
-            ("output", self.output),
-            ("port", self.port),
-            ("place", self.place),
-            ("load", self.load),
-            ("controller", self.controller),
-        ):
-            self._check_vectors(kind, items)
-        self._check_laws_and_controllers()
-        self._check_root_and_ratios()
-        self._check_parameters()
+        for kind in ("input", "output", "port", "place", "load", "controller"):
+            for item in getattr(self, kind):
+                self._check_vectors(kind, item)
+        for port in self.port:
+            self._check_flow(port)
+        for item in self.controller:
+            self._check_controller(item)
+        n = self.size
+        if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
+            raise ValueError(f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
+        if self.damping is not None and self.damping.ratios is not None and len(self.damping.ratios) != n:
+            came = counted(len(self.damping.ratios), "value")
+            raise ValueError(f"damping.ratios needs one value for each mode, {n} in all, but {came} came")
+        self._check_names()
         return self
 
     def _check_matrices(self) -> None:
@@ -129,21 +133,18 @@ class LumpedDescription(ModelDescription):
             raise ValueError("mass is missing (or capacity, of states of first order)")
         if n and not (self.stiffness or self.stiffness_part or self.free):
             raise ValueError("stiffness is missing: give it, or [[stiffness_part]], or say `free = true`")
-        second = [("stiffness", self.stiffness)] if self.stiffness else []
-        second += [(f"{kind} {part.name!r}", part.matrix) for kind, part in self._parts_of("mass")]
         if n and self.damping is None and not self.free:
             raise ValueError("'damping' is missing")
-        if self.damping is not None and self.damping.matrix is not None:
-            second.append(("damping.matrix", self.damping.matrix))
-        first = [("conductance", self.conductance)] if self.conductance or not self.conductance_part else []
-        first += [(f"{kind} {part.name!r}", part.matrix) for kind, part in self._parts_of("capacity")]
-        for reference, count, matrices in (("mass", n, second), ("capacity", m, first)):
-            if count:
-                matrices = [(reference, getattr(self, reference)), *matrices]
-            for where, content in matrices if count else ():
+        given = [(name, getattr(self, name)) for name in ("mass", "stiffness", "capacity", "conductance")]
+        given.append(("damping.matrix", (self.damping and self.damping.matrix) or ()))
+        given += [(f"{kind} {part.name!r}", part.matrix) for kind in _PARTS for part in getattr(self, kind)]
+        for where, content in given:
+            count, reference = (m, "capacity") if where.startswith(_OF_STATES) else (n, "mass")
+            needed = where == "conductance" and m and not self.conductance_part
+            if content and not count:
+                raise ValueError(f"{where} is there, but {reference} is missing")
+            if content or needed:
                 _check_matrix(where, content, count, reference)
-            if not count and any(len(content) for _, content in matrices):
-                raise ValueError(f"{matrices[0][0]} is there, but {reference} is missing")
         for where, loose in (("mass", ""), ("capacity", ""), ("stiffness", _LOOSE)):
             whole = self.whole(where)
             least, most = np.linalg.eigvalsh(whole)[[0, -1]] if len(whole) else (1.0, 1.0)
@@ -154,12 +155,8 @@ class LumpedDescription(ModelDescription):
             ("force_of_states", n, m), ("flow_of_speeds", m, n), ("flow_of_displacements", m, n),
         ):  # fmt: skip
             content = getattr(self.coupling, name)
-            if content is not None and _shape(content) != (rows, columns):
+            if content is not None and np.atleast_2d(np.array(content)).shape != (rows, columns):
                 raise ValueError(f"coupling.{name} must be a {rows} x {columns} matrix by rows")
-
-    def _parts_of(self, reference: str) -> list[tuple[str, PartSection]]:
-        names = ("mass_part", "stiffness_part", "damping_part") if reference == "mass" else _STATE_PARTS
-        return [(name, part) for name in names for part in getattr(self, name)]
 
     def whole(self, name: str, factors: Mapping[str, float] = MappingProxyType({})) -> FloatArray:
         """Return "mass", "stiffness", "capacity" or "conductance" with its parts, each times its factor.
@@ -177,88 +174,75 @@ class LumpedDescription(ModelDescription):
         """Return the laws of ports that the model has as it is, each times its factor."""
         return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in self.law))
 
-    def _check_vectors(
-        self,
-        kind: str,
-        items: Sequence[NamedVector] | Sequence[OutputSection] | Sequence[ControllerSection],
-    ) -> None:
-        """Refuse vectors of another length, zero ones and names that are there twice."""
+    def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
+        """Refuse vectors of another length and zero ones."""
         n = self.size + self.states
-        for item in items:
-            for key in ("vector", "acts", "station_derivative", "chord_derivative"):
-                vector = getattr(item, key, None)
-                if vector is not None and len(vector) != n:
-                    came = counted(len(vector), "entry", "entries")
-                    raise ValueError(
-                        f"{key} of {kind} {item.name!r} has {came}, but the model has {counted(n, 'unknown')}"
-                    )
-            if item.vector is not None and not any(item.vector):
-                raise ValueError(f"vector of {kind} {item.name!r} is zero")
-            if kind == "port" and item.vector is not None and self.size:
-                sides = any(item.vector[: self.size]), any(item.vector[self.size :])
-                if all(sides):
-                    raise ValueError(f"the port {item.name!r} is of displacements or of states, not of both")
-            through = getattr(item, "through", None)
-            if through is not None and through not in self.terms:
+        for key in ("vector", "acts", "station_derivative", "chord_derivative"):
+            vector = getattr(item, key, None)
+            if vector is not None and len(vector) != n:
+                came = counted(len(vector), "entry", "entries")
                 raise ValueError(
-                    f"{kind} {item.name!r} acts through {through!r}, but there are {', '.join(self.terms)}"
+                    f"{key} of {kind} {item.name!r} has {came}, but the model has {counted(n, 'unknown')}"
                 )
-        check_unique(kind, [item.name for item in items])
-        prescribed = {item.name for item in self.input if item.quantity.moving}
-        for item in items:
-            reaction = getattr(item, "reaction", None)
-            if reaction is not None and reaction not in prescribed:
-                raise ValueError(
-                    f"the output {item.name!r} is the reaction of {reaction!r}, which is no input that "
-                    "prescribes a motion"
-                )
+        if item.vector is not None and not any(item.vector):
+            raise ValueError(f"vector of {kind} {item.name!r} is zero")
 
-    def _check_laws_and_controllers(self) -> None:
-        """Refuse laws at no port, flows that feed their own store, and controllers that cannot be."""
-        ports = {item.name: item for item in self.port}
-        check_unique("law", [item.name for item in self.law])
-        for law in self.law:
-            if law.port not in ports:
-                known = ", ".join(ports) or "none"
-                raise ValueError(f"the law {law.name!r} acts on the port {law.port!r}, but there are {known}")
-        n = self.size
-        for port in self.port:
-            if port.acts is None:
-                continue
-            row, push = np.array(port.vector), np.array(port.acts)
-            if (
-                any(row[:n])
-                or any(push[:n])
-                or row[n:] @ np.linalg.solve(self.whole("capacity"), push[n:]) <= 0.0
-            ):
-                raise ValueError(
-                    f"`acts` of the port {port.name!r} is for states, and must take from what its vector sees"
-                )
-        for item in self.controller:
-            self._check_controller(item)
-        names = [item.reference for item in self.controller if item.reference]
-        check_unique("input or reference", [*(item.name for item in self.input), *names])
-        controllers = [item.name for item in self.controller]
-        for output in self.output:
-            if output.controller is not None and output.controller not in controllers:
-                raise ValueError(
-                    f"the output {output.name!r} is what {output.controller!r} gives, but controllers are "
-                    f"{', '.join(controllers) or 'none'}"
-                )
+    def _check_flow(self, port: PortSection) -> None:
+        """Refuse a port of displacements and states, and a flow that feeds its own store."""
+        n, row, push = self.size, np.array(port.vector), np.array(port.acts or port.vector)
+        if any(row[:n]) and any(row[n:]):
+            raise ValueError(f"the port {port.name!r} is of displacements or of states, not of both")
+        if port.acts is not None and (
+            any(row[:n])
+            or any(push[:n])
+            or row[n:] @ np.linalg.solve(self.whole("capacity"), push[n:]) <= 0.0
+        ):
+            raise ValueError(
+                f"`acts` of the port {port.name!r} is for states, and must take from what its vector sees"
+            )
 
     def _check_controller(self, item: ControllerSection) -> None:
-        of_states = any(item.vector[self.size :])
-        speed = bool(item.quantity.moving) and item.quantity is item.quantity.moving[1]
+        of_states, order = any(item.vector[self.size :]), order_of(item.quantity)
         if of_states and any(item.vector[: self.size]):
             raise ValueError(f"the controller {item.name!r} measures displacements or states, not both")
-        if item.quantity.moving and item.quantity is item.quantity.moving[2]:
+        if order == 2:
             raise ValueError(f"the controller {item.name!r} cannot follow an acceleration")
-        if item.derivative and (of_states or speed):
+        if item.derivative and (of_states or order == 1):
             what = "a state" if of_states else "a speed"
             raise ValueError(
                 f"the controller {item.name!r} measures {what}, whose derivative it cannot take: "
                 "leave `derivative` out"
             )
+
+    def _check_names(self) -> None:
+        """Refuse names that are there twice, and those that name nothing."""
+        for kind in ("output", "port", "place", "load", "controller", "law", "parameter"):
+            check_unique(kind, [item.name for item in getattr(self, kind)])
+        references = [item.reference for item in self.controller if item.reference]
+        check_unique("input", [item.name for item in self.input])
+        check_unique("input or reference", [*(item.name for item in self.input), *references])
+        check_unique("place station", [f"{place.station:g}" for place in self.place])
+        kinds = ("mass", "stiffness", "damping", "capacity", "conductance")
+        check_unique("part", [*(part.name for kind in _PARTS for part in getattr(self, kind)), *kinds])
+        named = (self.law,) if self.is_plain else (self.input, self.load, self.law, self.controller)
+        gains = [f"{item.name}.{gain}" for item in self.controller for gain in GAINS]
+        scaled = [*self.terms, *(item.name for items in named for item in items), *gains]
+        driven = [item.name for item in self.input if item.quantity.moving]
+        pushing: tuple[InputSection | LoadSection, ...] = (*self.input, *self.load)
+        for item in pushing:
+            _check_known(f"{item.name!r} acts through", item.through, self.terms)
+        for law in self.law:
+            _check_known(
+                f"the law {law.name!r} acts on the port", law.port, [item.name for item in self.port]
+            )
+        for output in self.output:
+            what = f"the output {output.name!r} is"
+            _check_known(f"{what} the reaction of the prescribed motion", output.reaction, driven)
+            controllers = [item.name for item in self.controller]
+            _check_known(f"{what} what a controller gives,", output.controller, controllers)
+        for parameter in self.parameter:
+            for term in parameter.scaled:
+                _check_known(f"parameter {parameter.name!r} scales", term, dict.fromkeys(scaled))
 
     @property
     def terms(self) -> dict[str, Matrix | None]:
@@ -267,49 +251,25 @@ class LumpedDescription(ModelDescription):
         found: dict[str, Matrix | None] = dict.fromkeys(
             (*kinds, *(("capacity", "conductance") if self.states else ()))
         )
-        for name in (*_PARTS, *_STATE_PARTS):
+        for name in _PARTS:
             found |= {part.name: part.matrix for part in getattr(self, name)}
         return found
-
-    def _check_root_and_ratios(self) -> None:
-        n = self.size
-        if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
-            raise ValueError(f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
-        if self.damping is not None and self.damping.ratios is not None and len(self.damping.ratios) != n:
-            came = counted(len(self.damping.ratios), "value")
-            raise ValueError(f"damping.ratios needs one value for each mode, {n} in all, but {came} came")
-
-    def _check_parameters(self) -> None:
-        check_unique("place station", [f"{place.station:g}" for place in self.place])
-        parts = [part.name for name in (*_PARTS, *_STATE_PARTS) for part in getattr(self, name)]
-        check_unique("part", [*parts, "mass", "stiffness", "damping", "capacity", "conductance"])
-        check_unique("parameter", [item.name for item in self.parameter])
-        known = list(self.terms)
-        named = (self.law,) if self.is_plain else (self.input, self.load, self.law, self.controller)
-        more = [item.name for items in named for item in items]
-        more += [f"{item.name}.{gain}" for item in self.controller for gain in GAINS]
-        known += [name for name in more if name not in known]
-        for parameter in self.parameter:
-            for term in parameter.scaled:
-                if term not in known:
-                    raise ValueError(
-                        f"parameter {parameter.name!r} scales {term!r}, but there are {', '.join(known)}"
-                    )
 
 
 GAINS = ("proportional", "derivative", "integral")
 """Gains of a controller; NAME.proportional is what a parameter scales."""
-_PARTS = ("mass_part", "stiffness_part", "damping_part")
-_STATE_PARTS = ("capacity_part", "conductance_part")
+_PARTS = ("mass_part", "stiffness_part", "damping_part", "capacity_part", "conductance_part")
+_OF_STATES = ("capacity", "conductance")
 _LOOSE = (
     "; a structure that can float away has no static response: say `free = true` if it can, "
     "as a cart or a falling body"
 )
 
 
-def _shape(content: Matrix) -> tuple[int, int]:
-    array = np.array(content)
-    return (1, len(array)) if array.ndim == 1 else (array.shape[0], array.shape[1])
+def _check_known(what: str, name: str | None, known: Collection[str]) -> None:
+    """Refuse a name that is said, but is none of those known."""
+    if name is not None and name not in known:
+        raise ValueError(f"{what} {name!r}, but there are {', '.join(known) or 'none'}")
 
 
 def _check_matrix(where: str, content: Matrix, count: int, reference: str) -> None:

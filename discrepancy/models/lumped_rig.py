@@ -1,7 +1,8 @@
-"""A lumped model as a rig: its matrices, what acts in a trial, and what its outputs show."""
+"""A lumped model at values of its parameters: its systems, what acts in a trial, what its outputs show."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
@@ -11,18 +12,22 @@ from scipy.linalg import eigh
 from discrepancy.campaign.records import Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.input_course import Course, Drive, FormulaCourse, acting_force
-from discrepancy.models.interface import Conditions, Response
+from discrepancy.models.interface import DEFAULT_PLACE, Conditions
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
 from discrepancy.models.lumped_sections import InputSection
-from discrepancy.models.rig import Rig, RigMotion, order_of
-from discrepancy.models.rig_records import Acting, Shown
+from discrepancy.models.patch_parts import LoadChange
+from discrepancy.models.rig_records import Acting, Load, Shown, order_of
+from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.models.second_order_motion import Motion
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
-from fe.runtime.patch import PortLoad, course_of
+from fe.runtime.patch import PointMass, PortLoad, Primitive, RootCompliance, course_of
 
 FloatArray = NDArray[np.float64]
-ActingLoad = tuple[float, float, FloatArray | None, Sequence[PortLoad]]
-"""Gain, tare and moved row of a trial's force, and loads at ports."""
+
+MOST_MODES = 8
+"""Modes that move of a structure on springs; the others follow without inertia."""
+UNCHANGED = LoadChange()
 
 
 class LumpedRig:
@@ -32,44 +37,65 @@ class LumpedRig:
     ----------
     description : LumpedDescription
         Content of the file.
-    mass, stiffness : (n, n) ndarray
-        Of the displacements, patched.
     factors : mapping of str to float
         Of terms, by name.
+    structure : sequence of Primitive
+        What a patch changes of the structure.
+    softening : float
+        Share of the stiffness that the temperature takes.
     """
 
     def __init__(
         self,
         description: LumpedDescription,
-        mass: FloatArray,
-        stiffness: FloatArray,
         factors: Mapping[str, float],
+        structure: Sequence[Primitive] = (),
+        softening: float = 0.0,
     ) -> None:
         self.description, self.factors = description, factors
         self._inputs = {item.name: item for item in description.input}
         self._loops = loops(description.controller, description.size, description.states, factors)
-        self._integrals = sum(loop.state is not None for loop in self._loops)
+        # displacements, states and integrals of controllers
+        self.width = (
+            description.size + description.states + sum(loop.state is not None for loop in self._loops)
+        )
+        softened = {**factors, "stiffness": factors.get("stiffness", 1.0) * (1.0 - softening)}
         self._parts = {
-            "mass": mass,
-            "stiffness": stiffness,
-            "damping": self._damping(mass, stiffness),
-            "capacity": description.whole("capacity", factors),
-            "conductance": description.whole("conductance", factors),
+            name: description.whole(name, softened)
+            for name in ("mass", "stiffness", "capacity", "conductance")
         }
-        self._rigs: dict[tuple[str, ...], Rig] = {}
+        for change in structure:
+            self._change(change)
+        self._eigen: tuple[FloatArray, FloatArray, int] | None = None
+        self._parts["damping"] = self._damping(self._parts["mass"], self._parts["stiffness"])
+        self._systems: dict[tuple[str, ...], SecondOrderSystem] = {}
         self._constant = sum(
             (self._vector(item.vector, item.through, item.name) for item in description.load),
             np.zeros(self.width),
         )
-        own = description.own_laws(factors)
-        self._laws = laws_of(own, {item.name for item in description.port}) if len(own) else NO_LAWS
 
-    @property
-    def width(self) -> int:
-        """Displacements, states and integrals of controllers."""
-        return self.description.size + self.description.states + self._integrals
+    def _change(self, change: Primitive) -> None:
+        """Put a point mass or a compliance of the root into the matrices."""
+        mass, stiffness = self._parts["mass"], self._parts["stiffness"]
+        if isinstance(change, PointMass):
+            places = sorted(self.description.place, key=lambda place: place.station)
+            stations = [place.station for place in places]
+            columns = zip(*(place.vector for place in places), strict=True)
+            row = np.array([np.interp(change.station, stations, column) for column in columns])
+            mass += change.mass * np.outer(row, row)
+        elif isinstance(change, RootCompliance) and self.description.root is not None:
+            # in series: K^-1 + c l l^T, by Sherman and Morrison
+            pull = stiffness @ np.array(self.description.root.lever)
+            stiff = float(pull @ np.array(self.description.root.lever))
+            stiffness -= np.outer(pull, pull) * change.compliance / (1.0 + change.compliance * stiff)
 
-    def _padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
+    @cached_property
+    def own_laws(self) -> Laws:
+        """Laws of ports that the model has as it is."""
+        own = self.description.own_laws(self.factors)
+        return laws_of(own, {item.name for item in self.description.port}) if len(own) else NO_LAWS
+
+    def padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
         """Return a row of the file with the integrals of controllers after it."""
         found = np.zeros(self.width)
         found[: len(row)] = row
@@ -83,8 +109,9 @@ class LumpedRig:
             matrix = matrix_of(given.matrix)
         elif given.ratios is not None:
             square, shapes = eigh(stiffness, mass)
-            weighted = mass @ shapes
-            twice = 2.0 * np.array(given.ratios) * np.sqrt(np.maximum(square, 0.0))
+            weighted, w = mass @ shapes, np.sqrt(np.maximum(square, 0.0))
+            self._eigen = w, shapes, len(w)
+            twice = 2.0 * np.array(given.ratios) * w
             matrix = (weighted * twice) @ weighted.T
         else:
             matrix = (given.alpha or 0.0) * mass + (given.beta or 0.0) * stiffness
@@ -94,42 +121,38 @@ class LumpedRig:
 
     def _vector(self, vector: Sequence[float] | FloatArray, through: str | None, name: str) -> FloatArray:
         """Return the vector (n + m,) of a load, through a matrix where it says so, times its own factor."""
-        row = self._padded(vector)
+        row, n, description = self.padded(vector), self.description.size, self.description
         if through is not None:
-            n, whole = self.description.size, np.zeros(len(row))
-            part = self.description.terms[through]
-            of_states = through in ("capacity", "conductance") or any(
-                through == item.name
-                for item in (*self.description.capacity_part, *self.description.conductance_part)
-            )
+            part = description.terms[through]
             matrix = (
                 self._parts[through] if part is None else self.factors.get(through, 1.0) * matrix_of(part)
             )
-            at = slice(n, n + self.description.states) if of_states else slice(0, n)
+            of_states = (*description.capacity_part, *description.conductance_part)
+            first = n if through in ("capacity", "conductance", *(item.name for item in of_states)) else 0
+            at, whole = slice(first, first + len(matrix)), np.zeros(len(row))
             whole[at] = matrix @ row[at]
             row = whole
         return np.asarray(self.factors.get(name, 1.0) * row)
 
-    def rig(self, drives: tuple[str, ...] = ()) -> Rig:
-        """Return the rig with the motions of some inputs prescribed."""
-        found = self._rigs.get(drives)
-        if found is None:
-            found = self._rigs[drives] = self._made(drives)
-        return found
+    def system(self, drives: tuple[str, ...] = ()) -> SecondOrderSystem:
+        """Return the system with the motions of some inputs prescribed."""
+        if drives not in self._systems:
+            self._systems[drives] = self._made(drives)
+        return self._systems[drives]
 
-    def open(self) -> Rig:
-        """Return the rig without its controllers."""
+    def open(self) -> SecondOrderSystem:
+        """Return the system without its controllers."""
         return self._made((), closed=False)
 
-    def _made(self, drives: tuple[str, ...], *, closed: bool = True) -> Rig:
-        n, m = self.description.size, self.description.states
+    def _made(self, drives: tuple[str, ...], *, closed: bool = True) -> SecondOrderSystem:
+        description, n, m = self.description, self.description.size, self.description.states
         own = slice(n, n + m)
         mass, damping, stiffness = np.zeros((3, self.width, self.width))
         mass[n:, n:] = np.eye(self.width - n)
         mass[:n, :n], mass[own, own] = self._parts["mass"], self._parts["capacity"]
         damping[:n, :n], damping[own, own] = self._parts["damping"], self._parts["conductance"]
         stiffness[:n, :n] = self._parts["stiffness"]
-        coupling = self.description.coupling
+        coupling = description.coupling
         for content, into, rows, columns in (
             (coupling.force_of_states, damping, slice(0, n), own),
             (coupling.flow_of_speeds, damping, own, slice(0, n)),
@@ -139,19 +162,26 @@ class LumpedRig:
                 into[rows, columns] = -np.atleast_2d(np.array(content))
         for loop in self._loops if closed else ():
             loop.close(damping, stiffness)
-        return Rig(
-            mass, damping, stiffness, n,
-            {item.name: self._padded(item.vector) for item in self.description.port},
-            np.array([self._padded(self._inputs[name].vector) for name in drives]).reshape(-1, self.width),
-            {item.name: self._padded(item.acts) for item in self.description.port if item.acts is not None},
+        beta = description.damping.beta if description.damping is not None else None
+        system = SecondOrderSystem(
+            mass, damping, stiffness,
+            {item.name: self.padded(item.vector) for item in description.port},
+            mode_count=MOST_MODES if description.is_plain else None,
+            relaxation=self.factors.get("damping", 1.0) * (beta or 0.0),
+            states=self.width - n,
+            drives=np.array([self.padded(self._inputs[name].vector) for name in drives]),
+            actions={item.name: self.padded(item.acts) for item in description.port if item.acts is not None},
         )  # fmt: skip
+        if self._eigen is not None and description.is_plain and n <= MOST_MODES and self._eigen[0][0] > 0.0:
+            vars(system)["_modes"] = self._eigen  # known already
+        return system
 
     # ------------------------------------------------------------ trials
 
     def acting(
-        self, trial: Trial, conditions: Conditions, gain: float, tare: float, place: FloatArray | None
-    ) -> tuple[Rig, Acting, tuple[str, ...]]:
-        """Return the rig, what acts in a dynamic trial, and the inputs whose motion is prescribed.
+        self, trial: Trial, conditions: Conditions, change: LoadChange = UNCHANGED
+    ) -> tuple[Acting, tuple[str, ...]]:
+        """Return what acts in a dynamic trial, and the inputs whose motion is prescribed.
 
         Every motion that an input can prescribe and that the trial does not record is held at zero, if an
         output is its reaction; else it is free.
@@ -161,23 +191,16 @@ class LumpedRig:
         ModelError
             If the trial records an input that the model does not have or that is of another quantity.
         """
+        if trial.kind is TrialKind.RINGDOWN:
+            return Acting(trial.time, self._constant, clock=conditions.clock), ()
         recorded = self.recorded(trial)
-        named = {item.name for item in recorded}
-        reactions = {item.reaction for item in self.description.output}
-        held = [
-            name
-            for name, item in self._inputs.items()
-            if item.quantity.moving and name in reactions and name not in named
-        ]
-        drives, loads, names = [], [], list[str]()
-        references: dict[str, tuple[tuple[FloatArray, Course], ...]] = {}
+        loads, drives, references = list[Load](), dict[str, Drive](), dict[str, Sequence[Load]]()
         offsets = (*conditions.offset, *(0.0,) * len(recorded))
         for item, offset in zip(recorded, offsets, strict=False):
             following = [loop for loop in self._loops if loop.section.reference == item.name]
             for loop in following:
-                pushed = loop.loads(trial, item, offset)
-                loads += pushed
-                references[loop.section.name] = tuple(pushed)
+                references[loop.section.name] = loop.loads(trial, item, offset)
+                loads += references[loop.section.name]
             if following:
                 continue
             section = self._section(trial, item)
@@ -189,44 +212,56 @@ class LumpedRig:
                         f"{self.description.name!r} prescribes, which no drive makes in steps or corners: "
                         "leave `reference` and `hold` out."
                     )
-                names.append(item.name)
-                order = order_of(item.quantity)
-                drives.append(Drive.of(trial.time, self.factors.get(item.name, 1.0) * values, order))
+                values = self.factors.get(item.name, 1.0) * values
+                drives[item.name] = Drive.of(trial.time, values, order_of(item.quantity))
                 continue
-            if (gain or tare) and item.quantity in (Quantity.FORCE, Quantity.TORQUE):
-                values = (1.0 + gain) * values + tare * (item.values != 0.0)
-            vector = np.array(section.vector) if place is None else place
-            loads.append(
-                (self._vector(vector, section.through, item.name), Course.of(trial.time, values, item.hold))
-            )
-        drives += [Drive.of(trial.time, np.zeros(len(trial.time))) for _ in held]
-        prescribed = (*names, *held)
+            if (change.gain or change.tare) and item.quantity in (Quantity.FORCE, Quantity.TORQUE):
+                values = (1.0 + change.gain) * values + change.tare * (item.values != 0.0)
+            course = Course.of(trial.time, values, item.hold)
+            loads.append((self.moved_row(section, change), course))
+        reactions = {item.reaction for item in self.description.output}
+        named = {item.name for item in recorded}
+        for name, section in self._inputs.items():
+            if section.quantity.moving and name in reactions and name not in named:
+                drives[name] = Drive.of(trial.time, np.zeros(len(trial.time)))
         acts = Acting(
-            trial.time,
-            loads,
-            self._constant,
-            drives,
-            trial.begins,
-            conditions.initial.ravel(),
-            conditions.clock,
-            references,
-        )
-        return self.rig(prescribed), acts, prescribed
+            trial.time, self._constant, loads, tuple(drives.values()), trial.begins,
+            conditions.initial.ravel(), conditions.clock, references,
+        )  # fmt: skip
+        return acts, tuple(drives)
 
     def recorded(self, trial: Trial) -> tuple[RecordedInput, ...]:
-        """Return the recorded inputs of a trial; of a forced one its force at its place."""
+        """Return the recorded inputs of a trial; of one under a force this at its place."""
         if trial.kind is TrialKind.DRIVEN:
             return trial.inputs
+        item = self.input_at(trial.load_place)
+        return (RecordedInput(item.name, item.quantity, trial.force, trial.hold),)
+
+    def input_at(self, place: str | tuple[float, float]) -> InputSection:
+        """Return the input of a load place; raises `ModelError` if there is none."""
         forces = [name for name, item in self._inputs.items() if not item.quantity.moving]
-        place = trial.load_place
-        if place not in self._inputs and len(forces) == 1:
+        if place == DEFAULT_PLACE and place not in self._inputs and len(forces) == 1:
             place = forces[0]
         if not isinstance(place, str) or place not in self._inputs:
             raise ModelError(
                 f"The load place {place!r} is not an input of the lumped model {self.description.name!r}; it "
                 f"has {', '.join(self._inputs) or 'none'}."
             )
-        return (RecordedInput(place, self._inputs[place].quantity, trial.force, trial.hold),)
+        return self._inputs[place]
+
+    def moved_row(self, item: InputSection, change: LoadChange = UNCHANGED) -> FloatArray:
+        """Return the row (n + m,) along which an input acts, where its place has been moved to."""
+        row = np.array(item.vector)
+        if change.along_span or change.along_chord:
+            if item.station_derivative is None:
+                raise ModelError(
+                    f"The input {item.name!r} of {self.description.name!r} declares no station_derivative, "
+                    "so its place cannot move."
+                )
+            row = row + change.along_span * np.array(item.station_derivative)
+            if item.chord_derivative is not None:
+                row = row + change.along_chord * np.array(item.chord_derivative)
+        return self._vector(row, item.through, item.name)
 
     def _section(self, trial: Trial, item: RecordedInput) -> InputSection:
         section = self._inputs.get(item.name)
@@ -235,123 +270,104 @@ class LumpedRig:
                 f"The trial {trial.name!r} records the input {item.name!r}, which the lumped model "
                 f"{self.description.name!r} does not have; it has {', '.join(self._inputs) or 'none'}."
             )
-        same = item.quantity is section.quantity or (
-            bool(section.quantity.moving) and item.quantity in section.quantity.moving
-        )
-        if not same:
+        if item.quantity is not section.quantity and item.quantity not in section.quantity.moving:
             raise ModelError(
                 f"The input {item.name!r} of the lumped model {self.description.name!r} is "
                 f"{section.quantity.value}, but the trial {trial.name!r} records {item.quantity.value}."
             )
         return section
 
-    def response(
+    def moved(
         self,
         trial: Trial,
-        outputs: Sequence[tuple[str, Quantity]],
-        laws: Laws,
         conditions: Conditions,
-        load: ActingLoad,
-        refinement: int,
-    ) -> Response:
-        """Return the response of a trial.
+        laws: Laws,
+        change: LoadChange = UNCHANGED,
+        at_ports: Sequence[PortLoad] = (),
+        refinement: int = 1,
+        *,
+        still: bool = False,
+    ) -> tuple[Motion, tuple[str, ...]]:
+        """Return the motion of a dynamic trial, and the inputs whose motion is prescribed; `still`: at rest.
 
         Raises
         ------
         ModelError
-            If the trial is a ring-down, or begins at rest where there is none, or a port of a load does not
-            exist.
+            If it cannot begin so, or what acts is not the model's.
         """
-        gain, tare, place, at_ports = load
-        name = self.description.name
-        if (at_ports or laws.spans) and not trial.is_dynamic:
-            raise ModelError(
-                f"The trial {trial.name!r} has no time, which a law or a force in time asks for."
-            )
-        if trial.kind is TrialKind.RINGDOWN and self.description.is_plain:
-            raise ModelError(
-                f"The trial {trial.name!r} is a ring-down, which no force with a course in time can act on; "
-                'say kind = "driven" and begins = "unknown".'
-            )
+        acting, drives = self.acting(trial, conditions, change)
+        system = self.system(drives)
         if trial.kind is TrialKind.RINGDOWN:
-            raise ModelError(
-                f"The trial {trial.name!r} is a ring-down, which the lumped model {name!r} cannot begin: it "
-                'is free, driven or has states; say kind = "driven" and begins = "unknown".'
-            )
-        if trial.kind is TrialKind.STATIC:
-            row = self._padded(self._inputs[self.recorded(trial)[0].name].vector)
-            place = place if place is None else self._padded(place)
-            force = acting_force(trial, gain, tare)
-            return self._static(trial, force, row if place is None else place, self.shown(outputs), laws)
+            self._check_released(trial, at_ports)
+            row = self.moved_row(self.input_at(trial.load_place))
+            assert trial.release is not None  # it has been checked
+            motion = system.ringdown(
+                row, trial.release, conditions.initial, trial.time, laws, clock=conditions.clock,
+                refinement=refinement,
+            )  # fmt: skip
+            return motion, drives
+        if at_ports:
+            pushed = [self._at_port(item, system) for item in at_ports]
+            acting = replace(acting, loads=[*acting.loads, *pushed])
+        if still:
+            acting = replace(acting, begins=Start.STILL)
         try:
-            motion, drives = self.moved(trial, conditions, laws, load, refinement)
-            return motion.response(self.shown(outputs, drives, motion.acting.references))
+            return system.motion(acting, laws, refinement), drives
         except ModelError as cause:
+            name = self.description.name
             raise ModelError(f"The trial {trial.name!r} of {name!r}: {cause}") from cause
 
-    def moved(
-        self, trial: Trial, conditions: Conditions, laws: Laws, load: ActingLoad, refinement: int = 1
-    ) -> tuple[RigMotion, tuple[str, ...]]:
-        """Return the motion of a dynamic trial, and the inputs whose motion is prescribed."""
-        gain, tare, place, at_ports = load
-        rig, acting, drives = self.acting(trial, conditions, gain, tare, place)
-        if at_ports:
-            acting = replace(acting, loads=(*acting.loads, *(self._at_port(item, rig) for item in at_ports)))
-        return rig.motion(acting, laws, refinement), drives
+    def _check_released(self, trial: Trial, at_ports: Sequence[PortLoad]) -> None:
+        """Refuse a ring-down that the model cannot begin."""
+        why = ""
+        if not self.description.is_plain:
+            name = self.description.name
+            why = f"which the lumped model {name!r} cannot begin: it is free, driven or has states"
+        elif at_ports:
+            why = "which no force with a course in time can act on"
+        if why:
+            raise ModelError(
+                f'The trial {trial.name!r} is a ring-down, {why}; say kind = "driven" and begins = "unknown".'
+            )
+        if trial.release is None:
+            raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
 
-    def _at_port(self, load: PortLoad, rig: Rig) -> tuple[FloatArray, FormulaCourse]:
+    def _at_port(self, load: PortLoad, system: SecondOrderSystem) -> Load:
         """Return the row and the course of a load at a port."""
-        row = rig.acting_rows.get(load.port)
+        row = system.acting_rows.get(load.port)
         if row is None:
             raise ModelError(
                 f"A force acts at the port {load.port!r}, which {self.description.name!r} does not have; it "
-                f"has {', '.join(rig.ports) or 'none'}."
+                f"has {', '.join(system.ports) or 'none'}."
             )
         spans = tuple(window.span for window in load.windows)
         return row, FormulaCourse(course_of(load.force, load.kind), spans)
 
-    def _static(
-        self, trial: Trial, force: FloatArray, row: FloatArray, shown: Sequence[Shown], laws: Laws
-    ) -> Response:
-        """Return the response of a static trial."""
-        rig = self.rig()
-        modal = (np.outer(force, row) + self._constant) @ rig.shapes[:, : len(rig.angular_frequency)]
-        try:
-            q, v, _ = rig.settled(modal, np.zeros((len(force), 0)), laws)
-        except ModelError as cause:
-            raise ModelError(f"The trial {trial.name!r} is static, but {cause}") from cause
-        n, shapes = rig.displacements, rig.shapes
-        values = [
-            q @ (item.row[:n] @ shapes[:n]) + v @ (item.row[n:] @ shapes[n:]) + item.constant
-            for item in shown
-        ]
-        return Response(np.stack(values, axis=1))
+    def static_loads(self, trial: Trial, change: LoadChange = UNCHANGED) -> FloatArray:
+        """Return the loads (L, n + m) of a static trial."""
+        row = self.moved_row(self.input_at(trial.load_place), change)
+        return np.outer(acting_force(trial, change.gain, change.tare), row) + self._constant
 
-    def moving(self, trial: Trial, conditions: Conditions, *, still: bool = False) -> RigMotion:
-        """Return the motion of a dynamic trial under the model's own laws; `still`: from rest."""
-        rig, acting, _ = self.acting(trial, conditions, 0.0, 0.0, None)
-        return rig.motion(replace(acting, begins=Start.STILL) if still else acting, self._laws)
-
-    def port_motion(
-        self, trial: Trial, conditions: Conditions, load: ActingLoad
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        motion, _ = self.moved(trial, conditions, NO_LAWS, load)
-        shapes = np.array(list(motion.rig.ports.values())).reshape(-1, self.width) @ motion.rig.shapes
-        return motion.q @ shapes.T, motion.velocity @ shapes.T
+    def held(self, trial: Trial) -> FloatArray:
+        """Return the displacements (L, n + m) in a static trial, or from which a ring-down is released."""
+        if trial.release is None:
+            return self.system().static(self.static_loads(trial)).values
+        row = self.moved_row(self.input_at(trial.load_place))
+        shape = self.system().flexibility(row)
+        return np.asarray(trial.release.displacement / float(row @ shape) * shape)[None]
 
     def shown(
         self,
         outputs: Sequence[tuple[str, Quantity]],
         drives: Sequence[str] = (),
-        references: Mapping[str, Sequence[tuple[FloatArray, Course]]] = MappingProxyType({}),
+        references: Mapping[str, Sequence[Load]] = MappingProxyType({}),
     ) -> list[Shown]:
-        """Return what each output shows of a rig with some motions prescribed."""
+        """Return what each output shows of a system with some motions prescribed."""
         known = {item.name: item for item in self.description.output}
         found = []
         for name, quantity in outputs:
             item = known[name]
-            further = quantity.derivatives_of(item.quantity)
+            further = 0 if quantity is item.quantity else quantity.derivatives_of(item.quantity)
             if item.reaction is not None:
                 if item.reaction not in drives:
                     raise ModelError(
@@ -359,14 +375,10 @@ class LumpedRig:
                         f"{item.reaction!r}, whose motion this trial does not prescribe."
                     )
                 found.append(Shown(np.zeros(self.width), reaction=list(drives).index(item.reaction)))
-                continue
-            if item.controller is not None:
+            elif item.controller is not None:
                 (loop,) = (loop for loop in self._loops if loop.section.name == item.controller)
-                effort = loop.effort(references.get(item.controller, ()))
-                found.append(Shown(np.zeros(self.width), effort=effort))
-                continue
-            row = self._padded(item.vector or ())
-            found.append(
-                Shown(row, order_of(item.quantity) + further, further, constant=item.constant * (not further))
-            )
+                found.append(loop.effort(references.get(item.controller, ())))
+            else:
+                row, order = self.padded(item.vector or ()), order_of(item.quantity) + further
+                found.append(Shown(row, order, further, constant=item.constant * (not further)))
         return found

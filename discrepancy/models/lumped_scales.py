@@ -5,28 +5,28 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Conditions, PortScale, Scales
+from discrepancy.models.interface import Conditions, PortScale, Scales, campaign_sizes
 from discrepancy.models.lumped_rig import LumpedRig
-from discrepancy.models.rig import RigMotion
+from discrepancy.models.second_order_motion import Motion
 
 FloatArray = NDArray[np.float64]
 
 
 def state_sizes(lumped: LumpedRig, campaign: Campaign, trial: Trial, conditions: Conditions) -> FloatArray:
     """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
-    rig, _, drives = lumped.acting(trial, conditions, 0.0, 0.0, None)
+    moved, drives = lumped.moved(trial, conditions, lumped.own_laws, still=True)
+    rig = moved.system
     count, moving = len(rig.angular_frequency), rig.moving
-    moved = lumped.moving(trial, conditions, still=True)
     x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
     pace = np.maximum(rig.angular_frequency[:moving], 1.0 / float(trial.time[-1] - trial.time[0]))
-    n, shapes = rig.displacements, rig.shapes[:, :count]
+    n, shapes = rig.displacements, rig.shapes
     channels = [campaign.channels[name] for name in trial.channels]
     shown = lumped.shown([(channel.output, channel.quantity) for channel in channels], drives)
     for column, item in enumerate(shown):
         kept = trial.values[trial.used[:, column], column] - item.constant
-        if item.reaction is not None or item.effort is not None or not kept.size:
+        if item.reaction is not None or item.speed is not None or not kept.size:
             continue
         size = float(np.max(np.abs(kept)))
         of_u, of_x = item.row[:n] @ shapes[:n, :moving], item.row[n:] @ shapes[n:, moving:]
@@ -66,51 +66,54 @@ class PortSizes:
     """
 
     def __init__(self, lumped: LumpedRig, *, driven_only: bool = False) -> None:
-        self._rig, self._driven_only = lumped.open(), driven_only
-        self._turns = dict.fromkeys(self._rig.ports, False)
-        self._follows = dict.fromkeys(self._rig.ports, True)
-        self._sizes = {name: np.zeros(3) for name in self._rig.ports}
-        self._forces: dict[str, list[FloatArray]] = {name: [] for name in self._rig.ports}
+        self._open, self._driven_only = lumped.open(), driven_only
+        self.rows = np.array(list(self._open.ports.values())).reshape(-1, lumped.width)
+        self._turns, self._follows = np.zeros(len(self.rows), bool), np.ones(len(self.rows), bool)
+        self._sizes = np.zeros((3, len(self.rows)))
+        self._squares: list[FloatArray] = []
+        self._counts: list[int] = []
 
-    def add(self, motion: RigMotion, measured: float, fitted: bool) -> None:
+    def add(self, motion: Motion, measured: float, fitted: bool) -> None:
         """Take up the motion of a trial, and the largest force that was measured in it [N]."""
-        rig, free = motion.rig, len(motion.rig.angular_frequency)
-        shapes = rig.shapes[:, :free]
+        system, shapes = motion.system, motion.system.shapes
+        free, modal = shapes.shape[1], self.rows @ system.all_shapes
         pushed = (
-            motion.acceleration[:, :free] @ (rig.mass @ shapes).T,
-            motion.velocity[:, :free] @ (self._rig.damping @ shapes).T,
-            rig.load_at(motion.acting, motion.time) if self._rig.drives.size == 0 else 0.0,
+            motion.acceleration[:, :free] @ (system.mass @ shapes).T,
+            motion.velocity[:, :free] @ (self._open.damping @ shapes).T,
+            motion.acting.load_at(motion.time, np.eye(len(system.mass))),
         )
-        for name, row in rig.ports.items():
-            modal = row @ rig.shapes
-            lent = float((row @ shapes) @ (row @ shapes))
-            self._follows[name] &= lent == 0.0
-            if lent > 0.0:  # modal force along the port, over what a unit force there gives
-                along = shapes @ (shapes.T @ row) / lent
-                squares = [np.mean((item @ along) ** 2) for item in pushed if isinstance(item, np.ndarray)]
-                force = float(np.sqrt(max(squares)))
-            else:
-                force = measured / FORCES
-            self._forces[name].append(np.array([len(motion.time), force**2]))
-            x, v = (float(np.max(np.abs(item @ modal))) for item in (motion.q, motion.velocity))
-            self._sizes[name] = np.maximum(self._sizes[name], (x * fitted, x, v))
-            speed = motion.velocity @ modal
-            self._turns[name] |= bool(np.min(speed) < -TURNS * v and np.max(speed) > TURNS * v)
+        # modal force along the port, over what a unit force there gives
+        lent = np.sum((self.rows @ shapes) ** 2, axis=1)
+        along = shapes @ (shapes.T @ self.rows.T) / np.where(lent > 0.0, lent, 1.0)
+        largest = np.max([np.mean((item @ along) ** 2, axis=0) for item in pushed], axis=0)
+        self._squares.append(np.where(lent > 0.0, largest, (measured / FORCES) ** 2))
+        self._counts.append(len(motion.time))
+        self._follows &= lent == 0.0
+        speed = motion.velocity @ modal.T
+        self.see(motion.q @ modal.T, fitted, speed)
+        least = TURNS * np.max(np.abs(speed), axis=0)
+        self._turns |= (np.min(speed, axis=0) < -least) & (np.max(speed, axis=0) > least)
+
+    def see(self, position: FloatArray, fitted: bool, speed: FloatArray | None = None) -> None:
+        """Take up where the ports were (N, P), and their speeds."""
+        x = np.max(np.abs(position), axis=0)
+        v = 0.0 * x if speed is None else np.max(np.abs(speed), axis=0)
+        self._sizes = np.maximum(self._sizes, (x * fitted, x, v))
 
     def scale(self, name: str) -> PortScale:
         """Return the natural scales of a port."""
-        usual, largest, speed = self._sizes[name].tolist()
-        rig = self._rig
+        rig, number = self._open, list(self._open.ports).index(name)
+        usual, largest, speed = self._sizes[:, number].tolist()
         along = (rig.ports[name] @ rig.shapes)[: rig.moving]
         frequency, weight = rig.angular_frequency[: rig.moving], along**2
         seen = weight > 1e-6 * float(weight.sum())
         amount = usual or largest or 1.0
-        table = np.array(self._forces[name]).reshape(-1, 2)
-        force = FORCES * float(np.sqrt(np.average(table[:, 1], weights=table[:, 0]))) if len(table) else 0.0
+        squares = [square[number] for square in self._squares]
+        force = FORCES * float(np.sqrt(np.average(squares, weights=self._counts))) if squares else 0.0
         if np.any(seen) and np.all(frequency[seen] > 0.0):
             first = int(np.flatnonzero(seen)[0])
             still = 1.0 / float(np.sum(weight[seen] / frequency[seen] ** 2))
-            if self._driven_only and self._follows[name] and force > 0.0 < speed:
+            if self._driven_only and self._follows[number] and force > 0.0 < speed:
                 return PortScale(
                     amount, force / amount, speed / amount, still, largest or amount, driven=True
                 )
@@ -120,57 +123,67 @@ class PortSizes:
         of_state = not np.any(rig.ports[name][: rig.displacements])
         return PortScale(
             amount, (force or 1.0) / amount, (speed or 1.0) / amount, None, largest or amount,
-            free=free, turns=self._turns[name] or not (free and self._driven_only and np.any(seen)),
+            free=free, turns=bool(self._turns[number]) or not (free and self._driven_only and np.any(seen)),
             of_state=of_state,
         )  # fmt: skip
 
 
-def rig_scales(
+def lumped_scales(
     lumped: LumpedRig, parameters: FloatArray, campaign: Campaign, stations: tuple[float, float] | None
 ) -> Scales:
-    """Return the natural scales of a rig under a campaign, at its prior mean."""
-    driven_only = all(trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN for trial in campaign.trials)
+    """Return the natural scales of a lumped model under a campaign, at its prior mean.
+
+    A structure that springs hold, which only forces move from rest, has scales of its own; for others what
+    acts and moves is the measure.
+    """
+    trials, description, system = campaign.trials, lumped.description, lumped.system()
+    driven_only = all(trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN for trial in trials)
+    held = description.is_plain and all(
+        trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED for trial in trials
+    )
     conditions, ports = Conditions(parameters), PortSizes(lumped, driven_only=driven_only)
-    rig, description = lumped.rig(), lumped.description
-    force, peak, speed, weight = 0.0, 0.0, 0.0, 0.0
-    for trial in campaign.trials:
+    peak, speed, weight = 0.0, 0.0, 0.0
+    for trial in trials:
+        if held and trial.kind in (TrialKind.STATIC, TrialKind.RINGDOWN):
+            ports.see(lumped.held(trial) @ ports.rows.T, trial.is_dynamic and not trial.held_out)
+        if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
+            continue
+        try:
+            motion, _ = lumped.moved(trial, conditions, lumped.own_laws)
+        except ModelError:
+            motion, _ = lumped.moved(trial, conditions, lumped.own_laws, still=True)
+        if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
+            sizes_of_state = state_sizes(lumped, campaign, trial, conditions)
+            motion, _ = lumped.moved(trial, replace(conditions, initial=sizes_of_state), lumped.own_laws)
         pushes = [
             float(np.max(np.abs(trial.values[trial.used[:, column], column]), initial=0.0))
             for column, name in enumerate(trial.channels)
             if campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE)
         ]
-        force = max(force, float(np.max(np.abs(trial.force))))
-        if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
-            continue
-        try:
-            motion = lumped.moving(trial, conditions)
-        except ModelError:
-            motion = lumped.moving(trial, conditions, still=True)
-        if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
-            sizes = state_sizes(lumped, campaign, trial, conditions)
-            motion = lumped.moving(trial, replace(conditions, initial=sizes))
         ports.add(motion, max(pushes, default=0.0), not trial.held_out)
-        here = motion.q @ motion.rig.shapes.T[:, : description.size]
-        pace = motion.velocity @ motion.rig.shapes.T[:, : description.size]
-        peak = max(peak, float(np.max(np.abs(here), initial=0.0)))
-        speed = max(speed, float(np.max(np.abs(pace), initial=0.0)))
-        weight = max(weight, float(np.max(np.abs(motion.rig.load_at(motion.acting, motion.time)))))
-    dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
-    duration = max((float(trial.time[-1] - trial.time[0]) for trial in dynamic), default=1.0)
-    elastic = rig.angular_frequency[rig.angular_frequency > 0.0]
-    begins = [trial.start + (trial.time[0] if trial.is_dynamic else 0.0) for trial in campaign.trials]
-    ends = [trial.start + (trial.time[-1] if trial.is_dynamic else 0.0) for trial in campaign.trials]
-    frequency = float(elastic[0]) if len(elastic) else speed / peak if peak > 0.0 < speed else 1.0 / duration
-    mass = float(np.trace(rig.mass)) / max(len(rig.mass), 1)
-    stiffness = weight / peak if peak > 0.0 < weight else mass * frequency**2
+        shapes = motion.system.all_shapes.T[:, : description.size]
+        peak = max(peak, float(np.max(np.abs(motion.q @ shapes), initial=0.0)))
+        speed = max(speed, float(np.max(np.abs(motion.velocity @ shapes), initial=0.0)))
+        weight = max(weight, float(np.max(np.abs(motion.acting.load_at(motion.time, np.eye(lumped.width))))))
+    sizes = campaign_sizes(campaign)
+    if held:
+        loaded = next((trial.load_place for trial in trials if trial.kind is not TrialKind.FLIGHT), None)
+        row = lumped.moved_row(description.input[0] if loaded is None else lumped.input_at(loaded))
+        frequency = float(system.angular_frequency[0])
+        participation = float(row @ system.shapes[:, 0]) ** 2
+        mass = 1.0 / participation if participation else float(np.trace(description.whole("mass")))
+        stiffness = 1.0 / float(row @ system.flexibility(row))
+    else:
+        elastic = system.angular_frequency[system.angular_frequency > 0.0]
+        usual = speed / peak if peak > 0.0 < speed else 1.0 / sizes["duration"]
+        frequency = float(elastic[0]) if len(elastic) else usual
+        mass = float(np.trace(system.mass)) / max(len(system.mass), 1)
+        stiffness = weight / peak if peak > 0.0 < weight else mass * frequency**2
     return Scales(
+        **{**sizes, "force": sizes["force"] or weight},
         length=description.characteristic_length or (max(map(abs, stations)) if stations else 0.0) or 1.0,
         tip_stiffness=stiffness,
         modal_mass=mass,
         angular_frequency=frequency,
-        force=force or weight,
-        load_factor=0.0,
-        duration=duration,
-        campaign_time=max(max(ends) - min(begins), 0.0) or 1.0,
         ports={item.name: ports.scale(item.name) for item in description.port},
     )

@@ -1,11 +1,10 @@
 """A model that remembers its latest responses: sensors are tried by the dozen on one motion."""
 
-from collections import OrderedDict
-
-from discrepancy.campaign.records import Quantity, Trial
+from discrepancy.campaign.records import Trial
 from fe.runtime.patch import ModelPatch
 
-from .interface import Conditions, Model, Response
+from .interface import Conditions, Model, Outputs, Response
+from .memory import Memory
 from .wrapped import WrappedModel
 
 KEPT = 400
@@ -23,12 +22,12 @@ class MemoModel(WrappedModel):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self._kept: OrderedDict[object, tuple[Trial, Response]] = OrderedDict()
+        self._kept = Memory(KEPT)
 
     def respond(
         self,
         trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
+        outputs: Outputs,
         patch: ModelPatch,
         conditions: Conditions,
         *,
@@ -36,17 +35,12 @@ class MemoModel(WrappedModel):
         refinement: int = 1,
     ) -> Response:
         """Return the response of a trial, kept or computed; as `Model.respond`."""
-        key = (
-            id(trial), outputs, patch.primitives, conditions.key, components, refinement,
-        )  # fmt: skip
-        kept = self._kept.get(key)
-        if kept is not None:
-            self._kept.move_to_end(key)
-            return kept[1]
-        found = self.inner.respond(
-            trial, outputs, patch, conditions, components=components, refinement=refinement
-        )
-        self._kept[key] = (trial, found)  # the trial lives as long, so that its id stays its own
-        if len(self._kept) > KEPT:
-            self._kept.popitem(last=False)
-        return found
+
+        def answer() -> tuple[Trial, Response]:  # the trial lives as long, so that its id stays its own
+            found = self.inner.respond(
+                trial, outputs, patch, conditions, components=components, refinement=refinement
+            )
+            return trial, found
+
+        key = (id(trial), outputs, patch.primitives, conditions.key, components, refinement)
+        return self._kept.get(key, answer)[1]

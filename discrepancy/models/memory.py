@@ -11,10 +11,13 @@ _Value = TypeVar("_Value")
 
 
 class Memory:
-    """Results by key, the least recently used forgotten."""
+    """Results by key, the least recently used forgotten where there are more than `size`.
 
-    def __init__(self, size: int = KEPT) -> None:
-        self._size = size
+    `weight` says how much of the size a result takes; one each if it is left out.
+    """
+
+    def __init__(self, size: int = KEPT, weight: Callable[[Any], int] = lambda _: 1) -> None:
+        self._size, self._weight, self._taken = size, weight, 0
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
@@ -23,8 +26,14 @@ class Memory:
             value = self._values[key]
         except KeyError:
             value = self._values[key] = make()
-            if len(self._values) > self._size:
-                self._values.popitem(last=False)
+            self._taken += self._weight(value)
+            while self._taken > self._size and len(self._values) > 1:
+                self._taken -= self._weight(self._values.popitem(last=False)[1])
             return value
         self._values.move_to_end(key)
         return value  # type: ignore[no-any-return]
+
+    def clear(self) -> None:
+        """Forget all results."""
+        self._values.clear()
+        self._taken = 0

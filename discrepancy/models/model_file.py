@@ -1,8 +1,12 @@
 """What the TOML files of models share: their tables and kinds of numbers."""
 
-from typing import Annotated, Literal, Self
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from discrepancy.campaign.records import Quantity
+from discrepancy.models.interface import ModelParameter
 
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0, strict=True)]
@@ -28,6 +32,11 @@ class ParameterSection(Section):
     high: Number
     unit: str = "1"
 
+    @property
+    def calibrated(self) -> ModelParameter:
+        """The parameter of the model."""
+        return ModelParameter(self.name, self.mean, self.deviation, self.unit, self.low, self.high)
+
     @model_validator(mode="after")
     def _in_range(self) -> Self:
         if not self.low <= self.mean <= self.high:
@@ -40,6 +49,47 @@ class ModelDescription(Section):
 
     format: Literal[1]
     name: Name
+
+
+class Named(Protocol):
+    """A table with a name."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+
+class DescribedModel:
+    """What models of a file know of themselves.
+
+    Parameters
+    ----------
+    name : str
+        For people.
+    parameters, ports : sequence of section
+        Of the file.
+    quantities : mapping of str to Quantity
+        What each output is.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parameters: Sequence[ParameterSection],
+        ports: Sequence[Named],
+        quantities: Mapping[str, Quantity],
+    ) -> None:
+        self.name, self.quantities = name, quantities
+        self.parameters = tuple(item.calibrated for item in parameters)
+        self._port_names = tuple(item.name for item in ports)
+
+    def output_quantity(self, output: str) -> Quantity | None:
+        """Return what an output is, or None if the model has no such output."""
+        return self.quantities.get(output)
+
+    def ports(self) -> tuple[str, ...]:
+        """Names of the ports."""
+        return self._port_names
 
 
 def check_unique(kind: str, names: list[str]) -> None:

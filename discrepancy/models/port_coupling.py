@@ -6,14 +6,13 @@ beforehand, so that friction can stop it. Second order in the step. The laws are
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.models.compiled_motion import law_functions
-from discrepancy.models.port_system import PortSystem
+from discrepancy.models.port_system import PortRows, PortSystem
 from fe.compilation import callable_when_compiled, compiled
 from fe.runtime import laws
 from fe.runtime.motion import Laws
@@ -139,46 +138,22 @@ def first_memory(internal: Laws, positions: FloatArray) -> FloatArray:
     return memory
 
 
-@dataclass(frozen=True)
-class PortMotion:
-    """Free motion at the ports, rows of a system that give what forces add, and who acts where.
-
-    Attributes
-    ----------
-    displacement, velocity : (N + 1, P) ndarray
-        Without the laws.
-    gain : (P, P) ndarray
-        Speed of each port after a step with a unit force at another.
-    """
-
-    displacement: FloatArray
-    velocity: FloatArray
-    gain: FloatArray
-
-
 def coupled_motion(
-    system: PortSystem,
-    free: PortMotion,
-    x_rows: FloatArray,
-    x_direct: FloatArray,
-    v_rows: FloatArray,
-    v_direct: FloatArray,
-    laws: Laws,
-    port_of: list[int],
+    system: PortSystem, rows: PortRows, free_x: FloatArray, free_v: FloatArray, laws: Laws, port_of: list[int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return states (N + 1, n) and applied forces (N, P) of a linear system with laws at its ports."""
+    """Return states (N + 1, n) and applied forces (N, P) of a linear system with laws at its ports.
+
+    Free motion (N + 1, P), displacement and velocity, is that without the laws; `port_of` the port of each.
+    """
     index = np.array(port_of, dtype=np.int64)
-    steps = len(free.displacement) - 1
-    states = np.zeros((steps + 1, len(system.transition)))
-    applied = np.zeros((steps, free.displacement.shape[1]))
-    memory = first_memory(laws, free.displacement[0, index])
-    arrays = (
-        system.transition, system.drive, x_rows, x_direct, v_rows, v_direct, free.displacement, free.velocity,
-    )  # fmt: skip
-    *rows, free_x, free_v = (np.ascontiguousarray(item, dtype=np.float64) for item in arrays)
+    steps, width = len(free_x) - 1, free_x.shape[1]
+    states, applied = np.zeros((steps + 1, len(system.transition))), np.zeros((steps, width))
+    gain = rows.speed @ system.drive + rows.speed_direct
+    arrays = (system.transition, system.drive, *rows, free_x, free_v, gain[np.ix_(index, index)])
+    *given, free_x, free_v, gain = (np.ascontiguousarray(item, dtype=np.float64) for item in arrays)
     _compiled(couple)(
-        tuple(rows), (free_x, free_v), system.step, np.ascontiguousarray(free.gain[np.ix_(index, index)]),
-        index, _ports(laws), memory, states, applied,
+        tuple(given), (free_x, free_v), system.step, gain, index, _ports(laws),
+        first_memory(laws, free_x[0, index]), states, applied,
     )  # fmt: skip
     return states, applied
 

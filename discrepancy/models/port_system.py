@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,15 @@ ROUNDING = 1e-11
 """Largest error of a matrix put together from its eigenvectors, as a share of its largest entry."""
 FIT = 1e-7
 """Largest error of a linear system against the record that it is made of, as a share of the record."""
+
+
+class PortRows(NamedTuple):
+    """Rows (P, n) by which ports move, and what they show of forces (P, P) at once."""
+
+    position: FloatArray
+    position_direct: FloatArray
+    speed: FloatArray
+    speed_direct: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,14 +141,22 @@ class PortSystem:
                 for column, times in shown
             ]
         )
-        moving = [
-            self.outputs[v] if v >= 0 else self.outputs[x] @ self.generator
-            for x, v in zip(at, speeds, strict=True)
-        ]
+        moving = self.port_rows(at, speeds)
         return PortedSystem(
-            self.generator, ports, self.push.T, self.outputs[list(at)], np.array(moving),
+            self.generator, ports, self.push.T, moving.position, moving.speed,
             rows.reshape(-1, order), at_once.reshape(-1, len(ports)).T,
         )  # fmt: skip
+
+    def port_rows(self, at: Sequence[int], speeds: Sequence[int]) -> PortRows:
+        """Return the rows of the ports from the columns of their positions and velocities, see `ported`."""
+        x, v = np.array(at), np.array(speeds)
+        known = (v >= 0)[:, None]
+        return PortRows(
+            self.outputs[x],
+            self.direct[x],
+            np.where(known, self.outputs[v], self.outputs[x] @ self.generator),
+            np.where(known, self.direct[v], 0.0),
+        )
 
     def motion(self, forces: FloatArray) -> FloatArray:
         """Return the outputs (N + 1, C) under forces (N, P), from rest."""

@@ -43,8 +43,8 @@ class ReducedSystem(SecondOrderSystem):
     found: tuple[FloatArray, FloatArray] = field(kw_only=True)
 
     @cached_property
-    def _modes(self) -> tuple[FloatArray, FloatArray]:
-        return self.found
+    def _modes(self) -> tuple[FloatArray, FloatArray, int]:
+        return *self.found, len(self.found[0])
 
     def flexibility(self, loads: FloatArray) -> FloatArray:
         """Return K^-1 loads, for loads (n,) or (n, k)."""

@@ -1,49 +1,19 @@
-"""What a structure did in a trial, in modal coordinates, and what sensors on it show of that."""
+"""What a system did in a trial, in modal coordinates, and what outputs show of that."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Quantity
 from discrepancy.models.interface import Response
-from fe.runtime.modal_system import ModalSystem
+from discrepancy.models.linear_system import LinearSystem
+from discrepancy.models.rig_records import Acting, Shown, shown_rows
 from fe.runtime.motion import Laws
 
 FloatArray = NDArray[np.float64]
-
-
-class Structure(Protocol):
-    """What a motion asks of the structure that moved; see `second_order.SecondOrderSystem`."""
-
-    @property
-    def relaxation(self) -> float:
-        """Delay of the modes without inertia [s]."""
-
-    @property
-    def angular_frequency(self) -> FloatArray:
-        """Angular frequencies (M,) [rad/s]."""
-
-    @property
-    def shapes(self) -> FloatArray:
-        """Mass-normalised mode shapes (n, M)."""
-
-    @property
-    def truncated(self) -> bool:
-        """Whether modes are left out."""
-
-    @property
-    def modal(self) -> ModalSystem:
-        """The modes with damping and ports."""
-
-    def residual(self, loads: FloatArray) -> FloatArray:
-        """Return the displacements by loads (n,) or (n, k) that the modes leave out."""
-
-    def port_rows(self, laws: Laws) -> FloatArray:
-        """Return the rows (J, n) of the laws' ports."""
 
 
 @dataclass(frozen=True)
@@ -52,16 +22,14 @@ class Motion:
 
     Attributes
     ----------
-    system : Structure
+    system : LinearSystem
         What moved.
+    acting : Acting
+        What acted.
     time : (N,) ndarray
-        Times of the motion since the release or the begin of the force [s].
-    q, velocity : (N, M) ndarray
-        Modal coordinates and their rates (mass-normalised).
-    force : (N,) ndarray
-        Applied force [N].
-    input_row : (n,) ndarray
-        Where it acts.
+        Times of the motion since the release or the begin of the record [s].
+    q, velocity : (N, M + P) ndarray
+        Modal coordinates, those of the drives too, and their rates (mass-normalised).
     port_forces : (N, J) ndarray
         Internal forces.
     lagged : (N, J) ndarray
@@ -70,87 +38,106 @@ class Motion:
         Their laws.
     held : int
         First samples that lie before the release, where the shape is held.
-    holding : float
-        Force that held the input point until the release [N].
+    holding : (n,) ndarray, optional
+        Force that held the release point until then [N].
     """
 
-    system: Structure
+    system: LinearSystem
+    acting: Acting
     time: FloatArray
     q: FloatArray
     velocity: FloatArray
-    force: FloatArray
-    input_row: FloatArray
     port_forces: FloatArray
     lagged: FloatArray
     laws: Laws
     held: int = 0
-    holding: float = 0.0
+    holding: FloatArray | None = None
 
     @cached_property
     def acceleration(self) -> FloatArray:
-        """Second derivatives (N, M) of the modal coordinates, from the equation of motion."""
-        square = self.system.angular_frequency**2
-        modal = self.system.modal
-        acceleration = -self.q * square - self.velocity @ modal.damping.T
+        """Second derivatives (N, M + P) of the modal coordinates, from the equation of motion."""
+        system, count = self.system, len(self.system.angular_frequency)
+        found = np.empty_like(self.q)
+        pull = self.q[:, :count] @ system.free.whole.T
         if self.laws.rate != 0.0:
-            acceleration -= self.laws.rate * self.time[:, None] * self.q * square
+            pull *= 1.0 + self.laws.rate * self.time[:, None]
+        found[:, :count] = system.forces_at(self.acting, self.time) - pull
+        found[:, :count] -= self.velocity[:, :count] @ system.free.damping.T
         if len(self.laws):
-            acceleration -= self.port_forces @ self.laws.rows(modal.ports, self.q.shape[1])
-        if np.any(self.force):
-            acceleration += np.outer(self.force, self.input_row @ self.system.shapes)
-        acceleration[: self.held] = 0.0
-        return np.asarray(acceleration)
+            rows = self.laws.rows(system.modal.actions or system.modal.ports, self.q.shape[1])
+            found[:, :count] -= self.port_forces @ rows[:, :count]
+        for number, drive in enumerate(self.acting.drives):
+            found[:, count + number] = system.heaviness * drive.at(self.time, 2)
+        found[: self.held] = 0.0
+        return found
 
-    @property
-    def _fading(self) -> FloatArray:
-        """What is left of a holding force in omitted modes (n,), at the first samples where any is."""
-        lag = self.system.relaxation
-        count = int(np.searchsorted(self.time, 40.0 * lag, side="right"))
-        return np.asarray(np.exp(-np.maximum(self.time[:count], 0.0) / lag))
+    @cached_property
+    def _jerk(self) -> FloatArray:
+        if len(self.time) < 2:
+            return np.zeros_like(self.q)
+        return np.asarray(np.gradient(self.acceleration, self.time, axis=0))
+
+    def derivative(self, order: int) -> FloatArray:
+        """Return a derivative (N, M + P) of the modal coordinates, up to the third."""
+        if order < 2:
+            return (self.q, self.velocity)[order]
+        return self.acceleration if order == 2 else self._jerk
 
     def values(self, rows: FloatArray) -> FloatArray:
-        """Return row . u (N, C) of rows (C, n).
+        """Return row . u and row . x (N, C) of rows (C, n + m)."""
+        n, shapes = self.system.displacements, self.system.all_shapes
+        found = self.q @ (rows[:, :n] @ shapes[:n]).T
+        if self.system.states:
+            found += self.velocity @ (rows[:, n:] @ shapes[n:]).T
+        return found + self._left_out(rows) if self.system.truncated else np.asarray(found)
 
-        Omitted modes follow applied forces without delay, and internal ones and the end of a holding force
-        with that of their damping.
+    def _left_out(self, rows: FloatArray) -> FloatArray:
+        """Return what omitted modes add to row . u (N, C).
+
+        They follow applied forces without delay, and internal ones and the end of a holding force with that
+        of their damping.
         """
-        values = self.q @ (rows @ self.system.shapes).T
-        if self.system.truncated:
-            if np.any(self.force):
-                values += np.outer(self.force, rows @ self.system.residual(self.input_row))
-            if len(self.laws):
-                port_rows = self.system.port_rows(self.laws)
-                values -= self.lagged @ (rows @ self.system.residual(port_rows.T)).T
-            if self.holding != 0.0 and self.system.relaxation > 0.0:
-                fading = self.holding * self._fading
-                count = len(fading)
-                values[:count] += np.outer(fading, rows @ self.system.residual(self.input_row))
-        return np.asarray(values)
+        system = self.system
+        residual, found = system.residual(rows.T), np.zeros((len(self.time), len(rows)))
+        if self.acting.loads:
+            found += self.acting.load_at(self.time, residual)
+        if len(self.laws):
+            found -= self.lagged @ (system.port_rows(self.laws) @ residual)
+        if self.holding is not None and system.relaxation > 0.0:
+            lag = system.relaxation
+            count = int(np.searchsorted(self.time, 40.0 * lag, side="right"))
+            fading = np.exp(-np.maximum(self.time[:count], 0.0) / lag)
+            found[:count] += np.outer(fading, self.holding @ residual)
+        return found
 
     def response(self, rows: FloatArray, quantities: Sequence[Quantity]) -> Response:
-        """Return what sensors at rows (C, n) show, and the rates.
+        """Return what sensors at rows (C, n) show, and the rates; see `seen`."""
+        return self.seen(shown_rows(rows, quantities))
 
-        Velocity and acceleration are derivatives of row . u, the other quantities row . u itself. Omitted
-        modes are part of values that are not derivatives only.
-        """
-        modal = rows @ self.system.shapes
-        values, rates = np.empty((2, len(self.q), len(rows)))
-        jerk: FloatArray | None = None
-        still = self.values(rows)
-        for column, quantity in enumerate(quantities):
-            if quantity is Quantity.VELOCITY:
-                values[:, column] = self.velocity @ modal[column]
-                rates[:, column] = self.acceleration @ modal[column]
-            elif quantity is Quantity.ACCELERATION:
-                if jerk is None:
-                    jerk = _slope(self.acceleration, self.time)
-                values[:, column] = self.acceleration @ modal[column]
-                rates[:, column] = jerk @ modal[column]
-            else:
-                values[:, column] = still[:, column]
-                rates[:, column] = self.velocity @ modal[column]
+    def seen(self, shown: Sequence[Shown]) -> Response:
+        """Return what outputs show, and the rates; omitted modes are in what is not derived only."""
+        system = self.system
+        values, rates = np.zeros((2, len(self.time), len(shown)))
+        for order, rows in enumerate(system.by_order(shown, system.all_shapes)):
+            if np.any(rows):
+                values += self.derivative(order) @ rows.T
+                if order < 3:
+                    rates += self.derivative(order + 1) @ rows.T
+        still = [number for number, item in enumerate(shown) if item.order == 0]
+        if system.truncated and still:
+            values[:, still] += self._left_out(np.array([shown[number].row for number in still]))
+        for number, item in enumerate(shown):
+            if item.constant:
+                values[:, number] += item.constant
+            if item.reaction is not None:
+                along = system.lift[:, item.reaction]
+                values[:, number] -= self.acting.load_at(self.time, along[:, None])[:, 0]
+                if len(self.laws):
+                    values[:, number] += self.port_forces @ (
+                        self.laws.rows(system.acting_rows, len(along)) @ along
+                    )
+            for factor, course in item.courses:
+                values[:, number] += factor * course.at(self.time)
+            if item.reaction is not None or item.courses:
+                rates[:, number] = np.gradient(values[:, number], self.time)
         return Response(values, rates)
-
-
-def _slope(values: FloatArray, time: FloatArray) -> FloatArray:
-    return np.asarray(np.gradient(values, time, axis=0)) if len(time) > 1 else np.zeros_like(values)

@@ -1,7 +1,7 @@
 """What the channels of a trial would show: the response of a model, seen through the sensors of a patch."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +23,7 @@ from fe.runtime.sensors import (
 
 FloatArray = NDArray[np.float64]
 
-__all__ = ["Observed", "observe", "observe_response", "record_of", "uses_sensors"]
-
-
-@dataclass(frozen=True)
-class Observed:
-    """What the channels of a trial would show without noise.
-
-    Attributes
-    ----------
-    values : (N, C) ndarray
-        By `trial.channels`, in the channels' units.
-    rates : (N, C) ndarray or None
-        Their time derivatives, for dynamic trials of models that give them.
-    """
-
-    values: FloatArray
-    rates: FloatArray | None
+__all__ = ["observe", "observe_response", "record_of", "uses_sensors"]
 
 
 def observe(
@@ -49,7 +33,7 @@ def observe(
     patch: ModelPatch,
     conditions: Conditions,
     refinement: int = 1,
-) -> Observed:
+) -> Response:
     """Return what the channels of a trial would show; gains and zeros that are nuisances are not in it.
 
     Parameters
@@ -81,8 +65,7 @@ def observe(
     )
     patch = (_by_channels(built_in_sensors(model), campaign) + patch).in_trial(trial.name)
     if not uses_sensors(patch):
-        response = model.respond(trial, outputs, patch, conditions, refinement=refinement)
-        return Observed(response.values, response.rates)
+        return model.respond(trial, outputs, patch, conditions, refinement=refinement)
     rate, zero = clock_of(patch)
     if rate or zero:
         clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
@@ -102,16 +85,7 @@ def observe(
             f"{model.name} gives no transverse and shear strain, so a turned gauge cannot be computed: leave "
             "gauge misalignment out for this model."
         )
-    return observe_response(
-        campaign,
-        trial,
-        patch,
-        conditions,
-        response.values,
-        response.rates,
-        response.transverse,
-        response.shear,
-    )
+    return observe_response(campaign, trial, patch, conditions, response)
 
 
 def logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> tuple[float, FloatArray] | None:
@@ -149,29 +123,21 @@ def _logged(
     """Return the response with the inputs at their true times, each channel sampled by its own clock."""
     inputs, channels = loggers
     stamped = replace(trial, time=(1.0 + inputs) * trial.time) if inputs else trial
-    values: dict[float, Response] = {}
-    for rate in np.unique(channels).tolist():
+    rates = np.unique(channels)
+    found = []
+    for rate in rates.tolist():
         beside = (1.0 + rate) / (1.0 + inputs) * (1.0 + conditions.clock[0]) - 1.0
         beside = 0.0 if abs(beside) < 1e-15 else beside
-        values[rate] = responded(stamped, replace(conditions, clock=(beside, conditions.clock[1])))
+        found.append(responded(stamped, replace(conditions, clock=(beside, conditions.clock[1]))))
+    own = [channels == rate for rate in rates]
 
     def merged(parts: list[FloatArray | None]) -> FloatArray | None:
         given = [part for part in parts if part is not None]
-        if len(given) < len(parts):
-            return None
-        found = given[0]
-        for rate, part in zip(values, given, strict=True):
-            found = np.where(channels == rate, part, found)
-        return found
+        return np.asarray(np.select(own, given)) if len(given) == len(parts) else None
 
-    every = list(values.values())
-    shown = merged([one.values for one in every])
-    assert shown is not None  # every response has values
     return Response(
-        shown,
-        merged([one.rates for one in every]),
-        merged([one.transverse for one in every]),
-        merged([one.shear for one in every]),
+        np.asarray(np.select(own, [one.values for one in found])),
+        *(merged([getattr(one, part) for one in found]) for part in ("rates", "transverse", "shear")),
     )
 
 
@@ -192,15 +158,8 @@ def _by_channels(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
 
 
 def observe_response(
-    campaign: Campaign,
-    trial: Trial,
-    patch: ModelPatch,
-    conditions: Conditions,
-    values: FloatArray,
-    rates: FloatArray | None = None,
-    transverse: FloatArray | None = None,
-    shear: FloatArray | None = None,
-) -> Observed:
+    campaign: Campaign, trial: Trial, patch: ModelPatch, conditions: Conditions, response: Response
+) -> Response:
     """Return what the channels show of a response that is known already; see `observe`.
 
     For callers that keep the response of a structure and try sensors on it. The clock of the patch must be in
@@ -208,12 +167,11 @@ def observe_response(
     """
     try:
         check_channels(patch, [(name, channel.quantity.value) for name, channel in campaign.channels.items()])
-        shown, shown_rates = apply_sensors(
-            patch, record_of(campaign, trial, conditions), values, rates, transverse, shear
-        )
+        record = record_of(campaign, trial, conditions)
+        parts = (response.values, response.rates, response.transverse, response.shear)
+        return Response(*apply_sensors(patch, record, *parts))
     except InvalidPatchError as cause:
         raise CatalogueError(str(cause)) from cause
-    return Observed(shown, shown_rates)
 
 
 def record_of(campaign: Campaign, trial: Trial, conditions: Conditions) -> SensorRecord:

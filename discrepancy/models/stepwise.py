@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.models.compiled_motion import compiled_steps
-from discrepancy.models.input_course import SMOOTH_PARTS, Course
 from discrepancy.models.memory import Memory
-from discrepancy.models.stepwise_kernel import Structure
+from discrepancy.models.stepwise_kernel import Steps, Structure
 from fe.runtime.modal_system import ModalSystem, exact_step
 from fe.runtime.motion import FASTEST_PHASE, SLOWEST_PHASE, Laws, ModalMotion, port_flexibility
 from fe.runtime.motion_arrays import Samples, State
@@ -30,7 +29,7 @@ ALIKE = 1e-9
 KEPT_STEPS = 16
 STEPS_AT_LEAST = 8
 """Substeps of an interval with laws where nothing in the structure has a pace of its own."""
-_kept = Memory(KEPT_STEPS)
+_kept, _divided = Memory(KEPT_STEPS), Memory(KEPT_STEPS)
 
 
 @dataclass(frozen=True)
@@ -56,11 +55,17 @@ class CoupledModes(ModalSystem):
         )
 
     @cached_property
+    def whole(self) -> FloatArray:
+        """S, a matrix where no coordinate is coupled too."""
+        return np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
+
+    @cached_property
     def paces(self) -> FloatArray:
-        """Magnitudes (2M,) of the eigenvalues [1/s] of the motion, without those that are zero."""
+        """Frequencies, or magnitudes (2M,) of the eigenvalues [1/s] of the motion that are not zero."""
         count = len(self.angular_frequency)
-        stiffness = np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
-        matrix = np.block([[np.zeros((count, count)), np.eye(count)], [-stiffness, -self.damping]])
+        if self.stiffness_matrix is None and np.all(self.angular_frequency > 0.0):
+            return self.angular_frequency
+        matrix = np.block([[np.zeros((count, count)), np.eye(count)], [-self.whole, -self.damping]])
         found = np.abs(np.linalg.eigvals(matrix))
         return np.asarray(found[found > 1e-7 * np.max(found, initial=0.0)])
 
@@ -97,70 +102,16 @@ class ExactSteps:
         )
 
 
-def exact_steps(system: ModalSystem, lengths: FloatArray) -> ExactSteps:
-    """Return the exact steps of lengths (K,) [s]."""
-    usual = float(np.median(lengths))
-    _, first, which = np.unique(np.round(lengths / (ALIKE * usual)), return_index=True, return_inverse=True)
-    distinct = np.ascontiguousarray(lengths[first])
-    stiffness = _stiffness_of(system)
-    key = (stiffness.tobytes(), system.damping.tobytes(), distinct.tobytes())
-    whole = stiffness if system.coupled else np.ascontiguousarray(np.diag(stiffness))
-    transition, begin, end = _kept.get(key, lambda: exact_step(whole, system.damping, distinct))
-    return ExactSteps(distinct, np.asarray(which, dtype=np.int64).ravel(), transition, begin, end)
+def exact_steps(system: CoupledModes, boundaries: "Boundaries") -> ExactSteps:
+    """Return the exact steps between boundaries."""
+    lengths, which = boundaries.alike
+    key = (system.whole.tobytes(), system.damping.tobytes(), lengths.tobytes())
+    return ExactSteps(lengths, which, *_kept.get(key, lambda: exponentials(system, lengths)))
 
 
-def _stiffness_of(system: ModalSystem) -> FloatArray:
-    given = system.stiffness_matrix if isinstance(system, CoupledModes) else None
-    return np.diag(system.stiffness) if given is None else given
-
-
-def simulate_at(
-    system: ModalSystem,
-    laws: Laws,
-    *,
-    q: FloatArray,
-    v: FloatArray,
-    time: FloatArray,
-    course: Course,
-    shape: FloatArray,
-    memory: FloatArray | None = None,
-    feed: FloatArray | None = None,
-    refinement: int = 1,
-) -> ModalMotion:
-    """Return the motion at time stamps under a force, from a state at the first of them.
-
-    Parameters
-    ----------
-    system : ModalSystem
-        The linear structure.
-    laws : Laws
-        Its internal forces.
-    q, v : (M,) ndarray
-        State at the first stamp.
-    time : (N,) ndarray
-        Stamps since the begin of the record [s], strictly increasing.
-    course : Course
-        The force, linear, held or smooth between its samples.
-    shape : (M,) ndarray
-        Modal forces by a unit of it.
-    memory : (J, 5 + E) ndarray, optional
-        Of the laws; left out, each law has been loaded from zero to its first position without turning back.
-    feed : (J,) ndarray, optional
-        What a unit of the force adds to the positions of the laws' ports beyond the modes.
-    refinement : int
-        Steps are this many times smaller than usual.
-
-    Returns
-    -------
-    ModalMotion
-        At the stamps, the first included.
-    """
-    boundaries = substeps(system, laws, time, refinement, SMOOTH_PARTS if course.is_smooth else 1, laws.edges)
-    begin, end = (np.outer(force, shape) for force in course.ends(boundaries.time))
-    found = exact_steps(system, boundaries.lengths)
-    fed = np.outer(course.at(boundaries.time), np.zeros(len(laws)) if feed is None else feed)
-    push = found.push(begin, end)
-    return advance(system, laws, found, boundaries, q, v, push, begin, end, fed, memory)
+def exponentials(system: CoupledModes, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return transitions (S, 2M, 2M) and the parts of the force at both ends (S, 2M, M), of lengths [s]."""
+    return exact_step(system.whole if system.coupled else system.stiffness, system.damping, lengths)
 
 
 @dataclass(frozen=True)
@@ -181,9 +132,19 @@ class Boundaries:
     sample: IntArray
     lengths: FloatArray
 
+    @cached_property
+    def alike(self) -> tuple[FloatArray, IntArray]:
+        """Distinct lengths (S,) [s], and which (K,) each step has."""
+        usual = float(np.median(self.lengths))
+        if np.ptp(self.lengths) <= ALIKE * usual:
+            return self.lengths[:1], np.zeros(len(self.lengths), dtype=np.int64)
+        rounded = np.round(self.lengths / (ALIKE * usual))
+        _, first, which = np.unique(rounded, return_index=True, return_inverse=True)
+        return np.ascontiguousarray(self.lengths[first]), np.asarray(which, dtype=np.int64).ravel()
+
 
 def substeps(
-    system: ModalSystem,
+    system: CoupledModes,
     laws: Laws,
     time: FloatArray,
     refinement: int = 1,
@@ -200,6 +161,11 @@ def substeps(
         found = substeps(system, laws, moments, refinement, least)
         return replace(found, sample=found.sample[np.searchsorted(moments, time)])
     parts = np.maximum(_substeps(system, laws, np.diff(time)), least) * refinement
+    return _divided.get((time.tobytes(), parts.tobytes()), lambda: _boundaries(time, parts))
+
+
+def _boundaries(time: FloatArray, parts: IntArray) -> Boundaries:
+    """Return the steps by which each interval between stamps (N,) is divided into parts (N - 1,)."""
     sample = np.concatenate(([0], np.cumsum(parts))).astype(np.int64)
     lengths = np.repeat(np.diff(time) / parts, parts)
     interval = np.repeat(np.arange(len(parts)), parts)
@@ -209,37 +175,31 @@ def substeps(
     return Boundaries(moments, sample, lengths)
 
 
-def advance(
-    system: ModalSystem,
-    laws: Laws,
-    steps: ExactSteps,
-    boundaries: Boundaries,
-    q: FloatArray,
-    v: FloatArray,
-    push: FloatArray,
-    begin: FloatArray,
-    end: FloatArray,
-    feed: FloatArray,
-    memory: FloatArray | None,
-) -> ModalMotion:
-    """Return the motion at the stamps of known steps; for arguments see `simulate_at` and `Steps`.
+class Begin(NamedTuple):
+    """Modal displacements and speeds (M + P,), and the laws' memory; None: loaded from zero at once."""
+
+    q: FloatArray
+    v: FloatArray
+    memory: FloatArray | None = None
+
+
+def advance(system: CoupledModes, laws: Laws, steps: Steps, begin: Begin) -> ModalMotion:
+    """Return the motion at the samples of known steps.
 
     Where laws begin or end, a new section does: modes and the laws that go on keep their state, a law that
     begins has been loaded from zero to where its port is.
     """
-    modes, count = len(q), len(boundaries.sample)
+    (q, v, memory), modes, count = begin, len(begin.q), len(steps.sample)
     result = ModalMotion(
         np.empty((count, modes)), np.empty((count, modes)), np.empty((count, len(laws))),
         laws.memory() if memory is None else memory.copy(), np.empty((count, len(laws))),
     )  # fmt: skip
     state = State(np.array(q, dtype=float), np.array(v, dtype=float), result.memory, np.zeros(len(laws)))
     rows = laws.rows(system.ports, modes)
-    acts = rows
-    if isinstance(system, CoupledModes) and system.actions:
-        acts = laws.rows(system.actions, modes)
+    acts = laws.rows(system.actions, modes) if system.actions else rows
     flexibility = port_flexibility(system, laws)
     before = np.ones(len(laws), dtype=bool)
-    for section in _sections(laws, boundaries):
+    for section in _sections(laws, steps):
         first, last = section.first, section.last
         now = section.acts[:, None]
         ports = laws.at(rows * now, flexibility, system.relaxation, np.zeros((2, len(laws))), acts * now)
@@ -248,10 +208,10 @@ def advance(
         moving = started & (laws.of_speed == 1)
         state.memory[moving, 1] = rows[moving] @ state.q
         state.current[:] = 0.0
-        between = slice(first, last)
+        between = (steps.which, steps.push, steps.begin, steps.end)
         arrays = (
-            steps.transition, steps.length, steps.which[between], push[between], begin[between], end[between],
-            feed[first : last + 1], boundaries.time[first : last + 1],
+            steps.transition, steps.length, *(item[first:last] for item in between),
+            steps.feed[first : last + 1], steps.time[first : last + 1],
         )  # fmt: skip
         given = (*(np.ascontiguousarray(item) for item in arrays), section.record)  # fields of `Steps`
         structure = Structure(
@@ -280,35 +240,32 @@ class _Section(NamedTuple):
     last: int
     acts: BoolArray
     record: IntArray
-    kept: IntArray
-    samples: IntArray
+    kept: IntArray | slice
+    samples: IntArray | slice
 
 
-def _sections(laws: Laws, boundaries: Boundaries) -> Iterator[_Section]:
+def _sections(laws: Laws, steps: Steps) -> Iterator[_Section]:
     """Yield the sections; one where all laws always act. A stamp at an edge belongs to what begins there."""
-    time, count = boundaries.time, len(boundaries.lengths)
-    every = np.arange(len(boundaries.sample))
+    time, sample, count = steps.time, steps.sample, len(steps.which)
     if not laws.spans:
-        yield _Section(0, count, np.ones(len(laws), dtype=bool), boundaries.sample, every, every)
+        every = slice(None)
+        yield _Section(0, count, np.ones(len(laws), dtype=bool), sample, every, every)
         return
     inside = np.array([moment for moment in laws.edges if time[0] < moment < time[-1]])
     cuts = np.unique(np.concatenate(([0, count], np.searchsorted(time, inside)))).tolist()
     for first, last in pairwise(cuts):
-        own = (boundaries.sample >= first) & (
-            (boundaries.sample < last) | ((boundaries.sample == last) & (last == count))
-        )
-        sample = boundaries.sample[own] - first
-        record = np.unique(np.concatenate(([0], sample, [last - first]))).astype(np.int64)
+        own = (sample >= first) & ((sample < last) | ((sample == last) & (last == count)))
+        kept = sample[own] - first
+        record = np.unique(np.concatenate(([0], kept, [last - first]))).astype(np.int64)
         acts = laws.act_at(0.5 * float(time[first] + time[first + 1]))
-        yield _Section(first, last, acts, record, np.searchsorted(record, sample), np.flatnonzero(own))
+        yield _Section(first, last, acts, record, np.searchsorted(record, kept), np.flatnonzero(own))
 
 
-def _substeps(system: ModalSystem, laws: Laws, lengths: FloatArray) -> IntArray:
+def _substeps(system: CoupledModes, laws: Laws, lengths: FloatArray) -> IntArray:
     """Return how many steps each interval (K,) is divided into, as `fe.runtime.motion.substeps_for` does."""
     if laws.linear:
         return np.ones(len(lengths), dtype=np.int64)
-    paces = system.paces if isinstance(system, CoupledModes) else system.angular_frequency
-    paces = paces[paces > 0.0]
+    paces = system.paces
     if not len(paces):
         return np.full(len(lengths), STEPS_AT_LEAST, dtype=np.int64)
     rate = max(float(paces.min()) / SLOWEST_PHASE, float(paces.max()) / FASTEST_PHASE)

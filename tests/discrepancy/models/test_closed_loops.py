@@ -218,7 +218,7 @@ def test_flows_are_offered_at_states_and_forces_are_not() -> None:
         (PENDULUM, "sine_force", "sine", "the law 'gravity' has the kind 'sine', but"),
         (PENDULUM, "wave_number = 1.0\n", "", "lacks wave_number"),
         (PENDULUM, 'port = "pivot"', 'port = "axle"', "acts on the port 'axle', but there are pivot"),
-        (PENDULUM, 'controller = "position"', 'controller = "pd"', "is what 'pd' gives, but controllers are"),
+        (PENDULUM, 'controller = "position"', 'controller = "pd"', "a controller gives, 'pd', but there are"),
         (PENDULUM, '"angle"\nreference', '"angular_velocity"\nreference', "leave `derivative` out"),
         (PENDULUM, '"position.proportional"', '"position.gain"', "scales 'position.gain', but there are"),
         (TANKS, "acts = [1.0, -1.0]", "acts = [-1.0, 1.0]", "must take from what its vector sees"),

@@ -330,7 +330,7 @@ def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
     force = np.asarray(15.0 * np.sin(2.0 * np.pi * time / 90.0))
     rows = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
     moved = system.forced(TIP, Course.of(time, force), time, laws).values(rows)
-    still = system.static(np.outer(force, TIP), laws) @ rows.T
+    still = system.static(np.outer(force, TIP), laws).values @ rows.T
     assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())
 
 
@@ -341,7 +341,8 @@ def test_a_release_goes_on_from_its_static_state(name: str) -> None:
     first = motion.response(rows, (Quantity.DISPLACEMENT,) * 2).values[0]
     assert first[0] == pytest.approx(0.02, rel=1e-9)
     system = motion.system
-    at_rest = system.static(np.outer([0.0, motion.holding], TIP), motion.laws)[-1]
+    assert motion.holding is not None
+    at_rest = system.static(np.stack((0.0 * TIP, motion.holding)), motion.laws).values[-1]
     assert first[1] == pytest.approx(at_rest[0], rel=1e-4)
 
 

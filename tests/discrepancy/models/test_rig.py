@@ -18,6 +18,7 @@ from discrepancy.campaign.records import (
     Hold,
     Quantity,
     RecordedInput,
+    Release,
     Start,
     Trial,
     TrialKind,
@@ -30,7 +31,7 @@ from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
 from discrepancy.models.lumped_scales import FORCES
-from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.patch import ModelPatch, ModulusTemperature, PowerDamping, PowerStiffness, Primitive
 
 FloatArray = NDArray[np.float64]
 
@@ -493,7 +494,7 @@ matrix = [[0.0, 0.0], [0.0, 0.08]]
             DAMPER,
             'reaction = "actuator"',
             'reaction = "hand"',
-            "is the reaction of 'hand', which is no input",
+            "is the reaction of the prescribed motion 'hand', but there are actuator",
         ),
         (DAMPER, 'quantity = "force"', 'quantity = "level"', "is a reaction: give it quantity"),
         (DAMPER, 'reaction = "actuator"\n', "", "needs one of a vector, a reaction and a controller"),
@@ -551,3 +552,48 @@ def test_the_same_record_is_one_course_to_the_last_bit():
             assert np.array_equal(one.at(between), other.at(between))
             assert np.array_equal(one.ends(between), other.ends(between))
     assert not np.array_equal(drive.at(between, 0), Drive.of(time, cosine, 1).at(between, 0))
+
+
+WHEEL = """
+format = 1
+name = "Wheel on a spring"
+mass = 1.0
+stiffness = 100.0
+damping = { alpha = 0.0 }
+[[input]]
+name = "twist"
+vector = 1.0
+quantity = "torque"
+[[output]]
+name = "turn"
+vector = 1.0
+quantity = "angle"
+"""
+HELD = """
+[[controller]]
+name = "hold"
+vector = 1.0
+acts = 1.0
+quantity = "angle"
+proportional = 50.0
+[[output]]
+name = "given"
+controller = "hold"
+quantity = "torque"
+"""
+
+
+def test_an_angle_that_is_let_go_shows_its_speed() -> None:
+    time = 0.01 * np.arange(100)
+    what = trial(time, kind=TrialKind.RINGDOWN, begins=Start.SETTLED, release=Release(0.02))
+    found = shown(model_of(WHEEL), what, {"turn": Quantity.ANGULAR_VELOCITY})[:, 0]
+    np.testing.assert_allclose(found, -0.2 * np.sin(10.0 * time), atol=1e-12)
+
+
+def test_a_rig_at_rest_has_the_temperature_of_each_level_and_what_holds_it() -> None:
+    warm = {"force": np.full(3, 3.0), "temperature": np.array([0.0, 40.0, 0.0])}
+    what = trial(np.arange(3.0), kind=TrialKind.STATIC, begins=Start.SETTLED, **warm)
+    outputs = {"turn": Quantity.ANGLE, "given": Quantity.TORQUE}
+    found = shown(model_of(WHEEL + HELD), what, outputs, ModulusTemperature(0.01))
+    turn = 3.0 / (np.array([100.0, 60.0, 100.0]) + 50.0)
+    np.testing.assert_allclose(found, np.stack((turn, -50.0 * turn), axis=1), rtol=1e-12)

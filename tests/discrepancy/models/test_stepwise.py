@@ -13,8 +13,8 @@ from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.input_course import Course
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.stepwise import CoupledModes, exact_steps, simulate_at
-from fe.runtime.modal_system import ModalSystem
+from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.models.stepwise import Boundaries, CoupledModes, exact_steps
 from fe.runtime.motion import NO_LAWS, laws_of, simulate
 from fe.runtime.patch import HighPass, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.sensors import SensorRecord, apply_sensors
@@ -59,7 +59,8 @@ def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
     frequency = np.array([0.0, 7.0, 60.0])
     system = CoupledModes(frequency, damping)
     lengths = np.array([0.01, 0.013, 0.01, 0.4])
-    found = exact_steps(system, lengths)
+    time = np.concatenate(([0.0], np.cumsum(lengths)))
+    found = exact_steps(system, Boundaries(time, np.arange(5), lengths))
     np.testing.assert_array_equal(found.length[found.which], lengths)
     for k, h in enumerate(lengths):
         matrix = np.zeros((12, 12))
@@ -75,16 +76,19 @@ def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
 
 @pytest.mark.parametrize("laws", [(), (COULOMB,), (QUADRATIC, CUBIC)])
 def test_even_stamps_are_those_of_the_even_stepper(laws: tuple[Primitive, ...]) -> None:
-    system = ModalSystem(np.array([9.0, 31.0]), np.diag([0.1, 0.4]), {"joint": np.array([0.7, -1.1])})
+    ports = {"joint": np.array([0.7, -1.1])}
+    system = SecondOrderSystem(np.eye(2), np.diag([0.1, 0.4]), np.diag([81.0, 961.0]), ports)
     internal = laws_of(ModelPatch(laws), system.ports) if laws else NO_LAWS
     time, shape = 0.01 * np.arange(300), np.array([0.4, 0.9])
     force = np.random.default_rng(0).normal(size=300)
-    q, v = np.array([0.01, 0.002]), np.zeros(2)
+    force[0] = 0.0
     even = simulate(
-        system, internal, q=q, v=v, force=force, interval=0.01, shape=shape, kernel=compiled_kernel()
-    )
-    found = simulate_at(system, internal, q=q, v=v, time=time, course=Course.of(time, force), shape=shape)
-    for one, other in zip(found, even, strict=True):
+        system.modal, internal, q=np.zeros(2), v=np.zeros(2), force=force, interval=0.01,
+        shape=shape @ system.shapes, kernel=compiled_kernel(),
+    )  # fmt: skip
+    found = system.forced(shape, Course.of(time, force), time, internal)
+    pairs = ((found.q, even.q), (found.velocity, even.v), (found.port_forces, even.port_forces))
+    for one, other in pairs:
         np.testing.assert_allclose(
             one, other, rtol=1e-9, atol=1e-9 * max(1e-9, float(np.abs(other).max(initial=0.0)))
         )
@@ -94,7 +98,7 @@ def test_a_forced_motion_at_uneven_stamps_is_exact(chain: LumpedModel) -> None:
     time = jittered(200, 0.02, 0.9)
     force = np.random.default_rng(2).normal(size=len(time))
     force[0] = 0.0
-    system = chain._system(np.ones(3), (), 0.0)
+    system = chain.rig(np.ones(3)).system()
     matrix = np.zeros((8, 8))
     matrix[:3, 3:6] = np.eye(3)
     matrix[3:6, :3] = -np.linalg.solve(system.mass, system.stiffness)
@@ -131,7 +135,7 @@ def test_leaving_samples_out_changes_nothing_at_the_others(
 
 def test_a_smooth_law_at_uneven_stamps_is_that_of_a_general_integrator(chain: LumpedModel) -> None:
     time = jittered(120, 0.01, 0.8)
-    system = chain._system(np.ones(3), (), 0.0)
+    system = chain.rig(np.ones(3)).system()
     row, end = chain._ports["joint"], np.array([0.0, 0.0, 1.0])
     inverse = np.linalg.inv(system.mass)
     start = 0.02 * system.flexibility(end) / float(end @ system.flexibility(end))

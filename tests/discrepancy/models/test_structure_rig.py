@@ -13,7 +13,7 @@ import pytest
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.fmu_excitation import Excitation
+from discrepancy.models.fmu_excitation import Excitation, Run
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.reduced_structure import structure_model
 from fe.reduction.reduced_basis import reduce_structure
@@ -138,7 +138,7 @@ def test_systems_of_small_steps_come_from_steps_that_tell_all_modes(
         assert system is not None
         force = np.random.default_rng(refinement).uniform(-1.0, 1.0, (400, 1))
         loads = [(Excitation("input", "push", force[:, 0].copy()), 1.0)]
-        wanted = motion.free(motion.nominal, step / refinement, 400, loads)
+        wanted = motion.free(Run(motion.nominal, step / refinement, 400, loads))
         largest = np.abs(wanted).max(axis=0)
         np.testing.assert_allclose(system.motion(force) / largest, wanted / largest, atol=1e-6)
     assert motion.ports.parts(step) == 2

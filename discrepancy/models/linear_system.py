@@ -1,0 +1,360 @@
+"""A linear system with ports: M z'' + C z' + K z = loads, its modes and its rest.
+
+Displacements u and states x, M u'' + C u' + K u = F x + b(t), T x' + R x = G u' + H u + d(t): a state is the
+speed of a coordinate that has no stiffness, x = s', so that both are one equation in z = (u, s).
+A motion that is prescribed takes its direction out of u; what is left moves in its modes. For the laws at
+ports the prescribed motion is a coordinate of its own, so heavy that they do not move it (`HEAVY`), and it is
+put right at every step. The wing, a structure on springs and a lumped rig are such systems.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, eigh, null_space
+from scipy.linalg.lapack import dpotrs
+
+from discrepancy.errors import ModelError
+from discrepancy.models.compiled_motion import compiled_kernel
+from discrepancy.models.ported import OutputRows, PortedSystem, modal_system
+from discrepancy.models.rig_records import Acting, Shown
+from discrepancy.models.stepwise import CoupledModes
+from fe.runtime.errors import SolutionError
+from fe.runtime.motion import NO_LAWS, Laws, StaticSolution, static_solution
+
+FloatArray = NDArray[np.float64]
+
+HEAVY = 1e12
+"""Mass of a prescribed coordinate over the largest of the system."""
+LEAST_PIVOT = 1e-9
+"""A system whose equilibrium is determined worse than this has none of its own."""
+ROUNDING = 1e-10
+"""Share of the largest entry below which what couples modes is rounding."""
+
+
+class Rest(NamedTuple):
+    """Displacements and states `values` (L, N) at rest, forces (L, J) and memory of the laws (None: none)."""
+
+    values: FloatArray
+    forces: FloatArray
+    memory: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSystem:
+    """A linear system of N unknowns, n of them displacements.
+
+    Attributes
+    ----------
+    mass, damping, stiffness : (N, N) ndarray
+        Of (u, s): diag(M, T), [[C, -F], [-G, R]], [[K, 0], [-H, 0]].
+    ports : mapping of str to (N,) ndarray
+        Rows of the ports where internal forces act: a displacement [m] or rotation [rad] is row . u, or a
+        state row . x.
+    mode_count : int or None
+        Modes that move of a structure that springs hold, with mass and stiffness positive definite; the
+        others follow without inertia. None: all, and nothing need hold it.
+    relaxation : float
+        Factor of the part of the damping that goes with the stiffness, for the modes without inertia [s].
+    on_modes : frozenset of str
+        Ports whose position is that of the modes that move alone.
+    states : int
+        N - n.
+    drives : (P, N) ndarray
+        Rows whose motion is prescribed.
+    actions : mapping of str to (N,) ndarray
+        Rows along which laws at ports act, where that is not how they see.
+    """
+
+    mass: FloatArray
+    damping: FloatArray
+    stiffness: FloatArray
+    ports: Mapping[str, FloatArray]
+    mode_count: int | None = None
+    relaxation: float = 0.0
+    on_modes: frozenset[str] = frozenset()
+    states: int = 0
+    drives: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    actions: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def displacements(self) -> int:
+        """Displacements n."""
+        return len(self.mass) - self.states
+
+    @cached_property
+    def acting_rows(self) -> dict[str, FloatArray]:
+        """Rows (N,) along which laws at the ports act."""
+        return {**self.ports, **self.actions}
+
+    # ------------------------------------------------------------ modes
+
+    @cached_property
+    def lift(self) -> FloatArray:
+        """Displacements (N, P) by unit motions of the drives."""
+        found = np.zeros((len(self.mass), len(self.drives)))
+        if len(self.drives):
+            found[: self.displacements] = np.linalg.pinv(self.drives[:, : self.displacements])
+        return found
+
+    @cached_property
+    def _modes(self) -> tuple[FloatArray, FloatArray, int]:
+        """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
+        n, most = self.displacements, self.mode_count
+        mass, stiffness = self.mass[:n, :n], 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
+        free = np.eye(n)
+        if len(self.drives):
+            free = null_space(self.drives[:, :n])
+            mass, stiffness = free.T @ mass @ free, free.T @ stiffness @ free
+        square, shapes = np.zeros(0), np.zeros((0, 0))
+        if len(mass):
+            chosen = [0, most - 1] if most and most < len(mass) else None
+            try:
+                square, shapes = eigh(stiffness, mass, subset_by_index=chosen)
+            except np.linalg.LinAlgError as cause:
+                raise ModelError(f"The mass matrix must be positive definite ({cause}).") from cause
+        if most is None:
+            square = np.where(np.abs(square) <= ROUNDING * np.max(np.abs(square), initial=0.0), 0.0, square)
+        elif square[0] <= 0.0:
+            raise ModelError(
+                f"The stiffness matrix must be positive definite, but an eigenvalue is {square[0]:g} 1/s^2."
+            )
+        moving = len(square)
+        found = np.zeros((len(self.mass), moving + self.states))
+        found[:n, :moving] = free @ shapes
+        if self.states:
+            capacity, axes = np.linalg.eigh(self.mass[n:, n:])
+            found[n:, moving:] = axes / np.sqrt(capacity)
+        none = np.zeros(self.states)
+        return np.concatenate((np.sqrt(np.maximum(square, 0.0)), none)), found, moving
+
+    @property
+    def angular_frequency(self) -> FloatArray:
+        """Angular frequencies (M,) [rad/s] of what is free, rising; zero for rigid motions and states."""
+        return self._modes[0]
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Mass-normalised shapes (N, M) of what is free."""
+        return self._modes[1]
+
+    @property
+    def moving(self) -> int:
+        """How many of the coordinates are displacements; the others are states."""
+        return self._modes[2]
+
+    @property
+    def truncated(self) -> bool:
+        """Whether modes are left out."""
+        return self.mode_count is not None and self.mode_count < len(self.mass)
+
+    @cached_property
+    def heaviness(self) -> float:
+        """Square root of the mass of the drives."""
+        return float(np.sqrt(HEAVY * np.max(np.abs(self.mass))))
+
+    @cached_property
+    def all_shapes(self) -> FloatArray:
+        """Shapes (N, M + P) of what is free and of the drives, mass-normalised."""
+        return np.hstack((self.shapes, self.lift / self.heaviness)) if len(self.drives) else self.shapes
+
+    @cached_property
+    def free(self) -> CoupledModes:
+        """What is free, with ports; what couples modes by rounding only does not."""
+        frequency, shapes, _ = self._modes
+        damping, stiffness = (shapes.T @ matrix @ shapes for matrix in (self.damping, self.stiffness))
+        diagonal, loose = np.diag(np.diag(damping)), self.mode_count is None
+        if loose:
+            apart = np.abs(stiffness - np.diag(frequency**2)).max(initial=0.0)
+            loose = bool(apart > ROUNDING * np.abs(stiffness).max(initial=1e-300))
+        if np.abs(damping - diagonal).max(initial=0.0) <= ROUNDING * np.abs(diagonal).max(initial=1e-300):
+            damping = diagonal
+        return CoupledModes(
+            frequency, damping, self._modal(self.ports), self._left_out, self.relaxation,
+            stiffness if loose else None, self._modal(self.acting_rows if self.actions else {}),
+        )  # fmt: skip
+
+    def _modal(self, rows: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        return {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
+
+    @cached_property
+    def modal(self) -> CoupledModes:
+        """What is free and the drives, with ports."""
+        if not len(self.drives):
+            return self.free
+        further, stiffness = (0, len(self.drives)), self.free.stiffness_matrix
+        return replace(
+            self.free,
+            angular_frequency=np.pad(self.free.angular_frequency, further),
+            damping=np.pad(self.free.damping, further),
+            stiffness_matrix=None if stiffness is None else np.pad(stiffness, further),
+        )
+
+    @cached_property
+    def _left_out(self) -> FloatArray | None:
+        """Flexibility (P,) of the ports that the modes leave out; None if there is none."""
+        if not (self.truncated and self.ports):
+            return None
+        rows = np.array(list(self.ports.values()))
+        left_out = np.einsum("pn,np->p", rows, self.residual(rows.T))
+        whole = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
+        flexible = [name not in self.on_modes for name in self.ports]
+        return np.where((left_out > 1e-9 * whole) & flexible, left_out, 0.0)  # less is rounding
+
+    def port_rows(self, laws: Laws) -> FloatArray:
+        """Return the rows (J, N) of the laws' ports."""
+        return laws.rows(self.ports, len(self.mass))
+
+    # ------------------------------------------------------------ rest
+
+    @cached_property
+    def _factor(self) -> tuple[FloatArray, bool]:
+        factor: tuple[FloatArray, bool] = cho_factor(self.stiffness)
+        return factor
+
+    def flexibility(self, loads: FloatArray) -> FloatArray:
+        """Return K^-1 loads, for loads (n,) or (n, k), of a structure that springs hold."""
+        # the LAPACK routine itself: checks of its arguments would take ten times as long
+        solution, _ = dpotrs(self._factor[0], loads, lower=self._factor[1])
+        return np.asarray(solution)
+
+    def residual(self, loads: FloatArray) -> FloatArray:
+        """Return the part of K^-1 loads, (n,) or (n, k), that the modes leave out."""
+        return np.asarray(self._residual @ loads)
+
+    @cached_property
+    def _residual(self) -> FloatArray:
+        held = (self.shapes / self.angular_frequency**2) @ self.shapes.T
+        return self.flexibility(np.eye(len(self.mass))) - held
+
+    @cached_property
+    def _restoring(self) -> tuple[FloatArray, bool]:
+        """Matrix (M, M) of modal forces at rest by displacements and states; whether it tells the rest."""
+        matrix = np.hstack((self.free.whole[:, : self.moving], self.free.damping[:, self.moving :]))
+        values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.ones(1)
+        return matrix, bool(values[-1] > LEAST_PIVOT * max(values[0], 1e-300))
+
+    def _resting(self, loads: FloatArray) -> FloatArray:
+        """Return displacements and states (L, N) at rest under loads (L, N).
+
+        Raises
+        ------
+        ModelError
+            If nothing holds the system against a load.
+        """
+        if self.mode_count is not None:
+            return self.flexibility(loads.T).T
+        (restoring, tells), force = self._restoring, loads @ self.shapes
+        if tells:
+            return np.asarray(np.linalg.solve(restoring, force.T).T @ self.shapes.T)
+        found = np.linalg.lstsq(restoring, force.T, rcond=LEAST_PIVOT)[0]
+        if np.max(np.abs(restoring @ found - force.T)) > 1e-6 * max(float(np.max(np.abs(force))), 1e-300):
+            size = float(np.max(np.abs(restoring), initial=0.0))
+            raise ModelError(
+                "the rig has no rest under what acts at the first sample (nothing holds it): say "
+                f'`begins` = "still" or "unknown" (its largest restoring coefficient is {size:.3g})'
+            )
+        return np.asarray(found.T @ self.shapes.T)
+
+    def static(
+        self,
+        loads: FloatArray,
+        laws: Laws = NO_LAWS,
+        *,
+        drive: FloatArray | None = None,
+        memory: FloatArray | None = None,
+        before: FloatArray | None = None,
+    ) -> Rest:
+        """Return the rest under loads (L, N) that follow one another from zero.
+
+        Parameters
+        ----------
+        loads : (L, N) ndarray
+            Levels.
+        laws : Laws
+            Internal forces; ports of states are at no position.
+        drive : (P,) ndarray, optional
+            Where the drives hold what they move.
+        memory, before : ndarray, optional
+            Of the laws, and the load (N,), where the first level is reached from; by default never loaded.
+
+        Raises
+        ------
+        ModelError
+            If nothing holds the system, or a law takes more than it has.
+        """
+        if drive is not None and len(drive):
+            held = self.lift @ drive
+            linear = self._resting(loads - self.stiffness @ held) + held
+        else:
+            linear = self._resting(loads)
+        if not len(laws):
+            return Rest(linear, np.zeros((len(loads), 0)), None)
+        rows = self.port_rows(laws)
+        rows[:, self.displacements :] = 0.0
+        answer = self._resting(rows)
+        start = None if before is None else rows @ self._resting(before[None])[0]
+        solution = solved(laws, linear @ rows.T, rows @ answer.T, memory, start)
+        return Rest(linear - solution.forces @ answer, solution.forces, solution.memory)
+
+    # ------------------------------------------------------------ what acts, and what is seen
+
+    def driven(self, number: int) -> list[FloatArray]:
+        """Return what resists a drive's motion, its speed and its acceleration, on the modes (M,)."""
+        along = self.lift[:, number]
+        return [self.shapes.T @ (matrix @ along) for matrix in (self.stiffness, self.damping, self.mass)]
+
+    def forces_at(self, acting: Acting, time: FloatArray) -> FloatArray:
+        """Return the modal forces (T, M) of loads and drives at times."""
+        total = acting.load_at(time, self.shapes)
+        for number, drive in enumerate(acting.drives):
+            for order, part in enumerate(self.driven(number)):
+                total -= np.outer(drive.at(time, order), part)
+        return np.asarray(total)
+
+    def by_order(self, shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
+        """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
+        n, found = self.displacements, np.zeros((4, len(shown), shapes.shape[1]))
+        for number, item in enumerate(shown):
+            found[item.order, number] = item.row[:n] @ shapes[:n]
+            if self.states:
+                found[item.further + 1, number] += item.row[n:] @ shapes[n:]
+            if item.speed is not None:
+                found[1, number] += item.speed @ shapes[:n]
+            if item.reaction is not None:
+                along = self.lift[:, item.reaction]
+                for order, matrix in enumerate((self.stiffness, self.damping, self.mass)):
+                    found[order, number] = along @ matrix @ shapes
+        return found
+
+    def seen_by(self, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:
+        """Return the system by which outputs see missing forces, in shapes (N, M) of what is free."""
+        acts = np.array(list(self.acting_rows.values())).reshape(len(self.ports), len(self.mass))
+        force = np.zeros((len(self.ports), len(shown)))
+        for number, item in enumerate(shown):
+            if item.reaction is not None:
+                force[:, number] = acts @ self.lift[:, item.reaction]
+            elif self.truncated and item.order == 0:
+                force[:, number] = -acts @ self.residual(item.row)
+        ports = {name: (row @ shapes, self.acting_rows[name] @ shapes) for name, row in self.ports.items()}
+        matrices = [shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness)]
+        position, speed, acceleration, _ = self.by_order(shown, shapes)
+        rows = OutputRows(position, speed, acceleration, force)
+        return modal_system((matrices[0], matrices[1], matrices[2]), ports, rows, self.moving)
+
+
+def solved(
+    laws: Laws,
+    linear: FloatArray,
+    compliance: FloatArray,
+    memory: FloatArray | None = None,
+    start: FloatArray | None = None,
+) -> StaticSolution:
+    """Return the static solution by compiled loops; raises `ModelError` where there is none."""
+    try:
+        return static_solution(laws, linear, compliance, memory=memory, start=start, kernel=compiled_kernel())
+    except SolutionError as cause:
+        raise ModelError(str(cause)) from cause
