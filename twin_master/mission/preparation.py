@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,6 +21,7 @@ from twin_master.mission.truth import Truth
 from twin_master.network.estimator import Estimator
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel
+from twin_master.network.inspection import InspectedSensorModel
 from twin_master.network.planner import PlannedPolicy, given_policy, value_iteration
 from twin_master.network.rewards import RewardModel, RewardSettings
 from twin_master.network.sensor_model import GaussianSensorModel, check_noise
@@ -97,6 +98,7 @@ class Knowledge:
             first_control=self.scenario.mission.first_control,
             estimator=estimator,
             safest=self.safest,
+            on_belief=self.plan.on_belief if policy is None else None,
         )
 
     @property
@@ -194,21 +196,43 @@ def knowledge_of(
     """
     section = scenario.observation
     kind = GaussianSensorModel if section.modes is None else IdentifiedSensorModel
-    sensor_model = kind(
+    within = model.states.within_interval if section.between_levels else None
+    sensor_model = (
+        partial(InspectedSensorModel, **_readings(scenario, model)) if scenario.readings else kind
+    )(
         predicted,
         section.standard_deviation,
         average=section.average_over_draws,
         model_error=section.model_error,
-        interval=model.states.within_interval(predicted.mean(axis=0)) if section.between_levels else None,
+        interval=within(predicted.mean(axis=0)) if within else None,
     )
     rewards = RewardModel(sensor_model, reward_settings(scenario), true)
-    transition, discount = model.transition, scenario.planner.gamma
+    transition, discount = model.transition, discounts(scenario)
     reward = rewards.planning_reward(scenario.rewards.health_weight, scenario.rewards.control_weight)
     if policy is None:
         plan = value_iteration(transition, reward, discount)
     else:
         plan = given_policy(transition, reward, discount, model.policy(policy))
     return Knowledge(scenario, model, draws, sensor_model, rewards, plan)
+
+
+def _readings(scenario: Scenario, model: GraphicalModel) -> dict[str, Float]:
+    """Return what inspections read in each state, and how well, for `InspectedSensorModel`."""
+    _, places, _, deviations = (np.array(column) for column in zip(*scenario.readings, strict=True))
+    coordinates = model.states.coordinates
+    within = np.zeros_like(coordinates)
+    if scenario.observation.between_levels:
+        within = np.einsum("sff->sf", model.states.within_interval(coordinates))
+    return {
+        "reading": coordinates[:, places],
+        "reading_deviation": np.hypot(within[:, places], deviations),
+    }
+
+
+def discounts(scenario: Scenario) -> Float:
+    """Return the discount behind a turn under each control (U,): zero where it ends the mission."""
+    ends = [scenario.ends(index) for index in range(len(scenario.control))]
+    return np.where(ends, 0.0, scenario.planner.gamma)
 
 
 def prepare_twin(

@@ -7,6 +7,7 @@ from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import filter_step
 from twin_master.network.kernels import step_many
+from twin_master.network.planner import PlannedPolicy
 
 __all__ = ["decide_many", "filter_step_many"]
 
@@ -70,7 +71,9 @@ def filter_step_many(
     return filtered[:, first], log_filtered[:, first], log_evidence[:, first], failed >= 0
 
 
-def decide_many(model: GraphicalModel, filtered: Float, control: Index, policy: Float, on: str) -> Index:
+def decide_many(
+    model: GraphicalModel, filtered: Float, control: Index, plan: PlannedPolicy, on: str
+) -> Index:
     """Return the next control of each of B twins (B,): the mode of the policy over its belief (B, S).
 
     Parameters
@@ -80,15 +83,16 @@ def decide_many(model: GraphicalModel, filtered: Float, control: Index, policy: 
         p(D_t | o_0..o_t).
     control : (B,)
         Control in force in turn t.
-    policy : (S, U)
-        p(U | D).
+    plan : PlannedPolicy
     on : {"filtered", "predicted"}
         Which belief is decided on, see `Twin`.
     """
     belief = filtered
-    if on == "predicted":
+    if on == "predicted" or plan.on_belief is not None:
         pairs = zip(control.tolist(), filtered, strict=True)
         belief = np.stack([model.transition.forward(in_force, row) for in_force, row in pairs])
+    if plan.on_belief is not None:
+        return np.array([plan.on_belief.decide(row) for row in belief], dtype=np.int64)
     # One product for each twin, so that its last bit does not depend on how many there are.
-    chosen: Index = np.argmax(np.matmul(belief[:, None, :], policy)[:, 0], axis=1)
+    chosen: Index = np.argmax(np.matmul(belief[:, None, :], plan.policy)[:, 0], axis=1)
     return chosen
