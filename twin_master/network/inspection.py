@@ -12,6 +12,7 @@ from twin_master.network.sensor_model import GaussianSensorModel
 __all__ = ["InspectedSensorModel"]
 
 Float = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 
 class InspectedSensorModel(GaussianSensorModel):
@@ -28,11 +29,22 @@ class InspectedSensorModel(GaussianSensorModel):
         What each reading shows in each state without noise, SI.
     reading_deviation : (S, I)
         Standard deviation of its noise, and of what lies within the interval of the state, SI.
+    asked_by : (I,)
+        Index of the control that asks for each reading.
     """
 
-    def __init__(self, *args: Any, reading: Float, reading_deviation: Float, **keywords: Any) -> None:
+    def __init__(
+        self, *args: Any, reading: Float, reading_deviation: Float, asked_by: Index, **keywords: Any
+    ) -> None:
         super().__init__(*args, **keywords)
-        self.reading, self.reading_deviation = reading, reading_deviation
+        self.reading, self.reading_deviation, self.asked_by = reading, reading_deviation, asked_by
+
+    def sampled(self, state: Index, control_index: int, generator: np.random.Generator) -> Float:
+        """Return one row drawn in each of N states (N,) under a control: (N, G + I), SI."""
+        gauges = super().sampled(state, control_index, generator)
+        noise = self.reading_deviation[state] * generator.standard_normal((len(state), len(self.asked_by)))
+        read = np.where(self.asked_by == control_index, self.reading[state] + noise, np.nan)
+        return np.hstack((gauges, read))
 
     def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
         """Return log p(o | D, u) for each state (S,), of a row (G + I,) or (G,)."""

@@ -1,6 +1,8 @@
 """Planning: value iteration on the Bellman equation, Kapteyn et al. 2021, eq. (36)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +33,27 @@ class BeliefPolicy:
 
     vectors: Float
     control: Index
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> "BeliefPolicy":
+        """Return the policy of arrays by the names of its attributes, as a file has them.
+
+        Raises
+        ------
+        PlanningError
+            They are none.
+        """
+        try:
+            vectors, control = arrays[f"{prefix}vectors"], arrays[f"{prefix}control"]
+        except KeyError as error:
+            raise PlanningError(
+                f"a policy on the belief has `vectors` and `control`: {error} is missing"
+            ) from None
+        if vectors.ndim != 2 or control.shape != vectors.shape[:1] or control.dtype.kind not in "iu":
+            raise PlanningError(
+                f"expected vectors (N, S) and a control for each, got {vectors.shape} and {control.shape}"
+            )
+        return cls(np.asarray(vectors, dtype=np.float64), np.asarray(control, dtype=np.int64))
 
     def value(self, belief: ArrayLike) -> Float:
         """Return the expected return from beliefs (..., S): (...)."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twin_master.errors import InvalidModelError, InvalidObservationError
+from twin_master.network import graphical_model
 from twin_master.network.estimator import (
     Carried,
     Estimate,
@@ -22,12 +23,7 @@ from twin_master.network.estimator import (
     SensorModel,
     Suspicion,
 )
-from twin_master.network.graphical_model import (
-    GraphicalModel,
-    leaving_table,
-    repaired_table,
-    worsening_table,
-)
+from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.inference import Predicted, predict
 from twin_master.network.packed_arrays import packed_arrays, unpacked_arrays
 from twin_master.network.planner import BeliefPolicy
@@ -75,12 +71,14 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
             }
     if leaving != 1.0:
         tables = {
-            control: {name: leaving_table(table, leaving) for name, table in rows.items()}
+            control: {name: graphical_model.leaving_table(table, leaving) for name, table in rows.items()}
             for control, rows in tables.items()
         }
     for action in scenario.action:
         for name in action.repairs:
-            tables[action.name][name] = repaired_table(tables[action.name][name], action.success)
+            tables[action.name][name] = graphical_model.repaired_table(
+                tables[action.name][name], action.success
+            )
     levels = {factor.name: factor.levels for factor in scenario.state}
     return GraphicalModel.from_tables(
         levels, tables, {factor.name: factor.prior for factor in scenario.state}
@@ -170,7 +168,7 @@ class Twin:
     safest : int or str, optional
         Control where no state is believed; without it the policy of what is believed decides alone.
     on_belief : BeliefPolicy, optional
-        What decides, always by p(D_{t+1} | o_0..o_t), in the place of the policy, which then predicts alone.
+        Decides in the place of the policy, which then predicts alone, by p(D_{t+1} | o_0..o_t).
 
     Raises
     ------
@@ -446,9 +444,8 @@ class Twin:
 
     def _decision(self, belief: Float, control_index: int) -> Float:
         """Return the probability of each control (U,), decided on the belief of this turn or the next."""
-        if self._on_belief is None and self.decide_on == "filtered":
-            return np.asarray(belief @ self.policy)
-        ahead = self.model.transition.forward(control_index, belief)
-        if self._on_belief is None:
-            return np.asarray(ahead @ self.policy)
-        return np.eye(len(self.model.controls))[self._on_belief.decide(ahead)]
+        if self.decide_on == "predicted" or self._on_belief is not None:
+            belief = self.model.transition.forward(control_index, belief)
+        if self._on_belief is not None:
+            return np.eye(len(self.model.controls))[self._on_belief.decide(belief)]
+        return np.asarray(belief @ self.policy)
