@@ -100,7 +100,7 @@ def new_run(
         What differs from the file: the fields of `Overrides`, such as ``{"seed": 3, "fmu": "wing.fmu"}``.
     policy : (S, U), BeliefPolicy or Path
         To fly instead of planning: p(U | D), row-stochastic, states in the order of `Knowledge.model.states`,
-        controls in that of the scenario; or a policy on the belief, or its file. It is kept in the run folder.
+        controls in that of the scenario; or a policy on the belief, or its file. The run folder keeps it.
     replace
         Take the place of an existing run folder.
     report

@@ -26,6 +26,7 @@ __all__ = [
     "decision_problem",
     "expected_plan",
     "planned",
+    "promised",
     "read_policy",
     "risk_of",
     "write_policy",
@@ -138,15 +139,11 @@ def risk_of(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel, policy: BeliefPolicy
 ) -> float:
     """Return the share of turns, discounted, beyond a health limit under a policy, in simulated missions."""
-
-    def rule(belief: Float, _turn: int) -> Index:
-        return policy.decide(belief)
-
     shares = [
-        _simulated(scenario, replace(problem, reward=reward), rule).mean()
+        promised(scenario, replace(problem, reward=reward), policy).mean
         for reward in (_risk(rewards), np.ones_like(problem.reward))
     ]
-    return float(shares[0] / shares[1])
+    return shares[0] / shares[1]
 
 
 def write_policy(path: Path, policy: BeliefPolicy, model: GraphicalModel) -> None:
@@ -201,10 +198,17 @@ class ComparedPolicy:
     half_width: float
 
 
-def compared(
-    scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy
-) -> tuple[ComparedPolicy, ...]:
-    """Return what the plan brings, and what the rules that are simpler do, all with the same beliefs.
+def promised(scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy) -> ComparedPolicy:
+    """Return what a policy on the belief brings in simulated missions."""
+
+    def rule(belief: Float, _turn: int) -> Index:
+        return policy.decide(belief)
+
+    return _summary("planned on the belief", _simulated(scenario, problem, rule))
+
+
+def compared(scenario: Scenario, problem: DecisionProblem) -> tuple[ComparedPolicy, ...]:
+    """Return what rules bring that are simpler than a plan on the belief, with the same beliefs.
 
     Inspection by the clock takes the first action that inspects, and decides as QMDP between.
     """
@@ -219,17 +223,16 @@ def compared(
         return rule
 
     rules: dict[str, Decide] = {
-        "planned on the belief": lambda belief, _turn: policy.decide(belief),
         "mode of the policy by states": lambda belief, _turn: np.argmax(belief @ known.policy, axis=1),
         "QMDP": lambda belief, _turn: np.argmax(belief @ known.action_value, axis=1),
     }
     for every in PERIODS if scenario.readings else ():
         rules[f"inspection every {every} {scenario.mission.step_name}s"] = by_the_clock(every)
-    found = {name: _simulated(scenario, problem, rule) for name, rule in rules.items()}
-    return tuple(
-        ComparedPolicy(name, float(total.mean()), float(1.96 * total.std() / np.sqrt(len(total))))
-        for name, total in found.items()
-    )
+    return tuple(_summary(name, _simulated(scenario, problem, rule)) for name, rule in rules.items())
+
+
+def _summary(name: str, returns: Float) -> ComparedPolicy:
+    return ComparedPolicy(name, float(returns.mean()), float(1.96 * returns.std() / np.sqrt(len(returns))))
 
 
 def _simulated(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Float:

@@ -233,9 +233,10 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
     ending = np.array([scenario.ends(index) for index in range(len(scenario.control))])
     before: tuple[Float | None, Index | None] = None, None
     for step in range(scenario.mission.steps):
-        for twin in np.flatnonzero(flying & ending[control]).tolist() if step else ():
-            plants.ended[twin] = ended_sentence(scenario, step, decided_to_end(scenario, control[twin]))
-        flying[[*plants.ended]] = False
+        flown = before[1]
+        for twin in () if flown is None else np.flatnonzero(flying & ending[flown]).tolist():
+            plants.ended[twin] = ended_sentence(scenario, step, decided_to_end(scenario, flown[twin]))
+            flying[twin] = False
         observed, state = plants.turn(step, control, flying)
         flying[[*plants.failure, *plants.ended]] = False
         observed[~flying] = np.nan

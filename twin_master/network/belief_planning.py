@@ -66,8 +66,8 @@ class DecisionProblem:
         wrong = [table.shape for table in self.likelihood if table.shape[1:] != (states,)]
         if self.reward.shape != (states, controls) or len(self.likelihood) != controls or wrong:
             raise PlanningError(
-                f"expected rewards of shape {(states, controls)} and for each control observations of {states} "
-                f"columns, got {self.reward.shape} and {[t.shape for t in self.likelihood]}"
+                f"expected rewards of shape {(states, controls)} and for each control observations of "
+                f"{states} columns, got {self.reward.shape} and {[t.shape for t in self.likelihood]}"
             )
         if any(np.any(np.abs(table.sum(axis=0) - 1.0) > 1e-9) for table in self.likelihood):
             raise PlanningError("the observations of each state must have probabilities that sum to one")

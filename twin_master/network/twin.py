@@ -1,7 +1,4 @@
-"""The twin: it is shown observations and the control in force, and says what to do next.
-
-It holds no asset and no truth.
-"""
+"""The twin: it is shown observations and the control in force, and says what to do; it holds no truth."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -168,7 +165,7 @@ class Twin:
     safest : int or str, optional
         Control where no state is believed; without it the policy of what is believed decides alone.
     on_belief : BeliefPolicy, optional
-        Decides in the place of the policy, which then predicts alone, by p(D_{t+1} | o_0..o_t).
+        Decides by p(D_{t+1} | o_0..o_t) in the place of the policy, which predicts.
 
     Raises
     ------
@@ -443,7 +440,7 @@ class Twin:
         return replace(estimate.suspicion, decided_by=max(share, key=share.__getitem__))
 
     def _decision(self, belief: Float, control_index: int) -> Float:
-        """Return the probability of each control (U,), decided on the belief of this turn or the next."""
+        """Return the probability of each control (U,), by the belief of this turn or the next."""
         if self.decide_on == "predicted" or self._on_belief is not None:
             belief = self.model.transition.forward(control_index, belief)
         if self._on_belief is not None:

@@ -1,0 +1,65 @@
+"""The picture of a plan on the belief: what is done where on triangles of beliefs."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.tri import Triangulation
+from numpy.typing import NDArray
+
+from reporting import figures as style
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.planner import BeliefPolicy
+
+Float = NDArray[np.float64]
+
+_COLORS = ("#56B4E9", "#E69F00", style.PRESENT, style.DECISION, style.PREDICTION, "#F0E442", style.PAST)
+_ROWS = 60
+"""Rows of points in a triangle."""
+
+
+def triangle_of(model: GraphicalModel, place: int) -> Float:
+    """Return three beliefs (3, S) of one factor: at its lowest level, at its highest, and not known.
+
+    The other factors are at their lowest levels.
+    """
+    corners = []
+    for own in (0, -1, slice(None)):
+        belief = np.zeros(model.states.shape)
+        levels: list[Any] = [0] * belief.ndim
+        levels[place] = own
+        belief[tuple(levels)] = 1.0
+        corners.append(belief.ravel() / belief.sum())
+    return np.array(corners)
+
+
+def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
+    """Draw for each factor of the state what a policy does between three beliefs, the control by colour."""
+    factors, count = model.states.names[:3], len(model.controls)
+    share = np.array([(i, j) for i in range(_ROWS + 1) for j in range(_ROWS + 1 - i)]) / _ROWS
+    weight = np.column_stack((1.0 - share.sum(axis=1), share))
+    x, y = (weight @ np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 0.866]])).T
+    mesh = Triangulation(x, y)
+    colors = [_COLORS[number % len(_COLORS)] for number in range(count)]
+    with style.publication_style():
+        figure = style.new_figure(3.2)
+        figure.subplots_adjust(bottom=0.14)
+        for place, (axes, name) in enumerate(
+            zip(figure.subplots(1, len(factors), squeeze=False)[0], factors, strict=True)
+        ):
+            centre = weight[mesh.triangles].mean(axis=1)
+            chosen = policy.decide(centre @ triangle_of(model, place))
+            axes.tripcolor(mesh, facecolors=chosen, cmap=ListedColormap(colors), vmin=-0.5, vmax=count - 0.5)
+            for text, at in (("lowest", (0.0, -0.06)), ("highest", (1.0, -0.06)), ("not known", (0.5, 0.9))):
+                axes.text(*at, text, ha="center", va="top" if at[1] < 0.0 else "bottom")
+            axes.set_aspect("equal")
+            axes.set_axis_off()
+            style.panel_label(axes, "abc"[place], f"Belief of {name}")
+        handles = [
+            Rectangle((0, 0), 1, 1, facecolor=color, label=name)
+            for name, color in zip(model.controls, colors, strict=True)
+        ]
+        figure.legend(handles=handles, loc="lower center", ncols=count, handlelength=1.4)
+    return figure
