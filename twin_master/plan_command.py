@@ -1,6 +1,6 @@
-"""`uav-twin plan`: what a scenario decides by its belief, and what that and knowing more are worth."""
+"""`uav-twin plan` and `uav-twin design`: what is decided by the belief, what it is worth, what tells most."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,9 +12,13 @@ from twin_master.command import Calibration, Seed
 from twin_master.errors import MissionInputError
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from twin_master.mission.planning import ComparedPolicy
     from twin_master.mission.preparation import Knowledge
     from twin_master.network.belief_planning import BeliefPlan, DecisionProblem
+    from twin_master.scenario.schema import Scenario
+    from twin_master.viewer.scene import Planform
 
 ValueOf = Annotated[
     str | None,
@@ -48,6 +52,7 @@ def plan(
 ) -> None:
     """Plan on the belief: expected return with its bounds, beside simpler rules."""
     from twin_master.mission.planning import compared, risk_of, write_policy
+    from twin_master.report.plan import plan_figure
 
     knowledge = _knowledge(scenario, seed, calibration)
     found = _planned(knowledge)
@@ -55,7 +60,7 @@ def plan(
     if out is not None:
         write_policy(out, plan.policy, knowledge.model)
     if picture is not None:
-        _draw(picture, plan, knowledge)
+        _draw(picture, plan_figure(plan.policy, knowledge.model))
     record: dict[str, Any] = {
         "lower": plan.lower,
         "upper": plan.upper,
@@ -65,7 +70,7 @@ def plan(
     }
     rows = [promised, *([] if value_of else compared(knowledge.scenario, found.problem))]
     if value_of is not None:
-        without = _planned(_without(knowledge, value_of)).promised
+        without = _planned(_without(knowledge, [value_of])).promised
         half = float((promised.half_width**2 + without.half_width**2) ** 0.5)
         rows.append(replace(without, name=f"planned without {value_of}"))
         record["value"] = {"of": value_of, "mean": promised.mean - without.mean, "half_width": half}
@@ -84,7 +89,7 @@ def _knowledge(scenario: str, seed: int | None, calibration: Path | None) -> "Kn
 
     loaded = load_scenario(scenario)
     planner = loaded.scenario.planner
-    plain = planner.model_copy(update={"policy": "mode", "limit_probability": None})
+    plain = planner.model_copy(update=_UNPLANNED)
     unplanned = replace(loaded, scenario=loaded.scenario.model_copy(update={"planner": plain}))
     found = prepare_twin(
         unplanned, Overrides(seed=seed, calibration=calibration), progress=terminal.progress()
@@ -101,33 +106,29 @@ def _planned(knowledge: "Knowledge") -> _Planned:
     return _Planned(problem, plan, promised(scenario, problem, plan.policy))
 
 
-def _without(knowledge: "Knowledge", name: str) -> "Knowledge":
-    """Return what is known where an action that inspects shows nothing, or a gauge is not there."""
+def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
+    """Return what is known where actions that inspect show nothing, or gauges are not there."""
     from twin_master.mission.preparation import knowledge_of
 
     scenario = knowledge.scenario
-    observation = scenario.observation
-    changed: Mapping[str, Any]
-    inspecting = [action.name for action in scenario.action if action.inspects]
-    titles = observation.titles or tuple(str(number + 1) for number in range(observation.count))
-    if name in inspecting:
-        blind = [
-            action.model_copy(update={"standard_deviation": _BLIND}) if action.name == name else action
-            for action in scenario.action
-        ]
-        changed = {"action": tuple(blind)}
-    elif name in titles:
-        given = observation.standard_deviation
-        each = list(given) if isinstance(given, tuple) else [given] * observation.count
-        each[titles.index(name)] = _BLIND
-        changed = {"observation": observation.model_copy(update={"standard_deviation": tuple(each)})}
-    else:
-        raise MissionInputError(
-            f"--value-of names an action that inspects ({', '.join(inspecting) or 'there is none'}) or a "
-            f"gauge ({titles[0]} to {titles[-1]}), and `{name}` came."
-        )
-    settings = scenario.planner.model_copy(update={"policy": "mode", "limit_probability": None})
-    bare = scenario.model_copy(update={**changed, "planner": settings})
+    titles, inspecting = _titles(scenario), [action.name for action in scenario.action if action.inspects]
+    for name in names:
+        if name not in (*titles, *inspecting):
+            raise MissionInputError(
+                f"--value-of names an action that inspects ({', '.join(inspecting) or 'there is none'}) or a "
+                f"gauge ({titles[0]} to {titles[-1]}), and `{name}` came."
+            )
+    given, count = scenario.observation.standard_deviation, scenario.observation.count
+    each = given if isinstance(given, tuple) else (given,) * count
+    each = tuple(_BLIND if title in names else own for title, own in zip(titles, each, strict=True))
+    blind = {"standard_deviation": _BLIND}
+    bare = scenario.model_copy(
+        update={
+            "action": tuple(a.model_copy(update=blind if a.name in names else {}) for a in scenario.action),
+            "observation": scenario.observation.model_copy(update={"standard_deviation": each}),
+            "planner": scenario.planner.model_copy(update=_UNPLANNED),
+        }
+    )
     found = knowledge_of(
         bare, knowledge.model, knowledge.draws, knowledge.sensor_model.value_per_draw,
         true=knowledge.rewards.true_per_draw,
@@ -135,16 +136,22 @@ def _without(knowledge: "Knowledge", name: str) -> "Knowledge":
     return replace(found, scenario=bare.model_copy(update={"planner": scenario.planner}))
 
 
+def _titles(scenario: "Scenario") -> tuple[str, ...]:
+    """Return what the sensors are called: their titles, or numbers from 1."""
+    section = scenario.observation
+    return section.titles or tuple(str(number + 1) for number in range(section.count))
+
+
+_UNPLANNED = {"policy": "mode", "limit_probability": None}
+"""Of the planner, where its plan is made apart."""
 _BLIND = 1e6
 """Standard deviation of a sensor that shows nothing, SI."""
 
 
-def _draw(path: Path, plan: "BeliefPlan", knowledge: "Knowledge") -> None:
+def _draw(path: Path, figure: "Figure") -> None:
     from reporting.figures import to_png, to_svg
     from reporting.files import atomic_write_bytes
-    from twin_master.report.plan import plan_figure
 
-    figure = plan_figure(plan.policy, knowledge.model)
     atomic_write_bytes(path, to_png(figure) if path.suffix.lower() == ".png" else to_svg(figure))
 
 
@@ -162,3 +169,104 @@ def _show(record: Mapping[str, Any], rows: "list[ComparedPolicy]") -> None:
     if "value" in record:
         value = record["value"]
         terminal.say(f"{value['of']} is worth {value['mean']:.3g} ± {value['half_width']:.2g} (95 %).")
+
+
+def design(
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A shipped scenario, or a TOML file.")],
+    sensors: Annotated[int, typer.Option(min=1, help="How many to choose.")],
+    among: Annotated[
+        str | None,
+        typer.Option(metavar="NAMES", help="Candidates, by numbers or titles with commas; all by default."),
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the choice, as SVG or PNG.")] = None,
+    vtu: Annotated[
+        Path | None, typer.Option(help="Write the gauges of a wing as points with their ranks.")
+    ] = None,
+    worth: Annotated[
+        bool, typer.Option("--worth", help="Plan with the chosen and with all, and compare the returns.")
+    ] = False,
+    calibration: Calibration = None,
+    json: terminal.Json = False,
+) -> None:
+    """Choose the sensors that tell most of the state, and name what none of them separates."""
+    from twin_master.mission.sensor_design import chosen_sensors, drawn_readings, separations
+
+    knowledge = _knowledge(scenario, None, calibration)
+    titles = _titles(knowledge.scenario)
+    wanted = titles if among is None else tuple(among.split(","))
+    if not {*wanted} <= {*titles} or len({*wanted}) < len(wanted):
+        raise MissionInputError(
+            f"--among names different sensors ({titles[0]} to {titles[-1]}), and `{among}` came."
+        )
+    candidates, readings = [titles.index(name) for name in wanted], drawn_readings(knowledge)
+    found = chosen_sensors(readings, candidates, sensors)
+    names = [titles[sensor] for sensor in found.sensors]
+    apart = separations(knowledge, readings, candidates)
+    record: dict[str, Any] = {
+        "sensors": names,
+        "information": list(found.information),
+        "of_all": found.of_all,
+        "not_separated": [_between(knowledge, *place) for place, far in apart.items() if far < 1.0],
+    }
+    if worth:
+        others = [title for title in titles if title not in names]
+        rest = [title for title in titles if title not in wanted]
+        few, every = (_planned(_without(knowledge, some)).promised for some in (others, rest))
+        record["worth"] = {"chosen": [few.mean, few.half_width], "all": [every.mean, every.half_width]}
+    _draw_design(picture, vtu, knowledge, record, found.sensors)
+    if json:
+        terminal.print_json(record)
+        return
+    for name, told in zip(names, found.information, strict=True):
+        terminal.say(f"{name}: {told:.3f} bit with those before it.")
+    terminal.say(f"All {len(candidates)} candidates: {found.of_all:.3f} bit.")
+    for pair in record["not_separated"]:
+        terminal.say(f"No gauge separates {pair}: less than one standard deviation by all candidates.")
+    for what, (mean, half) in record.get("worth", {}).items():
+        terminal.say(f"Expected return planned with {what}: {mean:.4g} ± {half:.2g} (95 %).")
+
+
+def _between(knowledge: "Knowledge", name: str, level: int) -> str:
+    """Return two neighbouring levels of a state in words."""
+    from twin_master.report.view import printed_state
+
+    place = knowledge.scenario.state_names.index(name)
+    factor = knowledge.scenario.state[place]
+    scale, unit = printed_state(factor.unit)
+    low, high = (scale * value for value in factor.levels[level : level + 2])
+    return f"{name} of {low:g} {unit} from {high:g} {unit}"
+
+
+def _draw_design(
+    picture: Path | None, vtu: Path | None, knowledge: "Knowledge", record: Mapping[str, Any],
+    chosen: Sequence[int],
+) -> None:  # fmt: skip
+    import numpy as np
+
+    from fe.structure.field import write_vtu
+    from twin_master.report.plan import design_figure
+
+    wing = _wing(knowledge.scenario)
+    if vtu is not None:
+        if wing is None:
+            raise MissionInputError("--vtu needs a wing, whose design says where its gauges are.")
+        points, rank = np.insert(wing.gauges, 2, 0.0, axis=1), np.zeros(len(wing.gauges))
+        rank[list(chosen)] = np.arange(1, len(chosen) + 1)
+        write_vtu(vtu, points, ("vertex", np.arange(len(rank))[:, None]), {"rank": rank}, {})
+    if picture is not None:
+        places = None if wing is None else wing.gauges
+        outlines = [] if wing is None else [wing.outline, *wing.regions]
+        figure = design_figure(
+            record["information"], record["of_all"], record["sensors"], places, chosen, outlines
+        )
+        _draw(picture, figure)
+
+
+def _wing(scenario: "Scenario") -> "Planform | None":
+    """Return the wing that is believed from above; None for another asset."""
+    from fe.wing.design import load_design
+    from twin_master.assets.design_source import DESIGN_COPY
+    from twin_master.viewer.scene import planform_of
+
+    file = scenario.belief.all_files().get(DESIGN_COPY)
+    return planform_of(None if file is None else load_design(file), scenario)

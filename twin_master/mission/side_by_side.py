@@ -233,10 +233,11 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
     ending = np.array([scenario.ends(index) for index in range(len(scenario.control))])
     before: tuple[Float | None, Index | None] = None, None
     for step in range(scenario.mission.steps):
-        flown = before[1]
-        for twin in () if flown is None else np.flatnonzero(flying & ending[flown]).tolist():
-            plants.ended[twin] = ended_sentence(scenario, step, decided_to_end(scenario, flown[twin]))
-            flying[twin] = False
+        if before[1] is not None:
+            for twin in np.flatnonzero(flying & ending[before[1]]).tolist():
+                how = decided_to_end(scenario, before[1][twin])
+                plants.ended[twin] = ended_sentence(scenario, step, how)
+                flying[twin] = False
         observed, state = plants.turn(step, control, flying)
         flying[[*plants.failure, *plants.ended]] = False
         observed[~flying] = np.nan

@@ -1,5 +1,6 @@
-"""The picture of a plan on the belief: what is done where on triangles of beliefs."""
+"""Pictures of plans: what is done where on triangles of beliefs, and which sensors tell most."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -62,4 +63,48 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
             for name, color in zip(model.controls, colors, strict=True)
         ]
         figure.legend(handles=handles, loc="lower center", ncols=count, handlelength=1.4)
+    return figure
+
+
+def design_figure(
+    information: Sequence[float], of_all: float, names: Sequence[str], places: Float | None,
+    chosen: Sequence[int], outlines: Sequence[Float],
+) -> Figure:  # fmt: skip
+    """Draw what the chosen sensors tell together, and where they are on a wing from above.
+
+    Parameters
+    ----------
+    information : sequence of float
+        Of the first, the first two, ... of them [bit].
+    of_all : float
+        Of all candidates [bit].
+    names : sequence of str
+        Of the chosen sensors.
+    places : (G, 2) or None
+        Of all sensors [m]; None where they are not known.
+    chosen : sequence of int
+        Sensors, from 0.
+    outlines : sequence of (N, 2)
+        What is drawn below the sensors [m].
+    """
+    with style.publication_style():
+        figure = style.new_figure(2.6)
+        ratios = [1] if places is None else [2, 3]
+        panels = figure.subplots(1, len(ratios), squeeze=False, width_ratios=ratios)[0]
+        number = np.arange(1, len(information) + 1)
+        panels[0].plot(number, information, "o-", color=style.PRESENT)
+        panels[0].axhline(of_all, color=style.REFERENCE, linestyle="--", label="all candidates")
+        panels[0].set(xlabel="sensors", ylabel="expected information [bit]", ylim=(0.0, None))
+        panels[0].set_xticks(number, names, rotation=60)
+        panels[0].legend(loc="lower right")
+        if places is not None:
+            for outline in outlines:
+                panels[1].fill(*outline.T, facecolor="none", edgecolor=style.REFERENCE, linewidth=0.8)
+            panels[1].plot(*places.T, "o", color=style.REFERENCE, markersize=3.5)
+            panels[1].plot(*places[list(chosen)].T, "o", color=style.PRESENT, markersize=6)
+            for rank, sensor in enumerate(chosen, start=1):
+                panels[1].annotate(str(rank), places[sensor], (3, 3), textcoords="offset points")
+            panels[1].set_aspect("equal")
+            panels[1].set_axis_off()
+        figure.tight_layout()
     return figure
