@@ -22,7 +22,7 @@ from twin_master.mission.plant import Plant, checked_values
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth
 from twin_master.network.estimator import Notice
-from twin_master.network.step_many import decide_many, filter_step_many
+from twin_master.network.step_many import decide_many, filter_step_many, rationed
 
 __all__ = ["Flights", "fly_one_by_one", "fly_side_by_side"]
 
@@ -231,6 +231,10 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
     control = np.full(count, scenario.control_names.index(scenario.mission.first_control))
     flying = np.ones(count, dtype=bool)
     ending = np.array([scenario.ends(index) for index in range(len(scenario.control))])
+    budget, inspecting = (
+        scenario.planner.inspections_a_turn,
+        sorted({place for place, *_ in scenario.readings}),
+    )
     before: tuple[Float | None, Index | None] = None, None
     for step in range(scenario.mission.steps):
         if before[1] is not None:
@@ -256,7 +260,13 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
         for array, row in (*kept, (flights.filtered, filtered), (flights.log_evidence, evidence)):
             array[flying, step] = row[flying]
         before = log_filtered, control
+        flown, on_belief = control, knowledge.plan.on_belief
         control = decide_many(model, filtered, control, knowledge.plan, scenario.planner.decide_on)
+        if budget is not None and on_belief is not None:
+            some = np.flatnonzero(flying)
+            control[some] = rationed(
+                model, filtered[some], flown[some], control[some], on_belief, inspecting, budget
+            )
     failure, ended = (
         tuple(told.get(twin, "") for twin in range(count)) for told in (plants.failure, plants.ended)
     )

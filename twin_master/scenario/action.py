@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from twin_master.scenario.section import (
+    Count,
     Flag,
     Name,
     NotNegative,
@@ -84,10 +85,15 @@ class Planner(Section):
     limit_probability: Annotated[Probability, Field(gt=0.0)] | None = None
     """`belief`: share of the turns, discounted, in which a health limit may be exceeded."""
 
+    inspections_a_turn: Count | None = None
+    """`belief` and `qmdp`: turns with an inspection that assets which fly side by side have among them."""
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.limit_probability is not None and self.policy != "belief":
             raise ValueError("`planner.limit_probability` needs `planner.policy` `belief`")
+        if self.inspections_a_turn is not None and self.policy == "mode":
+            raise ValueError("`planner.inspections_a_turn` needs `planner.policy` `belief` or `qmdp`")
         return self
 
 

@@ -290,7 +290,7 @@ class Scenario(Section):
         if not self.action:
             absent |= {"action": True}
         if self.planner.policy == "mode":
-            absent |= {"planner": {"policy", "limit_probability"}}
+            absent |= {"planner": {"policy", "limit_probability", "inspections_a_turn"}}
         return self.model_dump(mode="json", exclude=absent)
 
     @model_validator(mode="after")

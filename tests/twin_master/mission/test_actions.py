@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,14 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+import uav_twin
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
 from scenarios import scenario_files
 from tests.command_line import call
 from twin_master.assets.wing_model import ReducedModelSource
-from twin_master.errors import PlanningError, ScenarioError
+from twin_master.errors import FleetError, PlanningError, ScenarioError
+from twin_master.fleet.plan import load_fleet
 from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
@@ -31,6 +35,8 @@ from twin_master.mission.planning import (
 from twin_master.mission.preparation import Knowledge, knowledge_of, prepare_knowledge
 from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.network.planner import BeliefPolicy
+from twin_master.network.step_many import rationed
+from twin_master.network.transition import TransitionModel
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 
@@ -198,3 +204,98 @@ def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(
     assert picture.read_bytes().startswith(b"<?xml")
     assert call(monkeypatch, "plan", "inspected_wing", "--value-of", "25") == 1
     assert "`25` came" in capsys.readouterr().err
+
+
+def test_inspections_of_a_fleet_go_where_they_are_worth_most() -> None:
+    known, (_, plan) = knowledge(), planned()
+    ahead = np.random.default_rng(0).dirichlet(np.full(25, 0.3), 60)
+    model = replace(known.model, transition=TransitionModel((np.tile(np.eye(25), (5, 1, 1)),)))
+    chosen = plan.policy.decide(ahead)
+    wanting = np.flatnonzero(chosen == INSPECT)
+    few = rationed(model, ahead, np.zeros(60, dtype=int), chosen, plan.policy, [INSPECT], 3)
+    value = plan.policy.action_value(ahead, 5)
+    other = np.delete(value, INSPECT, axis=1).max(axis=1)
+    gain = value[:, INSPECT] - other
+    kept = np.flatnonzero(few == INSPECT)
+    assert len(wanting) > len(kept) == 3
+    assert gain[kept].min() >= np.delete(gain, kept)[np.isin(np.delete(np.arange(60), kept), wanting)].max()
+    late = np.setdiff1d(wanting, kept)
+    assert value[late, few[late]] == pytest.approx(other[late])
+    assert np.array_equal(np.delete(few, wanting), np.delete(chosen, wanting))
+
+
+def test_a_budget_of_inspections_is_kept_in_every_turn() -> None:
+    known, (_, plan) = knowledge(), planned()
+    settings = known.scenario.planner.model_copy(update={"inspections_a_turn": 3})
+    written = known.scenario.model_copy(update={"planner": settings})
+    found = knowledge_of(written, known.model, known.draws, known.sensor_model.value_per_draw, plan.policy)
+    flown = fly_side_by_side(found, [found.truth(seed) for seed in range(40)], [asset_of(found)] * 40)
+    inspections = (flown.control_index == INSPECT).sum(axis=0)
+    assert inspections.max() == 3
+
+
+FLEET = """format = 1
+[fleet]
+name = "inspected"
+shard = {shard}
+[[group]]
+name = "all"
+scenario = "inspected_wing"
+count = 30
+inspections_a_turn = 2
+"""
+
+
+def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text(FLEET.format(shard=20), encoding="utf-8")
+    with pytest.raises(FleetError, match="`shard` be 30 or more"):
+        load_fleet(path)
+    path.write_text(FLEET.format(shard=30), encoding="utf-8")
+    assert load_fleet(path).groups[0].scenarios[0].planner.inspections_a_turn == 2
+
+
+def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path: Path) -> None:
+    text = (
+        TEXT[: TEXT.index("# What flies.")]
+        + TEXT[TEXT.index("# What the twin believes") : TEXT.index("[truth]")]
+    )
+    path = tmp_path / "watched.toml"
+    path.write_text(text, encoding="utf-8")
+    known = knowledge()
+    plant = known.plant(known.truth(2), asset_of(known))
+    told: list[dict[str, Any]] = []
+    rows: list[np.ndarray] = []
+    controls = ["3g"]
+
+    def messages() -> Iterator[dict[str, Any]]:
+        names = known.scenario.control_names
+        for turn in range(15):
+            before = names.index(controls[-2]) if turn else None
+            row = plant.turn(names.index(controls[-1]), before)
+            rows.append(row)
+            read = {
+                f"{name}_percent": 100.0 * value
+                for (*_, name, _), value in zip(known.scenario.readings, row[24:].tolist(), strict=True)
+                if np.isfinite(value)
+            }
+            yield {"turn": turn, "control": controls[-1], "strain": row[:24].tolist()} | read
+
+    def decide(decision: Mapping[str, Any]) -> None:
+        told.append(dict(decision))
+        controls.append(decision["next_control"])
+
+    uav_twin.watch(path, messages(), tmp_path / "watch", decide=decide, report=False)
+    assert "inspect" in controls
+    known_plan = knowledge_of(
+        known.scenario, known.model, known.draws, known.sensor_model.value_per_draw, planned()[1].policy
+    )
+    twin = known_plan.twin()
+    for row, decision, control in zip(rows, told, controls[:-1], strict=True):
+        turn = twin.turn(row, control)
+        mean = known.model.states.mean(turn.filtered)
+        assert decision["health"]["z2"]["mean"] == pytest.approx(mean[1], abs=0.05)
+    inspected = controls.index("inspect")
+    assert np.isfinite(rows[inspected][24:]).all()
+    spread = [decision["health"]["z2"]["standard_deviation"] for decision in told]
+    assert spread[inspected] < 0.7 * spread[inspected - 1]
