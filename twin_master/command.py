@@ -98,11 +98,11 @@ def run(
 
     scenario, ssp = _flown(scenario, with_scenario)
     overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt)
-    progress, report = terminal.progress(), not no_report
+    told: dict[str, Any] = {"progress": terminal.progress(), "report": not no_report}
     if seeds is not None:
         chosen = _alone(scenario, resume is not None or seed is not None or view or policy is not None)
         engine = engine_of(workers, cluster)
-        run_ensemble(chosen, seeds, out, overrides, engine, replace=replace, report=report, json=json)
+        run_ensemble(chosen, seeds, out, overrides, engine, replace=replace, report=not no_report, json=json)
         return
     if workers is not None or cluster is not None:
         given = "--workers" if cluster is None else "--cluster"
@@ -116,7 +116,7 @@ def run(
         folder, loaded = resume, None if scenario is None else load_scenario(scenario)
 
         def fly(begun: "Begun | None") -> "RunOutcome":
-            return resume_run(resume, loaded, report=report, progress=progress, begun=begun)
+            return resume_run(resume, loaded, begun=begun, **told)
     else:
         if scenario is None:
             raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
@@ -124,10 +124,7 @@ def run(
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
 
         def fly(begun: "Begun | None") -> "RunOutcome":
-            return new_run(
-                loaded, folder, overrides, policy=policy, replace=replace, report=report, progress=progress,
-                begun=begun,
-            )  # fmt: skip
+            return new_run(loaded, folder, overrides, policy=policy, replace=replace, begun=begun, **told)
 
     with shown(view) as begun:
         outcome = _interruptible(lambda: fly(begun), folder)
