@@ -80,14 +80,8 @@ class DecisionProblem:
         likelihood = self.likelihood[control]
         likelihood = likelihood if observed is None else likelihood[observed]
         if self.moves_first:
-            return np.asarray(likelihood * self._moved(belief, control))
-        return self._moved(likelihood * belief, control)
-
-    def _moved(self, belief: Float, control: int) -> Float:
-        if not self.transition.is_product:
-            return np.asarray(belief @ self.transition.matrix[control])
-        rows = [self.transition.forward(control, row) for row in np.atleast_2d(belief)]
-        return np.array(rows).reshape(belief.shape)
+            return np.asarray(likelihood * self.transition.forward(control, belief))
+        return self.transition.forward(control, likelihood * belief)
 
     def behind(self, control: int, chosen: Index, vectors: Float) -> Float:
         """Return the mean of vectors (N, S), one chosen for each observation (K,), behind a turn: (S,)."""
