@@ -421,10 +421,7 @@ def forget_modules(folder: str) -> None:
     """
     inside = folder.rstrip(os.sep) + os.sep
     sys.path[:] = [entry for entry in sys.path if not (entry + os.sep).startswith(inside)]
-    for (
-        name,
-        module,
-    ) in sys.modules.copy().items():  # one step, unlike a list of items: other threads import too
+    for name, module in sys.modules.copy().items():  # one step, unlike a list of items: other threads import too
         if str(getattr(module, "__file__", None) or "").startswith(inside):
             sys.modules.pop(name, None)
 

@@ -58,9 +58,8 @@ def planned(
     if policy is None and scenario.planner.policy == "qmdp":
         policy = BeliefPolicy(plan.action_value.T, np.arange(len(discount)))
     elif policy is None and scenario.planner.policy == "belief":
-        policy = expected_plan(scenario, decision_problem(scenario, model, sensor_model, rewards), rewards)[
-            0
-        ].policy
+        problem = decision_problem(scenario, model, sensor_model, rewards)
+        policy = expected_plan(scenario, problem, rewards)[0].policy
     return replace(plan, on_belief=policy)
 
 
