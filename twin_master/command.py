@@ -138,7 +138,8 @@ def _alone(scenario: str | None, beside: bool) -> str:
     """Return the scenario of an ensemble; refuse what is for one mission."""
     if scenario is None or beside:
         raise typer.BadParameter(
-            "many seeds need a scenario, and neither --resume (repeat the command), --seed, --policy nor --view",
+            "many seeds need a scenario, and neither --resume (repeat the command), --seed, --policy nor "
+            "--view.",
             param_hint="--seeds",
         )
     return scenario
