@@ -24,7 +24,7 @@ _STEP = 1e-12
 """What a bound improves by at least."""
 _DEEPEST = 1000
 """Turns that a descent looks ahead at most."""
-MOST_BELIEFS = 400
+MOST_BELIEFS = 1000
 """Beliefs to improve the bounds at, where the gap stays wider than asked for."""
 _SHARE = 0.9
 """Of the gap of the prior that a descent leaves alone, so that it is short while the gap is wide."""
