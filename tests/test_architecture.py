@@ -49,7 +49,7 @@ ROOMS = {
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
         "store", "report", "viewer", "workflow", "watch", "scenario_check", "fleet", "environment",
-        "command", "watch_command", "view_command", "__main__",
+        "command", "plan_command", "watch_command", "view_command", "__main__",
     ),
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",

@@ -51,6 +51,9 @@ Library = Annotated[
 Learnt = Annotated[
     Path | None, typer.Option(help="Fly with what a fleet has learnt, a file of `uav-twin fleet learn`.")
 ]
+Policy = Annotated[
+    Path | None, typer.Option(help="Fly this policy, a file of `uav-twin plan --out`, without planning.")
+]
 InProcess = Annotated[
     bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
 ]
@@ -86,6 +89,7 @@ def run(
     seeds: Seeds = None,
     workers: Workers = None,
     cluster: Cluster = None,
+    policy: Policy = None,
 ) -> None:
     """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
     from twin_master.assets.resolution import Overrides
@@ -94,17 +98,17 @@ def run(
 
     scenario, ssp = _flown(scenario, with_scenario)
     overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt)
-    progress, report = terminal.progress(), not no_report
+    told: dict[str, Any] = {"progress": terminal.progress(), "report": not no_report}
     if seeds is not None:
-        chosen = _alone(scenario, resume is not None or seed is not None or view)
+        chosen = _alone(scenario, resume is not None or seed is not None or view or policy is not None)
         engine = engine_of(workers, cluster)
-        run_ensemble(chosen, seeds, out, overrides, engine, replace=replace, report=report, json=json)
+        run_ensemble(chosen, seeds, out, overrides, engine, replace=replace, report=not no_report, json=json)
         return
     if workers is not None or cluster is not None:
         given = "--workers" if cluster is None else "--cluster"
         raise typer.BadParameter("belongs to --seeds: one mission flies alone.", param_hint=given)
     if resume is not None:
-        if out is not None or replace or overrides != Overrides():
+        if out is not None or replace or policy is not None or overrides != Overrides():
             raise typer.BadParameter(
                 "a run is continued with what its folder holds: give nothing beside it that would change it.",
                 param_hint="--resume",
@@ -112,7 +116,7 @@ def run(
         folder, loaded = resume, None if scenario is None else load_scenario(scenario)
 
         def fly(begun: "Begun | None") -> "RunOutcome":
-            return resume_run(resume, loaded, report=report, progress=progress, begun=begun)
+            return resume_run(resume, loaded, begun=begun, **told)
     else:
         if scenario is None:
             raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
@@ -120,9 +124,7 @@ def run(
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
 
         def fly(begun: "Begun | None") -> "RunOutcome":
-            return new_run(
-                loaded, folder, overrides, replace=replace, report=report, progress=progress, begun=begun
-            )
+            return new_run(loaded, folder, overrides, policy=policy, replace=replace, begun=begun, **told)
 
     with shown(view) as begun:
         outcome = _interruptible(lambda: fly(begun), folder)
@@ -136,7 +138,8 @@ def _alone(scenario: str | None, beside: bool) -> str:
     """Return the scenario of an ensemble; refuse what is for one mission."""
     if scenario is None or beside:
         raise typer.BadParameter(
-            "many seeds need a scenario, and neither --resume (repeat the command), --seed nor --view.",
+            "many seeds need a scenario, and neither --resume (repeat the command), --seed, --policy nor "
+            "--view.",
             param_hint="--seeds",
         )
     return scenario

@@ -101,7 +101,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         self._step, self._seed, self._control = 0, 0, 0
         self._seen: Float = np.empty(0)
         self._info: dict[str, Any] = {}
-        sensors = self.scenario.observation.count
+        sensors = self.scenario.observation.count + len(self.scenario.readings)
         self.action_space = gymnasium.spaces.Discrete(len(self.scenario.control))
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (sensors,), np.float64)
 

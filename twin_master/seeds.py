@@ -6,7 +6,7 @@ way round, and so that an interrupted run draws nothing twice.
 
 import numpy as np
 
-PURPOSES = ("damage", "noise", "calibration", "asset", "population")
+PURPOSES = ("damage", "noise", "calibration", "asset", "population", "inspection", "planning")
 """Purposes in the order of their spawn keys; new ones are appended."""
 
 

@@ -32,7 +32,9 @@ from twin_master.mission.checkpoint import open_checkpoint
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.kept_knowledge import keep_knowledge
 from twin_master.mission.loop import Flight, fly
+from twin_master.mission.planning import read_policy
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import (
     CONFIG_NAME,
@@ -53,7 +55,7 @@ from twin_master.store.summary import another_truth, control_changes, noticed, s
 from twin_master.store.writing import store_mission, write_summary, write_timing
 
 POLICY_NAME = "policy.npy"
-"""In the run folder: the policy (S, U) that was given in the place of a plan."""
+"""In the run folder: the policy that was given in the place of a plan, (S, U) or on the belief."""
 CALIBRATION_NAME = "calibration.json"
 
 
@@ -80,7 +82,7 @@ def new_run(
     folder: Path | str | None = None,
     overrides: Overrides | Mapping[str, Any] | None = None,
     *,
-    policy: ArrayLike | None = None,
+    policy: ArrayLike | BeliefPolicy | Path | None = None,
     replace: bool = False,
     report: bool = True,
     progress: Progress | None = None,
@@ -96,9 +98,9 @@ def new_run(
         The run folder to make; ``runs/NAME`` by default.
     overrides
         What differs from the file: the fields of `Overrides`, such as ``{"seed": 3, "fmu": "wing.fmu"}``.
-    policy : (S, U)
-        p(U | D) to fly instead of planning, row-stochastic: states in the order of `Knowledge.model.states`,
-        controls in that of the scenario. It is kept in the run folder.
+    policy : (S, U), BeliefPolicy or Path
+        To fly instead of planning: p(U | D), row-stochastic, states in the order of `Knowledge.model.states`,
+        controls in that of the scenario; or a policy on the belief, or its file. The run folder keeps it.
     replace
         Take the place of an existing run folder.
     report
@@ -129,8 +131,13 @@ def new_run(
     source.check()  # what is not there should not cost the user a folder
     files = dict(source.files())
     if policy is not None:
+        model = build_graphical_model(resolved)
+        on_belief = read_policy(policy, model) if isinstance(policy, Path) else policy
         kept = io.BytesIO()
-        np.save(kept, build_graphical_model(resolved).policy(policy))
+        if isinstance(on_belief, BeliefPolicy):
+            np.savez(kept, **vars(on_belief))
+        else:
+            np.save(kept, model.policy(on_belief))
         files[POLICY_NAME] = kept.getvalue()
     progress = progress or SilentProgress()
     if loaded.remark:
@@ -232,7 +239,7 @@ def _fly_and_store(
     config: Mapping[str, Any],
     scenario: Scenario,
     source: AssetSource,
-    policy: NDArray[np.float64] | None,
+    policy: NDArray[np.float64] | BeliefPolicy | None,
     clock: _Clock,
     progress: Progress,
 ) -> dict[str, Any]:
@@ -264,14 +271,15 @@ def _fly_and_store(
     return _timing(result.flight)
 
 
-def _given_policy(folder: Path, hashes: dict[str, str]) -> NDArray[np.float64] | None:
-    """Return the policy (S, U) that a run folder keeps, its hash noted, or None where it was planned."""
+def _given_policy(folder: Path, hashes: dict[str, str]) -> NDArray[np.float64] | BeliefPolicy | None:
+    """Return the policy that a run folder keeps, its hash noted, or None where it was planned."""
     path = folder / POLICY_NAME
     if not path.is_file():
         return None
     hashes["policy"] = hash_file(path)
     try:
-        return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+        kept = np.load(path, allow_pickle=False)
+        return np.asarray(kept, dtype=np.float64) if isinstance(kept, np.ndarray) else BeliefPolicy.of(kept)
     except (OSError, ValueError) as error:
         raise NotResumableError(
             f"{path} is damaged ({error}): fly the mission again with --replace."

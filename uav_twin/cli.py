@@ -9,6 +9,8 @@ from reporting import terminal
 from twin_master.command import guarded
 from twin_master.command import run as run_command
 from twin_master.fleet.command import compare, fleet_app
+from twin_master.plan_command import design as design_command
+from twin_master.plan_command import plan as plan_command
 from twin_master.view_command import view as view_command
 from twin_master.watch_command import watch as watch_command
 from uav_twin.calibrate_commands import calibrate_app
@@ -45,6 +47,8 @@ def uav_twin(
 
 
 app.command("run")(run_command)
+app.command("plan")(plan_command)
+app.command("design")(design_command)
 app.command("view")(view_command)
 app.command("watch")(watch_command)
 app.command("compare")(compare)

@@ -15,7 +15,7 @@ from twin_master.scenario.reading import load_scenario
 
 def test_what_is_shipped() -> None:
     wings = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
-    wings |= {"level_turns_learning", "paper_level_turns", "three_regions"}
+    wings |= {"level_turns_learning", "paper_level_turns", "three_regions", "inspected_wing"}
     assert set(scenario_files()) == {*wings, "pump_wear", "watched_wing", "bracket", "stiffened_panel"}
     assert set(binding_files()) == {
         *("gear_pump", "three_fmus", "uav_wing", "uav_wing_fmi3"),
@@ -45,7 +45,8 @@ def test_each_scenario_names_a_shipped_binding_and_can_be_flown(name: str) -> No
     assert scenario.asset.kind == "strain_library" or scenario.asset.binding in binding_files()
     model = build_graphical_model(scenario)
     assert model.states.size == (125 if name == "three_regions" else 25)
-    assert Truth(scenario, model, 0).noise.shape == ((60, 4) if name == "pump_wear" else (50, 24))
+    steps = {"pump_wear": 60, "inspected_wing": 120}.get(name, 50)
+    assert Truth(scenario, model, 0).noise.shape == (steps, 4 if name == "pump_wear" else 24)
 
 
 def test_the_wing_with_a_third_region_is_the_shipped_one_with_a_third_region() -> None:

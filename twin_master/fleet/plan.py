@@ -62,6 +62,8 @@ class GroupSection(Section):
     """A file of `uav-twin fleet learn`."""
     steps: Count | None = None
     parameters: dict[str, Spread] = Field(default_factory=dict)
+    inspections_a_turn: Count | None = None
+    """What `planner.inspections_a_turn` is in this group, which then flies in one shard."""
     true_probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
     """What `truth.probability` is in this group."""
 
@@ -216,6 +218,12 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
     for section in found.group:
         try:
             groups.append(_group(section, path.resolve().parent, head.seed))
+            rationed = groups[-1].scenarios[0].planner.inspections_a_turn is not None
+            if rationed and (len(groups[-1].members) > head.shard or len(groups[-1].scenarios) > 1):
+                raise FleetError(
+                    f"`inspections_a_turn` is shared by assets of one scenario in one shard: let `shard` be "
+                    f"{len(groups[-1].members)} or more, and give no pattern of files"
+                )
         except TwinMasterError as error:
             wrong.append(f"group {section.name}: {error}")
     if wrong:
@@ -323,6 +331,8 @@ def _of_group(section: GroupSection, scenario: Scenario) -> Scenario:
     table = scenario.to_dict()
     if section.steps is not None:
         table["mission"]["steps"] = section.steps
+    if section.inspections_a_turn is not None:
+        table["planner"]["inspections_a_turn"] = section.inspections_a_turn
     if section.true_probability:
         table["truth"]["probability"] = section.true_probability
     return parse_scenario(table, f"group {section.name}")

@@ -26,6 +26,7 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.assets.resolution import located_scenario
+from twin_master.errors import FleetError
 from twin_master.fleet.outcome import outcomes_of
 from twin_master.fleet.plan import Member
 from twin_master.fleet.recorded import assimilated
@@ -215,6 +216,10 @@ def _fly_each(
                         return fly(kit.knowledge, truths, [asset] * len(members))
                 else:
                     asset.restore_state(start)
+                if kit.scenario.planner.inspections_a_turn is not None:
+                    raise FleetError(
+                        "`inspections_a_turn` needs assets without memory, which fly side by side"
+                    )
                 flown.append(fly(kit.knowledge, [truth], [asset]))
             except IN_FLIGHT as error:
                 flown.append(replace(Flights.empty(kit.knowledge, 1), failure=(str(error),)))

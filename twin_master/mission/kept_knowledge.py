@@ -16,6 +16,7 @@ from reporting.files import atomic_write_bytes
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import RunFolderError
 from twin_master.mission.preparation import Knowledge, knowledge_of
+from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
@@ -25,7 +26,8 @@ KNOWLEDGE_NAME = "twin.npz"
 def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
     """Write what a twin knows before its flight; the bytes depend on nothing else.
 
-    The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); where what is there at
+    The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); where it is decided by the
+    belief also `belief_vectors` (N, S) and `belief_control` (N,); where what is there at
     the sensors is not what they show also `true` (E, S, U, G), SI.
 
     Raises
@@ -39,6 +41,8 @@ def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
         "draws": knowledge.draws.values,
         "policy": knowledge.plan.policy,
     }
+    if knowledge.plan.on_belief is not None:
+        arrays |= {f"belief_{name}": array for name, array in vars(knowledge.plan.on_belief).items()}
     np.savez(content, **arrays | ({} if true is None else {"true": true}))
     atomic_write_bytes(folder / KNOWLEDGE_NAME, content.getvalue())
 
@@ -75,12 +79,13 @@ def kept_knowledge(folder: Path, scenario: Scenario) -> Knowledge:
                 np.asarray(kept[name], dtype=np.float64) for name in ("predicted", "draws", "policy")
             )
             true = np.asarray(kept["true"], dtype=np.float64) if "true" in kept else None
+            on_belief = BeliefPolicy.of(kept, "belief_") if "belief_control" in kept else None
         calibration = scenario.calibration
         parameter = ParameterDraws(
             calibration.parameter, draws, float(draws.mean()), float(draws.std()), calibration.source
         )
         model = build_graphical_model(scenario)
-        return knowledge_of(scenario, model, parameter, predicted, policy, true)
+        return knowledge_of(scenario, model, parameter, predicted, on_belief or policy, true)
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise RunFolderError(
             f"{path} is missing, damaged or of another scenario ({error}): fly the run again with --replace."

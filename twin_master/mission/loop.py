@@ -250,7 +250,7 @@ def fly(
     unit = f"{scenario.mission.step_name}s"
     with (progress or SilentProgress()).stage("Flying", total=steps, unit=unit) as stage:
         stage.advance(resumed_at)
-        source = _Flown(plant, steps)
+        source = _Flown(plant, scenario)
         for reading, turn, seconds in operate(twin, source, kept):
             beliefs.add(reading.observed, turn)
             timing.append(seconds)
@@ -267,6 +267,11 @@ def ended_sentence(scenario: Scenario, turns: int, how: str) -> str:
     return f"The asset ended the mission after {turns} of {steps} {unit}s: {how}"
 
 
+def decided_to_end(scenario: Scenario, control_index: int) -> str:
+    """Return that an action has ended a mission, for `ended_sentence`."""
+    return f"the twin decided on `{scenario.control_names[control_index]}`."
+
+
 class _Flown:
     """A simulated asset as a source: it is flown under the control that the twin proposed.
 
@@ -278,15 +283,17 @@ class _Flown:
 
     ended: str | None = None
 
-    def __init__(self, plant: Plant, steps: int) -> None:
-        self._plant = plant
-        self._steps = steps
+    def __init__(self, plant: Plant, scenario: Scenario) -> None:
+        self._plant, self._scenario = plant, scenario
 
     def read(self, twin: Twin) -> Reading | None:
-        if twin.turns == self._steps:
+        if twin.turns == self._scenario.mission.steps:
             return None
         control = twin.proposed_control
         before = twin.control_of(twin.turns - 1) if twin.turns else None
+        if before is not None and self._scenario.ends(before):
+            self.ended = decided_to_end(self._scenario, before)
+            return None
         try:
             return Reading(self._plant.turn(control, before), control)
         except FmuEndedError as error:

@@ -77,7 +77,9 @@ class Plant:
         self._monitors: dict[str, list[float]] = {}
 
     def turn(self, control_index: int, previous_control_index: int | None) -> Float:
-        """Fly one turn and return what the sensors say: (G,), NaN where a sensor is lost.
+        """Fly one turn and return what the sensors say, and behind it the readings of inspections: (G + I,).
+
+        NaN where a sensor is lost, and where a reading was not asked for.
 
         Raises
         ------
@@ -99,7 +101,8 @@ class Plant:
         self._observations.append(values)
         for name, value in reading.monitors.items():
             self._monitors.setdefault(name, []).append(float(value))
-        return self._truth.sense(step, values) if reading.inner is None else reading.inner.sensed
+        sensed = self._truth.sense(step, values) if reading.inner is None else reading.inner.sensed
+        return np.concatenate((sensed, self._truth.inspected(step, state, control_index)))
 
     def _told(self, step: int, reading: AssetReading) -> Float:
         """Return the true state that an asset with damage of its own tells."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,12 +16,14 @@ from twin_master.assets.interface import Asset
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.learning.setup import scenario_estimator
+from twin_master.mission.planning import planned
 from twin_master.mission.plant import Plant
 from twin_master.mission.truth import Truth
 from twin_master.network.estimator import Estimator
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel
-from twin_master.network.planner import PlannedPolicy, given_policy, value_iteration
+from twin_master.network.inspection import InspectedSensorModel
+from twin_master.network.planner import BeliefPolicy, PlannedPolicy
 from twin_master.network.rewards import RewardModel, RewardSettings
 from twin_master.network.sensor_model import GaussianSensorModel, check_noise
 from twin_master.network.twin import Planner, Twin, build_graphical_model
@@ -97,6 +99,7 @@ class Knowledge:
             first_control=self.scenario.mission.first_control,
             estimator=estimator,
             safest=self.safest,
+            on_belief=self.plan.on_belief if policy is None else None,
         )
 
     @property
@@ -130,7 +133,7 @@ class Knowledge:
 
 
 def prepare_knowledge(
-    scenario: Scenario, source: AssetSource, seed: int, policy: Float | None = None
+    scenario: Scenario, source: AssetSource, seed: int, policy: Float | BeliefPolicy | None = None
 ) -> Knowledge:
     """Calibrate, predict the observations of every state and control, and plan.
 
@@ -144,8 +147,8 @@ def prepare_knowledge(
         Already prepared.
     seed : int
         Seed of the run.
-    policy : (S, U), optional
-        p(U | D) to fly instead of planning, row-stochastic.
+    policy : (S, U) or BeliefPolicy, optional
+        To fly instead of planning; p(U | D), row-stochastic.
 
     Raises
     ------
@@ -169,7 +172,7 @@ def knowledge_of(
     model: GraphicalModel,
     draws: ParameterDraws,
     predicted: Float,
-    policy: Float | None = None,
+    policy: Float | BeliefPolicy | None = None,
     true: Float | None = None,
 ) -> Knowledge:
     """Return what a twin knows that expects these observations (E, S, U, G), SI.
@@ -194,21 +197,34 @@ def knowledge_of(
     """
     section = scenario.observation
     kind = GaussianSensorModel if section.modes is None else IdentifiedSensorModel
-    sensor_model = kind(
+    within = model.states.within_interval if section.between_levels else None
+    sensor_model = (
+        partial(InspectedSensorModel, **_readings(scenario, model)) if scenario.readings else kind
+    )(
         predicted,
         section.standard_deviation,
         average=section.average_over_draws,
         model_error=section.model_error,
-        interval=model.states.within_interval(predicted.mean(axis=0)) if section.between_levels else None,
+        interval=within(predicted.mean(axis=0)) if within else None,
     )
     rewards = RewardModel(sensor_model, reward_settings(scenario), true)
-    transition, discount = model.transition, scenario.planner.gamma
-    reward = rewards.planning_reward(scenario.rewards.health_weight, scenario.rewards.control_weight)
-    if policy is None:
-        plan = value_iteration(transition, reward, discount)
-    else:
-        plan = given_policy(transition, reward, discount, model.policy(policy))
-    return Knowledge(scenario, model, draws, sensor_model, rewards, plan)
+    return Knowledge(
+        scenario, model, draws, sensor_model, rewards, planned(scenario, model, sensor_model, rewards, policy)
+    )
+
+
+def _readings(scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
+    """Return what inspections read in each state, and how well, for `InspectedSensorModel`."""
+    asked_by, places, _, deviations = (np.array(column) for column in zip(*scenario.readings, strict=True))
+    coordinates = model.states.coordinates
+    within = np.zeros_like(coordinates)
+    if scenario.observation.between_levels:
+        within = np.einsum("sff->sf", model.states.within_interval(coordinates))
+    return {
+        "asked_by": asked_by,
+        "reading": coordinates[:, places],
+        "reading_deviation": np.hypot(within[:, places], deviations),
+    }
 
 
 def prepare_twin(

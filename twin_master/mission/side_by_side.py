@@ -17,12 +17,12 @@ from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuEndedError, FmuError
 from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
-from twin_master.mission.loop import Flight, ended_sentence, fly
+from twin_master.mission.loop import Flight, decided_to_end, ended_sentence, fly
 from twin_master.mission.plant import Plant, checked_values
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth
 from twin_master.network.estimator import Notice
-from twin_master.network.step_many import decide_many, filter_step_many
+from twin_master.network.step_many import decide_many, filter_step_many, rationed
 
 __all__ = ["Flights", "fly_one_by_one", "fly_side_by_side"]
 
@@ -109,7 +109,7 @@ class _Plants(Protocol):
     """The assets of B twins with their truths."""
 
     def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
-        """Return what the sensors say (B, G) and the true states (B, F), under the controls (B,)."""
+        """Return what is observed (B, G + I) and the true states (B, F), under the controls (B,)."""
 
     failure: dict[int, str]
     """What ended the flight of a twin."""
@@ -123,7 +123,7 @@ class _Each:
     def __init__(self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]) -> None:
         pairs = zip(truths, assets, strict=True)
         self._plants: list[Plant] = [knowledge.plant(truth, asset) for truth, asset in pairs]
-        self._shape = len(self._plants), knowledge.scenario.observation.count, len(knowledge.scenario.state)
+        self._shape = len(self._plants), knowledge.scenario.row_width, len(knowledge.scenario.state)
         self._before: Index | None = None
         self._scenario = knowledge.scenario
         self.failure: dict[int, str] = {}
@@ -160,7 +160,10 @@ class _Stateless:
         self._growth = DamageGrowth(knowledge.true_model)
         self._noise = np.stack([truth.noise for truth in truths])
         self._uniform = np.stack([truth.uniform for truth in truths])
-        self._truth = truths[0]  # script, drift and losses are the scenario's, the same for all
+        self._truths, self._truth = (
+            truths,
+            truths[0],
+        )  # script, drift and losses are the scenario's, the same for all
         self._before: list[tuple[int | None, int | None]] = [(None, None)] * len(assets)
         self._seen: dict[tuple[int, int, bytes], Float | str] = {}
         self.failure: dict[int, str] = {}
@@ -179,7 +182,8 @@ class _Stateless:
                 distinct[row] = shown
         observed = distinct[inverse] + self._noise[:, step] + self._truth.drift[step]
         observed[:, self._truth.status[step] == SensorStatus.LOST] = np.nan
-        return observed, state
+        turns = zip(self._truths, state, control.tolist(), strict=True)
+        return np.hstack((observed, [truth.inspected(step, *turn) for truth, *turn in turns])), state
 
     def _grown(self, step: int, control: Index) -> tuple[Index, Float]:
         """Return the true states: their numbers (B,), zeros where they are scripted, and levels (B, F)."""
@@ -226,8 +230,18 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
     plants: _Plants = (_Stateless if stateless else _Each)(knowledge, truths, assets)
     control = np.full(count, scenario.control_names.index(scenario.mission.first_control))
     flying = np.ones(count, dtype=bool)
+    ending = np.array([scenario.ends(index) for index in range(len(scenario.control))])
+    budget, inspecting = (
+        scenario.planner.inspections_a_turn,
+        sorted({place for place, *_ in scenario.readings}),
+    )
     before: tuple[Float | None, Index | None] = None, None
     for step in range(scenario.mission.steps):
+        if before[1] is not None:
+            for twin in np.flatnonzero(flying & ending[before[1]]).tolist():
+                how = decided_to_end(scenario, before[1][twin])
+                plants.ended[twin] = ended_sentence(scenario, step, how)
+                flying[twin] = False
         observed, state = plants.turn(step, control, flying)
         flying[[*plants.failure, *plants.ended]] = False
         observed[~flying] = np.nan
@@ -238,11 +252,21 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
             plants.failure[twin] = str(ImpossibleObservation(scenario.mission.name, step, worst))
         flying &= ~impossible
         log_filtered[impossible] = model.log_prior  # of a failed twin: anything that can be gone on with
-        kept = (flights.observed, observed), (flights.control_index, control), (flights.state, state)
+        kept = (
+            (flights.observed, observed[:, : scenario.observation.count]),
+            (flights.control_index, control),
+            (flights.state, state),
+        )
         for array, row in (*kept, (flights.filtered, filtered), (flights.log_evidence, evidence)):
             array[flying, step] = row[flying]
         before = log_filtered, control
-        control = decide_many(model, filtered, control, knowledge.plan.policy, scenario.planner.decide_on)
+        flown, on_belief = control, knowledge.plan.on_belief
+        control = decide_many(model, filtered, control, knowledge.plan, scenario.planner.decide_on)
+        if budget is not None and on_belief is not None:
+            some = np.flatnonzero(flying)
+            control[some] = rationed(
+                model, filtered[some], flown[some], control[some], on_belief, inspecting, budget
+            )
     failure, ended = (
         tuple(told.get(twin, "") for twin in range(count)) for told in (plants.failure, plants.ended)
     )

@@ -52,6 +52,8 @@ class Truth:
         Drift added to the raw observation, in its SI unit.
     status : (T, G)
         `SensorStatus` of each sensor.
+    reading_noise : (T, I)
+        Noise added to the readings of inspections, SI.
     uniform : (T,)
         What drives random growth; zeros where damage is scripted.
     in_asset : bool
@@ -66,6 +68,9 @@ class Truth:
         self.drift: Float = np.zeros((steps, sensors))
         self.status: NDArray[np.int8] = np.zeros((steps, sensors), dtype=np.int8)
         self._apply_faults(scenario)
+        self._readings = scenario.readings
+        drawn = generator(seed, "inspection").standard_normal((steps, len(self._readings)))
+        self.reading_noise: Float = drawn * [deviation for *_, deviation in self._readings]
         self.in_asset = scenario.truth.kind == "asset"
         self.uniform: Float = np.zeros(steps)
         if self.in_asset:
@@ -112,6 +117,11 @@ class Truth:
         sensed: Float = observation + self.noise[step] + self.drift[step]
         sensed[self.status[step] == SensorStatus.LOST] = np.nan
         return sensed
+
+    def inspected(self, step: int, state: Float, control: int) -> Float:
+        """Return the readings of inspections in a step: (I,), SI, NaN where the control asks for none."""
+        read = [state[place] if action == control else np.nan for action, place, *_ in self._readings]
+        return np.asarray(np.array(read) + self.reading_noise[step])
 
 
 StateRule = Callable[[int, "Float | None", "int | None"], Float]

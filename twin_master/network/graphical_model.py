@@ -20,6 +20,8 @@ __all__ = [
     "GraphicalModel",
     "StateSpace",
     "deterministic_policy",
+    "leaving_table",
+    "repaired_table",
     "worsening_table",
 ]
 
@@ -295,6 +297,26 @@ def worsening_table(level_count: int, probability: float) -> Float:
     table += np.diag(np.full(level_count - 1, probability), 1)
     table[-1, -1] = 1.0
     return stochastic_matrix(table, name="worsening table")
+
+
+def repaired_table(table: Float, success: float) -> Float:
+    """Return transitions (L, L) whose end is brought to the lowest level with a probability."""
+    result = (1.0 - success) * table
+    result[:, 0] += success
+    return np.asarray(result / result.sum(axis=1, keepdims=True), dtype=np.float64)
+
+
+def leaving_table(table: Float, factor: float) -> Float:
+    """Return transitions (L, L) whose probabilities to leave a level are multiplied by a factor."""
+    result = factor * np.where(np.eye(len(table), dtype=bool), 0.0, table)
+    stay = 1.0 - result.sum(axis=1)
+    if np.any(stay < 0.0):
+        raise InvalidModelError(
+            f"a factor of {factor:g} on the transition probabilities makes the probability to leave a level "
+            f"{1.0 - float(stay.min()):g}, and at most 1 is possible: take "
+            "smaller `learning.transition_factors`"
+        )
+    return np.asarray(result + np.diag(stay), dtype=np.float64)
 
 
 def deterministic_policy(control_index: ArrayLike, control_count: int) -> Float:

@@ -1,6 +1,8 @@
 """Planning: value iteration on the Bellman equation, Kapteyn et al. 2021, eq. (36)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,10 +13,65 @@ from twin_master.network.distributions import stochastic_matrix
 from twin_master.network.graphical_model import deterministic_policy
 from twin_master.network.transition import TransitionModel
 
-__all__ = ["PlannedPolicy", "evaluate_policy", "given_policy", "value_iteration"]
+__all__ = ["BeliefPolicy", "PlannedPolicy", "evaluate_policy", "given_policy", "value_iteration"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class BeliefPolicy:
+    """What to do by the belief before a turn: the control of the vector that is largest there.
+
+    Attributes
+    ----------
+    vectors : (N, S)
+        Expected return of a plan that begins with a control, from each state.
+    control : (N,)
+        That control.
+    """
+
+    vectors: Float
+    control: Index
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> "BeliefPolicy":
+        """Return the policy of arrays by the names of its attributes, as a file has them.
+
+        Raises
+        ------
+        PlanningError
+            They are none.
+        """
+        try:
+            vectors, control = arrays[f"{prefix}vectors"], arrays[f"{prefix}control"]
+        except KeyError as error:
+            raise PlanningError(
+                f"a policy on the belief has `vectors` and `control`: {error} is missing"
+            ) from None
+        if vectors.ndim != 2 or control.shape != vectors.shape[:1] or control.dtype.kind not in "iu":
+            raise PlanningError(
+                f"expected vectors (N, S) and a control for each, got {vectors.shape} and {control.shape}"
+            )
+        return cls(np.asarray(vectors, dtype=np.float64), np.asarray(control, dtype=np.int64))
+
+    def value(self, belief: ArrayLike) -> Float:
+        """Return the expected return from beliefs (..., S): (...)."""
+        result: Float = (np.asarray(belief) @ self.vectors.T).max(axis=-1)
+        return result
+
+    def action_value(self, belief: ArrayLike, controls: int) -> Float:
+        """Return the same by the control of the first turn: (..., U), minus infinity without a vector."""
+        every = np.asarray(belief) @ self.vectors.T
+        result: Float = np.full((*every.shape[:-1], controls), -np.inf)
+        for control in np.unique(self.control).tolist():
+            result[..., control] = every[..., self.control == control].max(axis=-1)
+        return result
+
+    def decide(self, belief: ArrayLike) -> Index:
+        """Return the control for beliefs (..., S): (...)."""
+        result: Index = self.control[np.argmax(np.asarray(belief) @ self.vectors.T, axis=-1)]
+        return result
 
 
 @dataclass(frozen=True)
@@ -33,6 +90,8 @@ class PlannedPolicy:
         The same as a row-stochastic matrix p(U | D).
     iterations : int
         Sweeps until convergence; 0 for a policy that was given.
+    on_belief : BeliefPolicy or None
+        What decides by the belief in the place of `policy`, which then predicts alone.
     """
 
     value: Float
@@ -40,12 +99,13 @@ class PlannedPolicy:
     control_index: Index
     policy: Float
     iterations: int
+    on_belief: BeliefPolicy | None = None
 
 
 def _checked(
-    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: float
-) -> tuple[TransitionModel, Float]:
-    """Return the transitions and the reward (S, U)."""
+    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: ArrayLike
+) -> tuple[TransitionModel, Float, Float]:
+    """Return the transitions, the reward (S, U) and the discount (U,)."""
     if not isinstance(transition, TransitionModel):
         matrix = stochastic_matrix(transition, name="transition[control, state]")
         if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2]:
@@ -64,9 +124,13 @@ def _checked(
         raise PlanningError(
             f"reward at (state, control) {where} is {rewards[where]}; expected finite rewards"
         )
-    if not 0.0 <= discount < 1.0:
-        raise PlanningError(f"expected a discount factor in [0, 1), got {discount}")
-    return transition, rewards
+    factors = np.asarray(discount, dtype=np.float64)
+    if factors.shape not in ((), rewards.shape[1:]) or not np.all((factors >= 0.0) & (factors < 1.0)):
+        raise PlanningError(
+            f"expected a discount factor in [0, 1), or one for each of {rewards.shape[1]} controls, "
+            f"got {factors}"
+        )
+    return transition, rewards, np.broadcast_to(factors, rewards.shape[1:])
 
 
 @compiled
@@ -99,7 +163,7 @@ def _sweep(
         iterations += 1
 
 
-def _action_value(transition: TransitionModel, reward: Float, discount: float, value: Float) -> Float:
+def _action_value(transition: TransitionModel, reward: Float, discount: Float, value: Float) -> Float:
     """Return the reward of each control first and the value afterwards: (S, U)."""
     later = [transition.expected(control, value) for control in range(reward.shape[1])]
     result: Float = reward + discount * np.stack(later, axis=1)
@@ -107,7 +171,7 @@ def _action_value(transition: TransitionModel, reward: Float, discount: float, v
 
 
 def _product_sweep(
-    transition: TransitionModel, reward: Float, discount: float, limit: float, max_iterations: int
+    transition: TransitionModel, reward: Float, discount: Float, limit: float, max_iterations: int
 ) -> tuple[Float, Float, int, float]:
     """Sweep over a product of tables as `_sweep` over one; return value, action value, sweeps and change."""
     value: Float = np.zeros(len(reward))
@@ -124,7 +188,7 @@ def _product_sweep(
 def value_iteration(
     transition: TransitionModel | ArrayLike,
     reward: ArrayLike,
-    discount: float,
+    discount: ArrayLike,
     *,
     tolerance: float = 1e-12,
     max_iterations: int = 100_000,
@@ -137,8 +201,8 @@ def value_iteration(
         Row-stochastic.
     reward : (S, U)
         Expected reward of one step.
-    discount : float
-        gamma, in [0, 1).
+    discount : float or (U,)
+        gamma, in [0, 1), for all controls or for each: zero where nothing comes after a control.
     tolerance : float
         Largest error of the value, relative to the largest reward (bounded from the last change of the value
         by the contraction; rounding adds about 1e-16 / (1 - discount)).
@@ -157,24 +221,25 @@ def value_iteration(
     InvalidDistributionError
         If a row of the transition does not sum to one.
     """
-    model, rewards = _checked(transition, reward, discount)
+    model, rewards, factors = _checked(transition, reward, discount)
+    largest = float(factors.max())
     scale = float(np.abs(rewards).max()) or 1.0
     # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
-    limit = max(tolerance * scale * (1.0 - discount), 4e-16 * scale / (1.0 - discount))
+    limit = max(tolerance * scale * (1.0 - largest), 4e-16 * scale / (1.0 - largest))
     value, action_value = np.zeros(len(rewards)), np.empty_like(rewards)
     if model.is_product:
         value, action_value, iterations, change = _product_sweep(
-            model, rewards, discount, limit, max_iterations
+            model, rewards, factors, limit, max_iterations
         )
     else:
-        discounted = discount * model.matrix
+        discounted = factors[:, None, None] * model.matrix
         iterations, change = _sweep(discounted, rewards, limit, max_iterations, value, action_value)
     if change > limit:
         raise PlanningError(
             f"value iteration still changes by {change:.3g} after {max_iterations} sweeps with discount "
-            f"{discount}; allow more sweeps or a larger tolerance"
+            f"{largest}; allow more sweeps or a larger tolerance"
         )
-    tie = 2.0 * max(tolerance * scale, limit / (1.0 - discount))
+    tie = 2.0 * max(tolerance * scale, limit / (1.0 - largest))
     best = action_value.max(axis=1, keepdims=True)
     control_index = np.argmax(action_value >= best - tie, axis=1).astype(np.int64)
     return PlannedPolicy(
@@ -187,7 +252,7 @@ def value_iteration(
 
 
 def evaluate_policy(
-    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: float, policy: ArrayLike
+    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: ArrayLike, policy: ArrayLike
 ) -> Float:
     """Return the exact value (S,) of a policy: one linear solve, or iterated to rounding over a product.
 
@@ -198,24 +263,25 @@ def evaluate_policy(
     policy : (S, U)
         p(U | D), row-stochastic.
     """
-    model, rewards = _checked(transition, reward, discount)
+    model, rewards, factors = _checked(transition, reward, discount)
     rows = stochastic_matrix(policy, name="policy[state]")
     if rows.shape != rewards.shape:
         raise PlanningError(f"expected a policy of shape {rewards.shape}, got {rows.shape}")
     expected = np.einsum("su,su->s", rows, rewards)
     if not model.is_product:
-        closed_loop = np.einsum("su,ust->st", rows, model.matrix)
-        result: Float = np.linalg.solve(np.eye(len(expected)) - discount * closed_loop, expected)
+        closed_loop = np.einsum("su,ust->st", rows * factors, model.matrix)
+        result: Float = np.linalg.solve(np.eye(len(expected)) - closed_loop, expected)
         return result
     value: Float = np.zeros_like(expected)
     # Each sweep shrinks the error by the discount at least.
-    for _ in range(int(np.ceil(np.log(1e-17) / np.log(discount))) if discount > 0.0 else 1):
-        value = np.einsum("su,su->s", rows, _action_value(model, rewards, discount, value))
+    largest = float(factors.max())
+    for _ in range(int(np.ceil(np.log(1e-17) / np.log(largest))) if largest > 0.0 else 1):
+        value = np.einsum("su,su->s", rows, _action_value(model, rewards, factors, value))
     return value
 
 
 def given_policy(
-    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: float, policy: ArrayLike
+    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: ArrayLike, policy: ArrayLike
 ) -> PlannedPolicy:
     """Return a policy that was made elsewhere, with its exact value.
 
@@ -227,10 +293,10 @@ def given_policy(
         p(U | D), row-stochastic; `control_index` is its mode, the first of equals.
     """
     value = evaluate_policy(transition, reward, discount, policy)
-    model, rewards = _checked(transition, reward, discount)
+    model, rewards, factors = _checked(transition, reward, discount)
     rows = stochastic_matrix(policy, name="policy[state]")
     if model.is_product:
-        action_value = _action_value(model, rewards, discount, value)
+        action_value = _action_value(model, rewards, factors, value)
     else:
-        action_value = rewards + discount * np.einsum("ust,t->su", model.matrix, value)
+        action_value = rewards + factors * np.einsum("ust,t->su", model.matrix, value)
     return PlannedPolicy(value, action_value, np.argmax(rows, axis=1).astype(np.int64), rows, 0)

@@ -207,6 +207,16 @@ class GaussianSensorModel(QuantityModel):
             )
         return observation
 
+    def sampled(self, state: Index, control_index: int, generator: np.random.Generator) -> Float:
+        """Return one observation drawn in each of N states (N,) under a control: (N, G), SI."""
+        size = len(state), self.sensor_count
+        draw = generator.choice(self.draw_count, size if self._inside else (size[0], 1), p=self.draw_weight)
+        values = self.value_per_draw[draw, state[:, None], control_index, np.arange(self.sensor_count)]
+        within = generator.standard_normal((size[0], self.interval.shape[-1]))
+        noise = self.independent_standard_deviation[state, control_index] * generator.standard_normal(size)
+        moved = np.einsum("ngf,nf->ng", self.interval[state, control_index], within)
+        return np.asarray(values + noise + moved)
+
     def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
         """Return log p(o | D, u) for each state, eq. (30) or (32).
 

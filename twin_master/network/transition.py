@@ -230,7 +230,7 @@ class TransitionModel:
         return _kronecker(rows)
 
     def forward(self, control: int, belief: Float) -> Float:
-        """Return the belief (S,) one step later, in the linear domain."""
+        """Return beliefs (..., S) one step later, in the linear domain."""
         if not self.is_product:
             moved: Float = belief @ self.blocks[0][control]
             return moved
@@ -244,11 +244,11 @@ class TransitionModel:
         return self._applied([block[control] for block in self.blocks], value)
 
     def _applied(self, matrices: Sequence[Float], vector: Float) -> Float:
-        inner = len(vector)
+        shape, inner = vector.shape, vector.shape[-1]
         for matrix in matrices:
             inner //= len(matrix)
             vector = np.matmul(matrix, vector.reshape(-1, len(matrix), inner)).ravel()
-        return vector
+        return vector.reshape(shape)
 
 
 def _kronecker(arrays: Sequence[Float]) -> Float:

@@ -1,7 +1,4 @@
-"""The twin: it is shown observations and the control in force, and says what to do next.
-
-It holds no asset and no truth.
-"""
+"""The twin: it is shown observations and the control in force, and says what to do; it holds no truth."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -12,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twin_master.errors import InvalidModelError, InvalidObservationError
+from twin_master.network import graphical_model
 from twin_master.network.estimator import (
     Carried,
     Estimate,
@@ -25,6 +23,7 @@ from twin_master.network.estimator import (
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.inference import Predicted, predict
 from twin_master.network.packed_arrays import packed_arrays, unpacked_arrays
+from twin_master.network.planner import BeliefPolicy
 from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
@@ -69,26 +68,18 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
             }
     if leaving != 1.0:
         tables = {
-            control: {name: _leaving(table, leaving) for name, table in rows.items()}
+            control: {name: graphical_model.leaving_table(table, leaving) for name, table in rows.items()}
             for control, rows in tables.items()
         }
+    for action in scenario.action:
+        for name in action.repairs:
+            tables[action.name][name] = graphical_model.repaired_table(
+                tables[action.name][name], action.success
+            )
     levels = {factor.name: factor.levels for factor in scenario.state}
     return GraphicalModel.from_tables(
         levels, tables, {factor.name: factor.prior for factor in scenario.state}
     )
-
-
-def _leaving(table: Float, factor: float) -> Float:
-    """Return transitions (L, L) whose probabilities to leave a level are multiplied by a factor."""
-    result = factor * np.where(np.eye(len(table), dtype=bool), 0.0, table)
-    stay = 1.0 - result.sum(axis=1)
-    if np.any(stay < 0.0):
-        raise InvalidModelError(
-            f"a factor of {factor:g} on the transition probabilities makes the probability to leave a level "
-            f"{1.0 - float(stay.min()):g}, and at most 1 is possible: take "
-            "smaller `learning.transition_factors`"
-        )
-    return np.asarray(result + np.diag(stay), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -173,6 +164,8 @@ class Twin:
         What holds the belief in the place of the exact filter of model and sensor model.
     safest : int or str, optional
         Control where no state is believed; without it the policy of what is believed decides alone.
+    on_belief : BeliefPolicy, optional
+        Decides by p(D_{t+1} | o_0..o_t) in the place of the policy, which predicts.
 
     Raises
     ------
@@ -193,6 +186,7 @@ class Twin:
         first_control: int | str = 0,
         estimator: Estimator | None = None,
         safest: int | str | None = None,
+        on_belief: BeliefPolicy | None = None,
     ) -> None:
         if lag is not None and lag < 0:
             raise InvalidModelError(f"expected a lag of 0 or more turns, or None for all, got {lag}")
@@ -202,6 +196,7 @@ class Twin:
         self.policy = model.policy(policy(model) if callable(policy) else policy)
         self.prediction_steps = prediction_steps
         self.decide_on = decide_on
+        self._on_belief = on_belief
         self.lag = lag
         # One turn more than is smoothed: what the oldest of them followed from.
         self._seen: deque[_Seen] = deque(maxlen=None if lag is None else lag + 2)
@@ -412,7 +407,7 @@ class Twin:
     def _decided(self, estimate: Estimate) -> TwinTurn:
         control_index = estimate.carried.control_index
         prediction = predict(self.model, estimate.filtered, control_index, self.policy, self.prediction_steps)
-        decision_probability: Float = self._decided_on(estimate.filtered, control_index) @ self.policy
+        decision_probability = self._decision(estimate.filtered, control_index)
         if self._safest is not None:
             none = sum(one.probability for one in estimate.hypotheses if one.belief is None)
             decision_probability = (1.0 - none) * decision_probability + none * self._safest
@@ -438,13 +433,16 @@ class Twin:
         for one in estimate.hypotheses:
             chosen = self._safest
             if one.belief is not None:
-                chosen = self._decided_on(one.belief, estimate.carried.control_index) @ self.policy
+                chosen = self._decision(one.belief, estimate.carried.control_index)
             share[one.name] = 0.0 if chosen is None else one.probability * float(chosen[self._proposed])
         if estimate.suspicion is None or not share:
             return estimate.suspicion
         return replace(estimate.suspicion, decided_by=max(share, key=share.__getitem__))
 
-    def _decided_on(self, belief: Float, control_index: int) -> Float:
-        """Return the belief that the policy acts on: that of this turn, or of the next one."""
-        forward = self.model.transition.forward
-        return belief if self.decide_on == "filtered" else forward(control_index, belief)
+    def _decision(self, belief: Float, control_index: int) -> Float:
+        """Return the probability of each control (U,), by the belief of this turn or the next."""
+        if self.decide_on == "predicted" or self._on_belief is not None:
+            belief = self.model.transition.forward(control_index, belief)
+        if self._on_belief is not None:
+            return np.eye(len(self.model.controls))[self._on_belief.decide(belief)]
+        return np.asarray(belief @ self.policy)

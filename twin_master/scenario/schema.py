@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
+from twin_master.scenario.action import Action, Planner, with_actions
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.learning import Learning
 from twin_master.scenario.notice import NoticingOrNot
@@ -24,14 +25,15 @@ from twin_master.scenario.section import (
     Probability,
     Section,
     Seed,
+    check_known,
     check_one_or_each,
+    check_same,
     short,
 )
+from twin_master.scenario.transition import ROW_SUM_TOLERANCE, Transition
 from twin_master.scenario.truth import TruthSection
 from twin_master.scenario.watch import WatchSection
 
-ROW_SUM_TOLERANCE = 1e-12
-"""Largest departure of the sum of probabilities from one, as the graphical model has it."""
 LARGEST_STRAIN_NOISE = 0.1
 """Standard deviation of a strain gauge beyond which a unit was forgotten [1]."""
 REWARD_NAMES = ("health", "control", "error")
@@ -101,16 +103,6 @@ class Control(Section):
     values: Annotated[dict[str, Number], Field(min_length=1)]
 
 
-class Transition(Section):
-    """How the state moves in one step under each control; factors move independently given the control."""
-
-    kind: Literal["independent_worsening", "independent_tables"]
-    probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
-    """`independent_worsening`: probability of one level up, for each control (or control and state)."""
-    tables: dict[str, dict[str, tuple[tuple[Probability, ...], ...]]] = Field(default_factory=dict)
-    """`independent_tables`: for each control and state a square table, rows from, columns to."""
-
-
 class Rewards(Section):
     """Figures of the rewards, eqs. (9)-(11), and their weights in planning."""
 
@@ -125,16 +117,6 @@ class Rewards(Section):
     """Distance of observation and model that costs one, one for all sensors or one for each."""
     normalise_error_by: Name | None = None
     control: dict[str, Number]
-
-
-class Planner(Section):
-    """Value iteration, eq. (36)."""
-
-    gamma: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)]
-    decide_on: Literal["filtered", "predicted"] = "filtered"
-    """Which belief the next control is the most probable one of: D_t, or D_{t+1} as predicted."""
-    safest: Name | None = None
-    """Control where no state explains the sensors; by default the one with the least load."""
 
 
 class Reference(Section):
@@ -194,6 +176,8 @@ class Scenario(Section):
     mission: Mission
     state: Annotated[tuple[StateFactor, ...], Field(min_length=1)]
     control: Annotated[tuple[Control, ...], Field(min_length=1)]
+    """With one for each action behind those of the file."""
+    action: tuple[Action, ...] = ()
     observation: ObservationSection
     transition: Transition
     rewards: Rewards
@@ -211,7 +195,9 @@ class Scenario(Section):
     @model_validator(mode="before")
     @classmethod
     def _of_a_real_asset(cls, table: object) -> object:
-        """Let a scenario without `[asset]` and `[truth]` be one of a real asset."""
+        """Let a scenario without `[asset]` and `[truth]` be one of a real asset, and actions be controls."""
+        if isinstance(table, Mapping) and table.get("action"):
+            table = with_actions(table)
         if not isinstance(table, Mapping) or "asset" in table or "truth" in table:
             return table
         untold = {"kind": "scripted", "noise": {"standard_deviation": 0.0}}
@@ -231,6 +217,28 @@ class Scenario(Section):
     def control_names(self) -> tuple[str, ...]:
         """Names of the controls in their order."""
         return tuple(control.name for control in self.control)
+
+    @property
+    def readings(self) -> tuple[tuple[int, int, str, float], ...]:
+        """Of each reading of an inspection the places of its control and state, its name, and its deviation.
+
+        They stand in a row behind the values of the sensors, NaN where they were not asked for.
+        """
+        return tuple(
+            (self.control_names.index(action.name), self.state_names.index(state), name, deviation)
+            for action in self.action
+            for name, state, deviation in action.readings
+        )
+
+    @property
+    def row_width(self) -> int:
+        """Length of the row that comes of a turn."""
+        return self.observation.width + len(self.readings)
+
+    def ends(self, control_index: int) -> bool:
+        """Return whether the mission ends with a turn under a control."""
+        name = self.control_names[control_index]
+        return any(action.ends for action in self.action if action.name == name)
 
     @property
     def figure_names(self) -> tuple[str, ...]:
@@ -279,6 +287,10 @@ class Scenario(Section):
         absent["truth"] = {name for name in ("probability", "record") if not getattr(self.truth, name)}
         if self.observation.modes is None:
             absent["observation"] = {"modes"}
+        if not self.action:
+            absent |= {"action": True}
+        if self.planner.policy == "mode":
+            absent |= {"planner": {"policy", "limit_probability", "inspections_a_turn"}}
         return self.model_dump(mode="json", exclude=absent)
 
     @model_validator(mode="after")
@@ -294,21 +306,30 @@ class Scenario(Section):
                     f"every control must give a value to the same inputs: `{controls[0]}` gives "
                     f"{short(sorted(roles))} and `{control.name}` gives {short(sorted(control.values))}"
                 )
-        _known(self.mission.first_control, controls, "mission.first_control", "control")
-        _same(self.rewards.control, controls, "rewards.control", "control")
-        _known(self.planner.safest or controls[0], controls, "planner.safest", "control")
+        check_known(self.mission.first_control, controls, "mission.first_control", "control")
+        check_same(self.rewards.control, controls, "rewards.control", "control")
+        check_known(self.planner.safest or controls[0], controls, "planner.safest", "control")
         norm = self.rewards.normalise_error_by
         if norm is not None:
-            _known(norm, tuple(sorted(roles)), "rewards.normalise_error_by", "control input")
+            check_known(norm, tuple(sorted(roles)), "rewards.normalise_error_by", "control input")
             if any(control.values[norm] <= 0.0 for control in self.control):
                 raise ValueError(
                     f"`rewards.normalise_error_by` divides by `{norm}`, which must be positive in every "
                     "control"
                 )
-        self._check_transition()
+        self.transition.check(self.control_names, {factor.name: len(factor.levels) for factor in self.state})
+        true = self.truth.probability
+        if true and (self.truth.kind, self.transition.kind) != ("random_growth", "independent_worsening"):
+            raise ValueError(
+                "`truth.probability` belongs to the kind `random_growth`, and to transitions of the kind "
+                "`independent_worsening`"
+            )
+        if true:
+            check_same(true, controls, "truth.probability", "control")
+        self._check_actions()
         referred = [entry.figure for entry in self.reference]
         for name in referred:
-            _known(name, self.figure_names, "reference.figure", "figure of the summary")
+            check_known(name, self.figure_names, "reference.figure", "figure of the summary")
             if referred.count(name) > 1:
                 raise ValueError(f"`reference` gives `{name}` more than once: keep one of them")
         if self.truth.kind == "asset":
@@ -316,11 +337,11 @@ class Scenario(Section):
                 raise ValueError(
                     f"`truth.kind` `asset` needs an FMU, and the kind of the asset is `{self.asset.kind}`"
                 )
-            _same(self.truth.state, states, "truth.state", "state")
+            check_same(self.truth.state, states, "truth.state", "state")
         if self.truth.kind == "random_growth" and self.truth.gains:
             raise ValueError("`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`")
         for gain in self.truth.gains:
-            _known(gain.state, states, "truth.gains.state", "state")
+            check_known(gain.state, states, "truth.gains.state", "state")
         self._check_model_error()
         self._check_sensors()
         self._check_modes()
@@ -331,6 +352,23 @@ class Scenario(Section):
                     f"and {max(fault.sensors)} came"
                 )
         return self
+
+    def _check_actions(self) -> None:
+        for action in self.action:
+            check_known(action.control, self.control_names, "action.control", "control")
+            for state in (*action.inspects, *action.repairs):
+                check_known(state, self.state_names, f"action.{action.name}", "state")
+            if action.repairs and self.truth.kind != "random_growth" and self.asset.kind != WATCHED_KIND:
+                raise ValueError(
+                    f"action `{action.name}` repairs, which a truth of the kind `random_growth` follows, and "
+                    f"the kind is `{self.truth.kind}`"
+                )
+        tables = [name for name in ("learning", "notice") if getattr(self, name) is not None]
+        if self.readings and (tables or self.observation.modes is not None):
+            name = [*tables, "observation.modes"][0]
+            raise ValueError(
+                f"`{name}` does not go together with actions that inspect: leave one of them out"
+            )
 
     def _check_model_error(self) -> None:
         error = self.observation.model_error
@@ -359,7 +397,9 @@ class Scenario(Section):
             raise ValueError(
                 "the role `modes` needs `truth.record`, which says how the record of a turn is made"
             )
-        _known(record.input, tuple(sorted(self.control[0].values)), "truth.record.input", "control input")
+        check_known(
+            record.input, tuple(sorted(self.control[0].values)), "truth.record.input", "control input"
+        )
         if modes.bands[-1][1] > 0.5 * record.sampling_rate:
             raise ValueError(
                 f"`truth.record.sampling_rate` {record.sampling_rate:g} shows nothing above "
@@ -400,51 +440,3 @@ class Scenario(Section):
                     f"`{key}` is {given:g} as a strain, and no gauge is off by {LARGEST_STRAIN_NOISE:g}: "
                     f"for microstrain write `{key}_microstrain = {given:g}`"
                 )
-
-    def _check_transition(self) -> None:
-        transition, true = self.transition, self.truth.probability
-        if true and (self.truth.kind, transition.kind) != ("random_growth", "independent_worsening"):
-            raise ValueError(
-                "`truth.probability` belongs to the kind `random_growth`, and to transitions of the kind "
-                "`independent_worsening`"
-            )
-        if true:
-            _same(true, self.control_names, "truth.probability", "control")
-        if transition.kind == "independent_worsening":
-            if transition.tables:
-                raise ValueError("`transition.tables` belongs to the kind `independent_tables`")
-            _same(transition.probability, self.control_names, "transition.probability", "control")
-            for name, entry in transition.probability.items():
-                if isinstance(entry, dict):
-                    _same(entry, self.state_names, f"transition.probability.{name}", "state")
-            return
-        if transition.probability:
-            raise ValueError("`transition.probability` belongs to the kind `independent_worsening`")
-        _same(transition.tables, self.control_names, "transition.tables", "control")
-        for name, tables in transition.tables.items():
-            _same(tables, self.state_names, f"transition.tables.{name}", "state")
-            for factor in self.state:
-                size = len(factor.levels)
-                table = tables[factor.name]
-                if len(table) != size or any(len(row) != size for row in table):
-                    raise ValueError(
-                        f"`transition.tables.{name}.{factor.name}` must be {size} rows of {size} "
-                        "probabilities"
-                    )
-                worst = max(abs(sum(row) - 1.0) for row in table)
-                if worst > ROW_SUM_TOLERANCE:
-                    raise ValueError(
-                        f"each row of `transition.tables.{name}.{factor.name}` must sum to 1, "
-                        f"one misses it by {worst:.3g}"
-                    )
-
-
-def _known(name: str, names: tuple[str, ...], where: str, what: str) -> None:
-    if name not in names:
-        raise ValueError(f"`{where}` must name a {what} ({short(names)}), and `{name}` came")
-
-
-def _same(table: Mapping[str, object], names: tuple[str, ...], where: str, what: str) -> None:
-    if set(table) != set(names):
-        came = short(list(table)) or "none"
-        raise ValueError(f"`{where}` must have one entry for each {what} ({short(names)}), and has {came}")

@@ -101,3 +101,16 @@ def short(values: object) -> str:
     if isinstance(values, list | tuple):
         return ", ".join(str(value) for value in values)
     return str(values)
+
+
+def check_known(name: str, names: tuple[str, ...], where: str, what: str) -> None:
+    """Check that a name is one of those there are."""
+    if name not in names:
+        raise ValueError(f"`{where}` must name a {what} ({short(names)}), and `{name}` came")
+
+
+def check_same(table: Mapping[str, object], names: tuple[str, ...], where: str, what: str) -> None:
+    """Check that a table has one entry for each name."""
+    if set(table) != set(names):
+        came = short(list(table)) or "none"
+        raise ValueError(f"`{where}` must have one entry for each {what} ({short(names)}), and has {came}")

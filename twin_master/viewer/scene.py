@@ -10,7 +10,7 @@ from fe.wing.design import WingDesign, load_design
 from twin_master.assets.design_source import DESIGN_COPY, FLOWN_DESIGN_COPY
 from twin_master.mission.preparation import Knowledge
 from twin_master.report.view import capital, printed_observation, printed_state, symbol
-from twin_master.scenario.schema import CALIBRATION_COPY, REWARD_NAMES
+from twin_master.scenario.schema import CALIBRATION_COPY, REWARD_NAMES, Scenario
 
 Float = NDArray[np.float64]
 
@@ -136,7 +136,7 @@ def scene_of(folder: Path, knowledge: Knowledge) -> Scene:
         controls=tuple(scenario.control_names),
         rewards=REWARD_NAMES,
         sensors=_sensors(knowledge),
-        planform=_planform(folder, knowledge),
+        planform=planform_of(_design(folder), scenario),
     )
 
 
@@ -152,9 +152,9 @@ def _sensors(knowledge: Knowledge) -> Sensors:
     return Sensors(word, titles, section.role, unit, scale, False, float(shown.min()), float(shown.max()))
 
 
-def _planform(folder: Path, knowledge: Knowledge) -> Planform | None:
-    design = _design(folder)
-    if design is None or len(design.gauges.positions) != knowledge.scenario.observation.count:
+def planform_of(design: WingDesign | None, scenario: Scenario) -> Planform | None:
+    """Return a wing from above; None without one that has the sensors of a scenario."""
+    if design is None or len(design.gauges.positions) != scenario.observation.count:
         return None
     plan = design.planform
 
@@ -169,7 +169,7 @@ def _planform(folder: Path, knowledge: Knowledge) -> Planform | None:
         f"z{number}": panel(d.span_start, d.span_end, d.chord_start, d.chord_end)
         for number, d in enumerate(design.defects, start=1)
     }
-    names = knowledge.scenario.state_names
+    names = scenario.state_names
     return Planform(
         outline=panel(0.0, plan.semi_span, 0.0, 1.0),
         regions=tuple(places[name] for name in names) if {*names} <= {*places} else (),

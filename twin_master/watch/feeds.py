@@ -250,7 +250,9 @@ class FolderFeed(_FileFeed):
         except (KeyError, TypeError, ValueError):
             return Refused("the line has another layout")
         sensors = self._scenario.observation
-        if len(observed) not in (sensors.count, sensors.width) or control >= len(self._scenario.control):
+        if len(observed) not in (sensors.count, self._scenario.row_width) or control >= len(
+            self._scenario.control
+        ):
             return Refused("it is of an asset with other sensors or controls")
         return Message(observed, turn, None, control)
 

@@ -152,7 +152,7 @@ class Intake:
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: RejectedFile) -> None:
         self._section, self._words = scenario.watch, words_of(scenario)
-        self._width = scenario.observation.width
+        self._width = scenario.row_width
         self._feed = feed
         self._rejected = rejected
         self._messages: Iterator[tuple[Message | Refused | None, str]] | None = None

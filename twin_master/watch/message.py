@@ -65,9 +65,9 @@ class MessageReader:
     """Reads the messages about the asset of a scenario.
 
     A sensor goes by `ROLE_NUMBER` (`strain_7`) or its title, its unit behind it: `strain_7_microstrain`,
-    `strain_7 [microstrain]`; without a unit it is in that of the scenario. All sensors together go by their
-    role, as a list, with `unit` beside it. A sensor of which no number comes, or an absurd one, is lost
-    alone.
+    `strain_7 [microstrain]`; without a unit it is in that of the scenario. The reading of an inspection goes
+    by `ACTION_STATE` (`inspect_z1_percent`). All sensors together go by their role, as a list, with `unit`
+    beside it. A sensor of which no number comes, or an absurd one, is lost alone.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -77,8 +77,11 @@ class MessageReader:
         self._index = {f"{role}_{number + 1}": number for number in range(count)}
         self._index |= {title: number for number, title in enumerate(scenario.observation.titles)}
         self._columns: dict[str, tuple[int, float]] = {}
-        units = scenario.observation.sensor_units
+        units, self._width = scenario.observation.sensor_units, scenario.row_width
         self._largest = [LARGEST_STRAIN if role == "strain" and unit == "1" else LARGEST for unit in units]
+        self._index |= {name: count + place for place, (*_, name, _) in enumerate(scenario.readings)}
+        self._units = [*units, *(scenario.state[place].unit for _, place, *_ in scenario.readings)]
+        self._largest += [LARGEST] * len(scenario.readings)
 
     def column(self, name: str) -> tuple[int, float] | None:
         """Return the index of the sensor that a name stands for, and what its values are multiplied by.
@@ -104,7 +107,7 @@ class MessageReader:
         if base not in self._index:
             raise Refused(
                 f"`{name[:60]}` is no sensor: a sensor is called such as {_near(name[:60], *self._index)}, "
-                f"its unit behind it, and there are {self._observation.count}; what is none is passed over "
+                f"its unit behind it, and there are {len(self._units)}; what is none is passed over "
                 "with --allow-unknown, or where its name begins with `_`"
             )
         sensor = self._index[base]
@@ -114,7 +117,7 @@ class MessageReader:
         return found
 
     def _factor(self, sensor: int, unit: str) -> float:
-        own = self._observation.sensor_units[sensor]
+        own = self._units[sensor]
         if unit in ("", own):
             return 1.0
         if own == "1" and unit in _WITHOUT_UNIT:
@@ -154,7 +157,7 @@ class MessageReader:
         Refused
             It is none.
         """
-        observed = np.full(self._observation.width, np.nan)
+        observed = np.full(self._width, np.nan)
         given: set[int] = set()
         unreadable: dict[int, str] = {}
         unit = record.get("unit", "")

@@ -1,0 +1,301 @@
+"""A wing that is inspected and repaired: actions in a scenario, flown, planned on the belief."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import uav_twin
+from fe.reduction.model_cache import reduced_model
+from fe.wing.design import load_design
+from scenarios import scenario_files
+from tests.command_line import call
+from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.errors import FleetError, PlanningError, ScenarioError
+from twin_master.fleet.plan import load_fleet
+from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
+from twin_master.mission.loop import fly
+from twin_master.mission.planning import (
+    decision_problem,
+    expected_plan,
+    promised,
+    read_policy,
+    risk_of,
+    write_policy,
+)
+from twin_master.mission.preparation import Knowledge, knowledge_of, prepare_knowledge
+from twin_master.mission.side_by_side import fly_side_by_side
+from twin_master.network.planner import BeliefPolicy
+from twin_master.network.step_many import rationed
+from twin_master.network.transition import TransitionModel
+from twin_master.scenario.reading import parse_scenario
+from twin_master.scenario.schema import Scenario
+
+TEXT = scenario_files()["inspected_wing"].read_text(encoding="utf-8")
+INSPECT, REPAIR_1 = 2, 3
+
+
+def scenario(*changes: tuple[str, str], **planner: Any) -> Scenario:
+    text = TEXT.replace("notice = false", "")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    table = tomllib.loads(text)
+    table["planner"] |= planner
+    return parse_scenario(table, "x")
+
+
+@cache
+def knowledge(policy: str = "mode") -> Knowledge:
+    written = scenario(policy=policy)
+    return prepare_knowledge(written, ReducedModelSource(written, reduced_model(load_design())), 3)
+
+
+def test_an_action_is_a_control_with_a_price_that_reads_back() -> None:
+    written = scenario()
+    assert written.control_names == ("2g", "3g", "inspect", "repair_1", "repair_2")
+    assert written.control[INSPECT].values == {"load_factor": 2.0}
+    assert written.rewards.control["inspect"] == pytest.approx(-0.1 - 0.2 / 16.0)
+    assert [reading[2:] for reading in written.readings] == [("inspect_z1", 0.1), ("inspect_z2", 0.1)]
+    assert parse_scenario(written.to_dict(), "config.json") == written
+    own = scenario(('"3g" = 0.15 }', '"3g" = 0.15, inspect = 0.0 }'))
+    assert own.transition.probability["inspect"] == 0.0
+
+
+def test_a_repair_follows_the_growth_of_its_turn() -> None:
+    moved = knowledge().model.transition
+    row = moved.row(REPAIR_1, 4 * 5 + 1).reshape(5, 5)
+    assert row[0] == pytest.approx([0.0, 0.95, 0.05, 0.0, 0.0])
+    assert not row[1:].any()
+
+
+WRONG = {
+    "no such control": ('control = "2g"\ncost = 0.2', 'control = "4g"\ncost = 0.2', ["action.control", "4g"]),
+    "no such state": ('["z1", "z2"]', '["z1", "z9"]', ["action.inspect", "z9"]),
+    "without a noise": ("standard_deviation_percent = 10\n", "", ["inspect", "standard_deviation"]),
+    "does nothing": ('repairs = ["z1"]', "", ["repair_1", "repairs"]),
+    "negative cost": ("cost = 3.0", "cost = -3.0", ["cost", "greater than or equal to 0"]),
+    "a script": ('"random_growth"', '"scripted"', ["repair_1", "random_growth", "scripted"]),
+    "learning": ("[planner]", "[learning]\n[planner]", ["learning", "inspect"]),
+    "a limit for the mode": ('policy = "belief"', "limit_probability = 0.1", ["limit_probability", "belief"]),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_with_an_action_is_said_in_one_sentence(case: str) -> None:
+    old, new, words = WRONG[case]
+    with pytest.raises(ScenarioError) as error:
+        scenario((old, new))
+    assert all(word in str(error.value) for word in words), error.value
+
+
+def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn() -> None:
+    known = knowledge()
+    row = np.full(26, np.nan)
+    row[24] = 0.37
+    seen = known.sensor_model.log_likelihood(row, INSPECT)
+    levels = known.model.states.coordinates[:, 0]
+    assert seen == pytest.approx(norm.logpdf(0.37, levels, 0.1))
+    assert not known.sensor_model.log_likelihood(row[:24], INSPECT).any()
+    drawn = known.sensor_model.sampled(np.zeros(9, dtype=int), 0, np.random.default_rng(0))  # type: ignore[attr-defined]
+    assert np.isnan(drawn[:, 24:]).all()
+
+
+def asset_of(known: Knowledge) -> Any:
+    return ReducedModelSource(known.scenario, reduced_model(load_design())).open()
+
+
+def test_missions_side_by_side_are_those_alone_with_readings_and_repairs() -> None:
+    known = knowledge("qmdp")
+    truths = [known.truth(seed) for seed in range(3)]
+    together = fly_side_by_side(known, truths, [asset_of(known)] * 3)
+    alone = fly(known.scenario, known.twin(), known.plant(truths[1], asset_of(known)))
+    assert np.array_equal(together.control_index[1], alone.control_index)
+    assert np.array_equal(together.filtered[1], alone.filtered)
+    for states, controls in zip(together.state, together.control_index, strict=True):
+        assert not states[1:][controls[:-1] == REPAIR_1, 0].any()
+    assert (together.control_index == REPAIR_1).any()
+
+
+def test_an_action_that_ends_ends_the_mission() -> None:
+    written = scenario(('repairs = ["z2"]', "ends = true"), ("cost = 3.0\nrepairs", "cost = 0.0\nrepairs"))
+    known = prepare_knowledge(written, ReducedModelSource(written, reduced_model(load_design())), 3)
+    stopping = BeliefPolicy(np.ones((1, 25)), np.array([4]))
+    stop = knowledge_of(written, known.model, known.draws, known.sensor_model.value_per_draw, stopping)
+    flown = fly(written, stop.twin(), stop.plant(stop.truth(1), asset_of(stop)))
+    assert flown.control_index.tolist() == [1, 4]
+    assert "decided on `repair_2`" in flown.notices[-1][1].sentence
+    many = fly_side_by_side(stop, [stop.truth(1)], [asset_of(stop)])
+    assert many.ended[0] == flown.notices[-1][1].sentence
+    value = known.plan.action_value[:, 4]
+    assert value == pytest.approx(known.planning_reward[:, 4])  # and nothing behind it
+
+
+@cache
+def planned() -> tuple[Any, Any]:
+    known = knowledge()
+    problem = decision_problem(known.scenario, known.model, known.sensor_model, known.rewards)
+    return problem, expected_plan(known.scenario, problem, known.rewards)[0]
+
+
+def test_flown_missions_bring_the_return_that_was_promised() -> None:
+    known, (problem, plan) = knowledge(), planned()
+    found = knowledge_of(
+        known.scenario, known.model, known.draws, known.sensor_model.value_per_draw, plan.policy
+    )
+    count = 300
+    flown = fly_side_by_side(found, [found.truth(seed) for seed in range(count)], [asset_of(found)] * count)
+    levels = np.rint(flown.state * 5.0).astype(int)
+    place = levels[..., 0] * 5 + levels[..., 1]
+    reward = known.planning_reward[place, flown.control_index]
+    total = reward @ known.scenario.planner.gamma ** np.arange(reward.shape[1])
+    half = 2.58 * total.std() / np.sqrt(count)
+    assert plan.lower - half <= total.mean() <= plan.upper + half
+    said = promised(known.scenario, problem, plan.policy)
+    assert abs(total.mean() - said.mean) <= np.hypot(half, 2.58 / 1.96 * said.half_width)
+    inspections = (flown.control_index == INSPECT).mean()
+    assert 0.05 < inspections < 0.3
+
+
+def test_a_limit_is_kept_by_the_plan() -> None:
+    known, (problem, plan) = knowledge(), planned()
+    free = risk_of(known.scenario, problem, known.rewards, plan.policy)
+    limited = scenario(policy="belief", limit_probability=round(0.6 * free, 4))
+    careful, price = expected_plan(limited, problem, known.rewards)
+    assert price > 0.0
+    assert risk_of(limited, problem, known.rewards, careful.policy) <= 0.6 * free
+    assert promised(limited, problem, careful.policy).mean < promised(limited, problem, plan.policy).mean
+
+
+def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path: Path) -> None:
+    known, (_, plan) = knowledge(), planned()
+    write_policy(tmp_path / "policy.npz", plan.policy, known.model)
+    policy = read_policy(tmp_path / "policy.npz", known.model)
+    assert np.array_equal(policy.vectors, plan.policy.vectors)
+    found = knowledge_of(known.scenario, known.model, known.draws, known.sensor_model.value_per_draw, policy)
+    keep_knowledge(tmp_path, found)
+    again = kept_knowledge(tmp_path, known.scenario).plan.on_belief
+    assert again is not None
+    assert np.array_equal(again.vectors, policy.vectors)
+    (tmp_path / "other.npz").write_bytes(b"no policy")
+    with pytest.raises(PlanningError, match="no policy of"):
+        read_policy(tmp_path / "other.npz", known.model)
+
+
+def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
+    words = ("plan", "inspected_wing", "--out", policy, "--picture", picture, "--value-of", "inspect")
+    assert call(monkeypatch, *words, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["lower"] < record["upper"]
+    assert record["value"]["mean"] > record["value"]["half_width"] > 0.0
+    assert policy.stat().st_size > 1000
+    assert picture.read_bytes().startswith(b"<?xml")
+    assert call(monkeypatch, "plan", "inspected_wing", "--value-of", "25") == 1
+    assert "`25` came" in capsys.readouterr().err
+
+
+def test_inspections_of_a_fleet_go_where_they_are_worth_most() -> None:
+    known, (_, plan) = knowledge(), planned()
+    ahead = np.random.default_rng(0).dirichlet(np.full(25, 0.3), 60)
+    model = replace(known.model, transition=TransitionModel((np.tile(np.eye(25), (5, 1, 1)),)))
+    chosen = plan.policy.decide(ahead)
+    wanting = np.flatnonzero(chosen == INSPECT)
+    few = rationed(model, ahead, np.zeros(60, dtype=int), chosen, plan.policy, [INSPECT], 3)
+    value = plan.policy.action_value(ahead, 5)
+    other = np.delete(value, INSPECT, axis=1).max(axis=1)
+    gain = value[:, INSPECT] - other
+    kept = np.flatnonzero(few == INSPECT)
+    assert len(wanting) > len(kept) == 3
+    assert gain[kept].min() >= np.delete(gain, kept)[np.isin(np.delete(np.arange(60), kept), wanting)].max()
+    late = np.setdiff1d(wanting, kept)
+    assert value[late, few[late]] == pytest.approx(other[late])
+    assert np.array_equal(np.delete(few, wanting), np.delete(chosen, wanting))
+
+
+def test_a_budget_of_inspections_is_kept_in_every_turn() -> None:
+    known, (_, plan) = knowledge(), planned()
+    settings = known.scenario.planner.model_copy(update={"inspections_a_turn": 3})
+    written = known.scenario.model_copy(update={"planner": settings})
+    found = knowledge_of(written, known.model, known.draws, known.sensor_model.value_per_draw, plan.policy)
+    flown = fly_side_by_side(found, [found.truth(seed) for seed in range(40)], [asset_of(found)] * 40)
+    inspections = (flown.control_index == INSPECT).sum(axis=0)
+    assert inspections.max() == 3
+
+
+FLEET = """format = 1
+[fleet]
+name = "inspected"
+shard = {shard}
+[[group]]
+name = "all"
+scenario = "inspected_wing"
+count = 30
+inspections_a_turn = 2
+"""
+
+
+def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text(FLEET.format(shard=20), encoding="utf-8")
+    with pytest.raises(FleetError, match="`shard` be 30 or more"):
+        load_fleet(path)
+    path.write_text(FLEET.format(shard=30), encoding="utf-8")
+    assert load_fleet(path).groups[0].scenarios[0].planner.inspections_a_turn == 2
+
+
+def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path: Path) -> None:
+    text = (
+        TEXT[: TEXT.index("# What flies.")]
+        + TEXT[TEXT.index("# What the twin believes") : TEXT.index("[truth]")]
+    )
+    path = tmp_path / "watched.toml"
+    path.write_text(text, encoding="utf-8")
+    known = knowledge()
+    plant = known.plant(known.truth(2), asset_of(known))
+    told: list[dict[str, Any]] = []
+    rows: list[np.ndarray] = []
+    controls = ["3g"]
+
+    def messages() -> Iterator[dict[str, Any]]:
+        names = known.scenario.control_names
+        for turn in range(15):
+            before = names.index(controls[-2]) if turn else None
+            row = plant.turn(names.index(controls[-1]), before)
+            rows.append(row)
+            read = {
+                f"{name}_percent": 100.0 * value
+                for (*_, name, _), value in zip(known.scenario.readings, row[24:].tolist(), strict=True)
+                if np.isfinite(value)
+            }
+            yield {"turn": turn, "control": controls[-1], "strain": row[:24].tolist()} | read
+
+    def decide(decision: Mapping[str, Any]) -> None:
+        told.append(dict(decision))
+        controls.append(decision["next_control"])
+
+    uav_twin.watch(path, messages(), tmp_path / "watch", decide=decide, report=False)
+    assert "inspect" in controls
+    known_plan = knowledge_of(
+        known.scenario, known.model, known.draws, known.sensor_model.value_per_draw, planned()[1].policy
+    )
+    twin = known_plan.twin()
+    for row, decision, control in zip(rows, told, controls[:-1], strict=True):
+        turn = twin.turn(row, control)
+        mean = known.model.states.mean(turn.filtered)
+        assert decision["health"]["z2"]["mean"] == pytest.approx(mean[1], abs=0.05)
+    inspected = controls.index("inspect")
+    assert np.isfinite(rows[inspected][24:]).all()
+    spread = [decision["health"]["z2"]["standard_deviation"] for decision in told]
+    assert spread[inspected] < 0.7 * spread[inspected - 1]

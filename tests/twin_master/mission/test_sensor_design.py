@@ -1,0 +1,112 @@
+"""Which sensors tell most, against exhaustive search and integrals."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from functools import cache
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from fe.reduction.model_cache import reduced_model
+from fe.wing.design import load_design
+from tests.command_line import call
+from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.errors import MissionInputError
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.sensor_design import Readings, chosen_sensors, drawn_readings, separations
+from twin_master.scenario.reading import load_scenario
+
+
+@cache
+def knowledge() -> Knowledge:
+    scenario = load_scenario("level_turns").scenario
+    return prepare_knowledge(scenario, ReducedModelSource(scenario, reduced_model(load_design())), 3)
+
+
+def test_the_information_of_a_sensor_is_that_of_an_integral() -> None:
+    means, rng = np.array([0.0, 1.0, 3.0]), np.random.default_rng(0)
+    state = np.arange(60_000) % 3
+    shown = means[state] + rng.standard_normal(len(state))
+    readings = Readings(state, (shown[:, None] - means)[..., None], np.zeros((3, 1, 0)), np.zeros((3, 1)))
+
+    def entropy(value: float) -> float:
+        density = norm.pdf(value - means).mean()
+        return -float(density * np.log2(density))
+
+    exact = quad(entropy, -9.0, 12.0, limit=200)[0] - 0.5 * np.log2(2.0 * np.pi * np.e)
+    assert readings.information([0]) == pytest.approx(exact, abs=0.01)
+
+
+def test_what_moves_all_sensors_together_is_a_covariance() -> None:
+    rng = np.random.default_rng(1)
+    moved, residual = rng.normal(size=(2, 3, 2)), rng.normal(size=(4, 2, 3))
+    state = np.array([0, 1, 0, 1])
+    found = Readings(state, residual, moved, np.zeros((2, 3))).information([0, 2])
+    log_density = np.empty((4, 2))
+    for s in range(2):
+        cover = np.eye(2) + moved[s][[0, 2]] @ moved[s][[0, 2]].T
+        inverse, scale = np.linalg.inv(cover), np.linalg.slogdet(cover)[1]
+        seen = residual[:, s][:, [0, 2]]
+        log_density[:, s] = -0.5 * (np.einsum("ng,gh,nh->n", seen, inverse, seen) + scale)
+    posterior = np.exp(log_density)
+    posterior /= posterior.sum(axis=1, keepdims=True)
+    assert found == pytest.approx(1.0 + np.log2(posterior[np.arange(4), state]).mean(), rel=1e-12)
+
+
+def test_three_of_twenty_four_are_those_of_an_exhaustive_search() -> None:
+    readings = drawn_readings(knowledge())
+    found = chosen_sensors(readings, range(24), 3)
+    told = {
+        some: float(np.mean([under.information(some) for under in readings]))
+        for some in itertools.combinations(range(24), 3)
+    }
+    best = max(told, key=lambda some: told[some])
+    assert tuple(sorted(found.sensors)) == best
+    assert found.information[-1] == pytest.approx(told[best], rel=1e-12)
+    assert found.of_all > found.information[-1] > found.information[0] > 0.0
+    with pytest.raises(MissionInputError, match="from 1 to 2"):
+        chosen_sensors(readings, [0, 1], 3)
+
+
+def test_a_gauge_beside_a_region_separates_it_and_the_other_region_is_hardly_told() -> None:
+    known = knowledge()
+    readings = drawn_readings(known)
+    apart = separations(known, readings, range(24))
+    assert min(far for (name, _), far in apart.items() if name == "z1") > 2.0
+    assert max(far for (name, _), far in apart.items() if name == "z2") < 1.0
+    fewer = separations(known, readings, [16, 23])
+    assert all(fewer[place] <= far + 1e-9 for place, far in apart.items())
+
+
+def test_the_command_chooses_draws_and_names_what_is_not_separated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture, points = tmp_path / "design.png", tmp_path / "gauges.vtu"
+    words = (
+        "design",
+        "level_turns",
+        "--sensors",
+        2,
+        "--among",
+        "1,17,24",
+        "--picture",
+        picture,
+        "--vtu",
+        points,
+    )
+    assert call(monkeypatch, *words, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["sensors"] == ["17", "24"]
+    assert "z2 of 0 % from 20 %" in record["not_separated"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    rank = meshio.read(points).point_data["rank"]
+    assert rank[[16, 23]].tolist() == [1.0, 2.0]
+    assert rank.sum() == 3.0
+    assert call(monkeypatch, "design", "level_turns", "--sensors", 2, "--among", "1,99") == 1
+    assert "`1,99` came" in capsys.readouterr().err

@@ -1,0 +1,138 @@
+"""Planning on the belief against enumeration, a fine grid of beliefs, and values that were published."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from twin_master.errors import PlanningError
+from twin_master.network.belief_planning import DecisionProblem, plan_on_belief
+from twin_master.network.planner import value_iteration
+from twin_master.network.simulated_return import simulated_returns
+from twin_master.network.transition import TransitionModel
+
+
+def tiger(discount: float) -> DecisionProblem:
+    """Kaelbling, Littman and Cassandra 1998: listen, or open one of two doors."""
+    moves = np.array([np.eye(2), np.full((2, 2), 0.5), np.full((2, 2), 0.5)])
+    reward = np.array([[-1.0, -100.0, 10.0], [-1.0, 10.0, -100.0]])
+    heard = np.array([[0.85, 0.15], [0.15, 0.85]])
+    nothing = np.full((2, 2), 0.5)
+    return DecisionProblem(
+        TransitionModel((moves,)), reward, np.full(3, discount), (heard, nothing, nothing),
+        np.array([0.5, 0.5]), moves_first=True,
+    )  # fmt: skip
+
+
+def drawn(seed: int, states: int, moves_first: bool, discount: float = 0.8) -> DecisionProblem:
+    rng = np.random.default_rng(seed)
+    moves = rng.dirichlet(np.ones(states), (3, states))
+    seen = tuple(rng.dirichlet(np.full(3, 0.4), states).T for _ in range(3))
+    factors = np.array([discount, discount, 0.0 if seed % 2 else discount])
+    return DecisionProblem(
+        TransitionModel((moves,)), rng.normal(size=(states, 3)), factors, seen,
+        rng.dirichlet(np.ones(states)), moves_first,
+    )  # fmt: skip
+
+
+def enumerated(problem: DecisionProblem, belief: np.ndarray, turns: int) -> float:
+    """The best return of so many turns, over every control and observation, beliefs state by state."""
+    if not turns:
+        return 0.0
+    best = -np.inf
+    states = range(len(belief))
+    for control in range(len(problem.discount)):
+        moves, seen = problem.transition.matrix[control], problem.likelihood[control]
+        total = float(belief @ problem.reward[:, control])
+        for shown in seen:
+            after = np.zeros(len(belief))
+            for before, behind in itertools.product(states, states):
+                at = behind if problem.moves_first else before
+                after[behind] += belief[before] * moves[before, behind] * shown[at]
+            if after.sum() > 0.0:
+                later = enumerated(problem, after / after.sum(), turns - 1)
+                total += problem.discount[control] * after.sum() * later
+        best = max(best, total)
+    return best
+
+
+@pytest.mark.parametrize(("discount", "published"), [(0.75, 1.933), (0.95, 19.3713)])
+def test_the_tiger_is_worth_what_was_published(discount: float, published: float) -> None:
+    plan = plan_on_belief(tiger(discount), gap=1e-4, most_beliefs=5000)
+    assert plan.lower - 5e-4 <= published <= plan.upper + 5e-4
+    assert plan.upper - plan.lower <= 1e-4 * plan.upper
+
+
+@pytest.mark.parametrize("moves_first", [False, True])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_bounds_hold_what_is_enumerated(seed: int, moves_first: bool) -> None:
+    problem = drawn(seed, 3, moves_first, discount=0.3)
+    turns = 4
+    rest = 0.3**turns * np.abs(problem.reward).max() / 0.7
+    exact = enumerated(problem, problem.prior, turns)
+    plan = plan_on_belief(problem, gap=1e-4)
+    assert plan.upper - plan.lower < 1e-3
+    assert plan.lower - rest <= exact <= plan.upper + rest
+    first = plan_on_belief(problem, first=2, gap=1e-4)
+    assert first.lower <= first.upper <= plan.upper + 1e-9
+
+
+@pytest.mark.parametrize("moves_first", [False, True])
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_the_value_is_that_on_a_fine_grid_of_beliefs(seed: int, moves_first: bool) -> None:
+    problem = drawn(seed, 2, moves_first)
+    grid = np.linspace(0.0, 1.0, 2001)
+    value = np.zeros_like(grid)
+    for _ in range(120):  # straight lines between the points of a convex function lie above it
+        best = np.full_like(grid, -np.inf)
+        for control, seen in enumerate(problem.likelihood):
+            total = np.column_stack((1.0 - grid, grid)) @ problem.reward[:, control]
+            for observed in range(len(seen)):
+                here = np.full(len(grid), observed)
+                after = problem.following(np.column_stack((1.0 - grid, grid)), control, here)
+                weight = after.sum(axis=1)
+                total += problem.discount[control] * weight * np.interp(after[:, 1] / weight, grid, value)
+            best = np.maximum(best, total)
+        value = best
+    exact = np.interp(problem.prior[1], grid, value)
+    plan = plan_on_belief(problem, gap=1e-4)
+    assert plan.lower <= exact + 1e-6
+    assert plan.upper >= exact - 1e-4
+    assert plan.upper - plan.lower <= 1e-3
+
+
+@pytest.mark.parametrize("moves_first", [False, True])
+def test_simulated_missions_bring_what_the_plan_promises(moves_first: bool) -> None:
+    problem = drawn(6, 4, moves_first)
+    plan = plan_on_belief(problem, gap=1e-3)
+    rng = np.random.default_rng(0)
+    total = simulated_returns(problem, lambda belief, _turn: plan.policy.decide(belief), 4000, 40, rng)
+    error = 4.0 * total.std() / np.sqrt(len(total))
+    assert plan.lower - error <= total.mean() <= plan.upper + error
+    known = value_iteration(problem.transition, problem.reward, problem.discount)
+    assert plan.upper <= problem.prior @ known.value + 1e-9
+
+
+def test_a_product_of_tables_is_planned_as_the_table_of_all_states() -> None:
+    rng = np.random.default_rng(7)
+    factors = tuple(rng.dirichlet(np.ones(3), (2, 3)) for _ in range(2))
+    product = TransitionModel(factors)
+    seen = tuple(rng.dirichlet(np.full(4, 0.5), 9).T for _ in range(2))
+    problem = DecisionProblem(
+        product, rng.normal(size=(9, 2)), np.full(2, 0.7), seen, rng.dirichlet(np.ones(9))
+    )
+    whole = replace(problem, transition=TransitionModel((product.matrix,)))
+    first, second = plan_on_belief(problem, gap=1e-3), plan_on_belief(whole, gap=1e-3)
+    assert first.lower == pytest.approx(second.lower, rel=1e-9)
+    assert first.upper == pytest.approx(second.upper, rel=1e-9)
+
+
+def test_a_problem_whose_tables_do_not_fit_is_refused() -> None:
+    problem = tiger(0.9)
+    with pytest.raises(PlanningError, match="sum to one"):
+        replace(problem, likelihood=(problem.likelihood[0] * 0.5, *problem.likelihood[1:]))
+    with pytest.raises(PlanningError, match="expected rewards of shape"):
+        replace(problem, likelihood=problem.likelihood[:2])

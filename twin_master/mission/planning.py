@@ -1,0 +1,246 @@
+"""The plan of a scenario, by the state or on the belief: what it promises, and what other rules bring."""
+
+import io
+import zipfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reporting.files import atomic_write_bytes
+from twin_master.errors import PlanningError
+from twin_master.network.belief_planning import BeliefPlan, DecisionProblem, plan_on_belief
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.observation_classes import observation_classes
+from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration
+from twin_master.network.rewards import RewardModel
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.simulated_return import Decide, simulated_returns
+from twin_master.scenario.schema import Scenario
+from twin_master.seeds import generator
+
+__all__ = [
+    "ComparedPolicy",
+    "compared",
+    "decision_problem",
+    "expected_plan",
+    "planned",
+    "promised",
+    "read_policy",
+    "risk_of",
+    "write_policy",
+]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+MISSIONS = 400
+"""That are simulated for each rule."""
+PERIODS = (2, 3, 5, 8, 12, 20)
+"""Turns between two inspections of the rules that inspect by the clock."""
+_HARDEST, _HALVINGS = 2.0**12, 4
+"""The largest price of a turn beyond the limit, in rewards, and how often the interval of it is halved."""
+
+
+def planned(
+    scenario: Scenario,
+    model: GraphicalModel,
+    sensor_model: GaussianSensorModel,
+    rewards: RewardModel,
+    policy: Float | BeliefPolicy | None = None,
+) -> PlannedPolicy:
+    """Return the policy that is given, or the one that the scenario asks for."""
+    reward, discount = _reward(scenario, rewards), discounts(scenario)
+    if policy is not None and not isinstance(policy, BeliefPolicy):
+        return given_policy(model.transition, reward, discount, model.policy(policy))
+    plan = value_iteration(model.transition, reward, discount)
+    if policy is None and scenario.planner.policy == "qmdp":
+        policy = BeliefPolicy(plan.action_value.T, np.arange(len(discount)))
+    elif policy is None and scenario.planner.policy == "belief":
+        problem = decision_problem(scenario, model, sensor_model, rewards)
+        policy = expected_plan(scenario, problem, rewards)[0].policy
+    return replace(plan, on_belief=policy)
+
+
+def decision_problem(
+    scenario: Scenario, model: GraphicalModel, sensor_model: GaussianSensorModel, rewards: RewardModel
+) -> DecisionProblem:
+    """Return what a scenario decides on, its observations joined to classes under its seed."""
+    return DecisionProblem(
+        model.transition,
+        _reward(scenario, rewards),
+        discounts(scenario),
+        observation_classes(sensor_model, generator(scenario.mission.seed, "planning")),
+        model.prior,
+    )
+
+
+def discounts(scenario: Scenario) -> Float:
+    """Return the discount behind a turn under each control (U,): zero where it ends the mission."""
+    ends = [scenario.ends(index) for index in range(len(scenario.control))]
+    return np.where(ends, 0.0, scenario.planner.gamma)
+
+
+def _reward(scenario: Scenario, rewards: RewardModel) -> Float:
+    return rewards.planning_reward(scenario.rewards.health_weight, scenario.rewards.control_weight)
+
+
+def expected_plan(
+    scenario: Scenario, problem: DecisionProblem, rewards: RewardModel
+) -> tuple[BeliefPlan, float]:
+    """Return the plan on the belief, and the price of a turn beyond a health limit that it is made with.
+
+    Without `planner.limit_probability` there is no price. With it the price is the least, of some that are
+    tried, under which the share of such turns stays below: a constraint on the mean by a multiplier, Altman
+    1999.
+
+    Raises
+    ------
+    PlanningError
+        No price is high enough.
+    """
+    first = scenario.control_names.index(scenario.mission.first_control)
+    allowed, risk = scenario.planner.limit_probability, _risk(rewards)
+
+    def priced(price: float) -> tuple[BeliefPlan, float]:
+        return plan_on_belief(replace(problem, reward=problem.reward - price * risk), first=first), price
+
+    def holds(plan: BeliefPlan) -> bool:
+        return allowed is None or risk_of(scenario, problem, rewards, plan.policy) <= allowed
+
+    below, price, found = 0.0, 1.0, priced(0.0)
+    if holds(found[0]):
+        return found
+    while not holds((found := priced(price))[0]):
+        below, price = price, 4.0 * price
+        if price > _HARDEST:
+            raise PlanningError(
+                f"no plan keeps the probability beyond a health limit at {allowed:g}: allow more, or give "
+                "the scenario a gentler control or a repair"
+            )
+    for _ in range(_HALVINGS):
+        middle = priced(0.5 * (below + price))
+        if holds(middle[0]):
+            found, price = middle, middle[1]
+        else:
+            below = middle[1]
+    return found
+
+
+def _risk(rewards: RewardModel) -> Float:
+    """Return the probability of each state and control that a health limit is exceeded (S, U)."""
+    beyond = (rewards.health_per_draw < 0.0).astype(np.float64)
+    return np.asarray(np.tensordot(rewards.quantity.draw_weight, beyond, axes=1))
+
+
+def risk_of(
+    scenario: Scenario, problem: DecisionProblem, rewards: RewardModel, policy: BeliefPolicy
+) -> float:
+    """Return the share of turns, discounted, beyond a health limit under a policy, in simulated missions."""
+    shares = [
+        promised(scenario, replace(problem, reward=reward), policy).mean
+        for reward in (_risk(rewards), np.ones_like(problem.reward))
+    ]
+    return shares[0] / shares[1]
+
+
+def write_policy(path: Path, policy: BeliefPolicy, model: GraphicalModel) -> None:
+    """Write a policy on the belief to an NPZ file, with what it is for.
+
+    Raises
+    ------
+    FileNotWrittenError
+        The disk is full or the folder cannot be written.
+    """
+    content = io.BytesIO()
+    np.savez(content, **vars(policy), controls=np.array(model.controls))
+    atomic_write_bytes(path, content.getvalue())
+
+
+def read_policy(path: Path, model: GraphicalModel) -> BeliefPolicy:
+    """Return the policy on the belief in a file, for the states and controls of a model.
+
+    Raises
+    ------
+    PlanningError
+        It is none, or one for other states or controls.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            policy, controls = BeliefPolicy.of(kept), tuple(kept["controls"].tolist())
+    except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+        raise PlanningError(
+            f"{path} is no policy of `uav-twin plan --out` ({error}): give such a file"
+        ) from None
+    if controls != model.controls or policy.vectors.shape[1] != model.states.size:
+        raise PlanningError(
+            f"{path} is for {policy.vectors.shape[1]} states and the controls {', '.join(controls)}, and the "
+            f"scenario has {model.states.size} and {', '.join(model.controls)}: plan it anew"
+        )
+    return policy
+
+
+@dataclass(frozen=True)
+class ComparedPolicy:
+    """What a rule brings in simulated missions.
+
+    Attributes
+    ----------
+    name : str
+    mean, half_width : float
+        Of the expected return: the half width of its 95 % interval.
+    """
+
+    name: str
+    mean: float
+    half_width: float
+
+
+def promised(scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy) -> ComparedPolicy:
+    """Return what a policy on the belief brings in simulated missions."""
+
+    def rule(belief: Float, _turn: int) -> Index:
+        return policy.decide(belief)
+
+    return _summary("planned on the belief", _simulated(scenario, problem, rule))
+
+
+def compared(scenario: Scenario, problem: DecisionProblem) -> tuple[ComparedPolicy, ...]:
+    """Return what rules bring that are simpler than a plan on the belief, with the same beliefs.
+
+    Inspection by the clock takes the first action that inspects, and decides as QMDP between.
+    """
+    known = value_iteration(problem.transition, problem.reward, problem.discount)
+
+    def by_the_clock(every: int) -> Decide:
+        def rule(belief: Float, turn: int) -> Index:
+            if turn % every == 0:
+                return np.full(len(belief), scenario.readings[0][0])
+            return np.asarray(np.argmax(belief @ known.action_value, axis=1))
+
+        return rule
+
+    rules: dict[str, Decide] = {
+        "mode of the policy by states": lambda belief, _turn: np.argmax(belief @ known.policy, axis=1),
+        "QMDP": lambda belief, _turn: np.argmax(belief @ known.action_value, axis=1),
+    }
+    for every in PERIODS if scenario.readings else ():
+        rules[f"inspection every {every} {scenario.mission.step_name}s"] = by_the_clock(every)
+    return tuple(_summary(name, _simulated(scenario, problem, rule)) for name, rule in rules.items())
+
+
+def _summary(name: str, returns: Float) -> ComparedPolicy:
+    return ComparedPolicy(name, float(returns.mean()), float(1.96 * returns.std() / np.sqrt(len(returns))))
+
+
+def _simulated(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Float:
+    """Return the returns of simulated missions under a rule, behind the first control of the scenario."""
+    first = scenario.control_names.index(scenario.mission.first_control)
+    return simulated_returns(
+        problem,
+        lambda belief, turn: rule(belief, turn) if turn else np.full(len(belief), first),
+        MISSIONS,
+        scenario.mission.steps,
+        generator(scenario.mission.seed, "damage"),
+    )

@@ -1,0 +1,71 @@
+"""Sensors that are read only when asked for: readings of inspections behind the values of the gauges."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twin_master.errors import InvalidObservationError
+from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI
+from twin_master.network.sensor_model import GaussianSensorModel
+
+__all__ = ["InspectedSensorModel"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class InspectedSensorModel(GaussianSensorModel):
+    """Gaussian sensors, and readings of the state itself.
+
+    An observation is a row: its G values, and behind them I readings, NaN where they were not asked for; a
+    row without them has none. Given the state they are independent.
+
+    Parameters
+    ----------
+    *args, **keywords
+        Of `GaussianSensorModel`.
+    reading : (S, I)
+        What each reading shows in each state without noise, SI.
+    reading_deviation : (S, I)
+        Standard deviation of its noise, and of what lies within the interval of the state, SI.
+    asked_by : (I,)
+        Index of the control that asks for each reading.
+    """
+
+    def __init__(
+        self, *args: Any, reading: Float, reading_deviation: Float, asked_by: Index, **keywords: Any
+    ) -> None:
+        super().__init__(*args, **keywords)
+        self.reading, self.reading_deviation, self.asked_by = reading, reading_deviation, asked_by
+
+    def sampled(self, state: Index, control_index: int, generator: np.random.Generator) -> Float:
+        """Return one row drawn in each of N states (N,) under a control: (N, G + I), SI."""
+        gauges = super().sampled(state, control_index, generator)
+        noise = self.reading_deviation[state] * generator.standard_normal((len(state), len(self.asked_by)))
+        read = np.where(self.asked_by == control_index, self.reading[state] + noise, np.nan)
+        return np.hstack((gauges, read))
+
+    def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
+        """Return log p(o | D, u) for each state (S,), of a row (G + I,) or (G,)."""
+        return np.asarray(self.log_likelihood_sequence(np.asarray(observation)[None], [control_index])[0])
+
+    def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
+        """Return log p(o_t | D_t, u_t) for a sequence of rows: (T, G + I) or (T, G), and (T,) -> (T, S)."""
+        rows, count = np.asarray(observations, dtype=np.float64), self.sensor_count
+        gauges = super().log_likelihood_sequence(rows[..., :count], control_index)
+        read = rows[..., count:]
+        if not read.shape[-1]:
+            return gauges
+        if read.shape[-1] != self.reading.shape[1] or np.isinf(read).any():
+            raise InvalidObservationError(
+                f"expected {count} finite values, or {count + self.reading.shape[1]} with the readings of "
+                f"inspections, got {rows.shape[-1]}"
+            )
+        residual = (read[:, None] - self.reading) / self.reading_deviation
+        density = -0.5 * residual**2 - np.log(self.reading_deviation) - LOG_ROOT_TWO_PI
+        return np.asarray(gauges + np.where(np.isnan(read)[:, None], 0.0, density).sum(axis=-1))
+
+    def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
+        """Return the sensors that fit worst; see `GaussianSensorModel`."""
+        return super().worst_residuals(np.asarray(observation)[: self.sensor_count], control_index)

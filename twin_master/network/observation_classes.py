@@ -1,0 +1,39 @@
+"""What sensors may show, as classes of finite number with their probabilities in each state."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+
+from twin_master.network.sensor_model import GaussianSensorModel
+
+__all__ = ["observation_classes"]
+
+Float = NDArray[np.float64]
+
+SAMPLES = 1500
+"""Observations that are drawn for each control, the same number in each state."""
+CLASSES = 64
+"""Classes that they are joined to."""
+
+
+def observation_classes(
+    sensor_model: GaussianSensorModel, generator: np.random.Generator, classes: int = CLASSES
+) -> tuple[Float, ...]:
+    """Return for each control the probability of each class of observations in each state: (K, S).
+
+    Observations are drawn in each state, and those are joined that tell the same of the state: whose
+    posterior beliefs, from all states alike, are close in the distance of Hellinger. The probability of a
+    class is that of its members, weighed by their likelihood in each state.
+    """
+    states = sensor_model.state_count
+    drawn = np.repeat(np.arange(states), -(-SAMPLES // states))
+    result = []
+    for control in range(sensor_model.control_count):
+        rows = sensor_model.sampled(drawn, control, generator)
+        log_likelihood = sensor_model.log_likelihood_sequence(rows, np.full(len(rows), control))
+        told = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
+        told /= told.sum(axis=1, keepdims=True)
+        _, label = kmeans2(np.sqrt(told), min(classes, len(rows)), minit="++", rng=generator)
+        joined = np.array([told[label == number].sum(axis=0) for number in np.unique(label)])
+        result.append(joined / joined.sum(axis=0))
+    return tuple(result)

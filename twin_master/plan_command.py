@@ -1,0 +1,272 @@
+"""`uav-twin plan` and `uav-twin design`: what is decided by the belief, what it is worth, what tells most."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reporting import terminal
+from twin_master.command import Calibration, Seed
+from twin_master.errors import MissionInputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from twin_master.mission.planning import ComparedPolicy
+    from twin_master.mission.preparation import Knowledge
+    from twin_master.network.belief_planning import BeliefPlan, DecisionProblem
+    from twin_master.scenario.schema import Scenario
+    from twin_master.viewer.scene import Planform
+
+ValueOf = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME", help="Say what an action that inspects is worth, or a gauge by its number or title."
+    ),
+]
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """A plan, what it was made for, and what it brings."""
+
+    problem: "DecisionProblem"
+    plan: "BeliefPlan"
+    promised: "ComparedPolicy"
+
+
+def plan(
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A shipped scenario, or a TOML file.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Write the policy to this file, for `uav-twin run --policy`.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw what is done at which belief, as SVG or PNG.")
+    ] = None,
+    value_of: ValueOf = None,
+    seed: Seed = None,
+    calibration: Calibration = None,
+    json: terminal.Json = False,
+) -> None:
+    """Plan on the belief: expected return with its bounds, beside simpler rules."""
+    from twin_master.mission.planning import compared, risk_of, write_policy
+    from twin_master.report.plan import plan_figure
+
+    knowledge = _knowledge(scenario, seed, calibration)
+    found = _planned(knowledge)
+    plan, promised = found.plan, found.promised
+    if out is not None:
+        write_policy(out, plan.policy, knowledge.model)
+    if picture is not None:
+        _draw(picture, plan_figure(plan.policy, knowledge.model))
+    record: dict[str, Any] = {
+        "lower": plan.lower,
+        "upper": plan.upper,
+        "simulated": promised.mean,
+        "half_width": promised.half_width,
+        "beyond_limit": risk_of(knowledge.scenario, found.problem, knowledge.rewards, plan.policy),
+    }
+    rows = [promised, *([] if value_of else compared(knowledge.scenario, found.problem))]
+    if value_of is not None:
+        without = _planned(_without(knowledge, [value_of])).promised
+        half = float((promised.half_width**2 + without.half_width**2) ** 0.5)
+        rows.append(replace(without, name=f"planned without {value_of}"))
+        record["value"] = {"of": value_of, "mean": promised.mean - without.mean, "half_width": half}
+    record["rules"] = {row.name: [row.mean, row.half_width] for row in rows}
+    if json:
+        terminal.print_json(record)
+        return
+    _show(record, rows)
+
+
+def _knowledge(scenario: str, seed: int | None, calibration: Path | None) -> "Knowledge":
+    """Return what the twin knows before any plan on the belief."""
+    from twin_master.assets.resolution import Overrides
+    from twin_master.mission.preparation import prepare_twin
+    from twin_master.scenario.reading import load_scenario
+
+    loaded = load_scenario(scenario)
+    planner = loaded.scenario.planner
+    plain = planner.model_copy(update=_UNPLANNED)
+    unplanned = replace(loaded, scenario=loaded.scenario.model_copy(update={"planner": plain}))
+    found = prepare_twin(
+        unplanned, Overrides(seed=seed, calibration=calibration), progress=terminal.progress()
+    )
+    return replace(found, scenario=found.scenario.model_copy(update={"planner": planner}))
+
+
+def _planned(knowledge: "Knowledge") -> _Planned:
+    from twin_master.mission.planning import decision_problem, expected_plan, promised
+
+    scenario, rewards = knowledge.scenario, knowledge.rewards
+    problem = decision_problem(scenario, knowledge.model, knowledge.sensor_model, rewards)
+    plan = expected_plan(scenario, problem, rewards)[0]
+    return _Planned(problem, plan, promised(scenario, problem, plan.policy))
+
+
+def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
+    """Return what is known where actions that inspect show nothing, or gauges are not there."""
+    from twin_master.mission.preparation import knowledge_of
+
+    scenario = knowledge.scenario
+    titles, inspecting = _titles(scenario), [action.name for action in scenario.action if action.inspects]
+    for name in names:
+        if name not in (*titles, *inspecting):
+            raise MissionInputError(
+                f"--value-of names an action that inspects ({', '.join(inspecting) or 'there is none'}) or a "
+                f"gauge ({titles[0]} to {titles[-1]}), and `{name}` came."
+            )
+    given, count = scenario.observation.standard_deviation, scenario.observation.count
+    each = given if isinstance(given, tuple) else (given,) * count
+    each = tuple(_BLIND if title in names else own for title, own in zip(titles, each, strict=True))
+    blind = {"standard_deviation": _BLIND}
+    bare = scenario.model_copy(
+        update={
+            "action": tuple(a.model_copy(update=blind if a.name in names else {}) for a in scenario.action),
+            "observation": scenario.observation.model_copy(update={"standard_deviation": each}),
+            "planner": scenario.planner.model_copy(update=_UNPLANNED),
+        }
+    )
+    found = knowledge_of(
+        bare, knowledge.model, knowledge.draws, knowledge.sensor_model.value_per_draw,
+        true=knowledge.rewards.true_per_draw,
+    )  # fmt: skip
+    return replace(found, scenario=bare.model_copy(update={"planner": scenario.planner}))
+
+
+def _titles(scenario: "Scenario") -> tuple[str, ...]:
+    """Return what the sensors are called: their titles, or numbers from 1."""
+    section = scenario.observation
+    return section.titles or tuple(str(number + 1) for number in range(section.count))
+
+
+_UNPLANNED = {"policy": "mode", "limit_probability": None}
+"""Of the planner, where its plan is made apart."""
+_BLIND = 1e6
+"""Standard deviation of a sensor that shows nothing, SI."""
+
+
+def _draw(path: Path, figure: "Figure") -> None:
+    from reporting.figures import to_png, to_svg
+    from reporting.files import atomic_write_bytes
+
+    atomic_write_bytes(path, to_png(figure) if path.suffix.lower() == ".png" else to_svg(figure))
+
+
+def _show(record: Mapping[str, Any], rows: "list[ComparedPolicy]") -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table("rule", "expected return", "± (95 %)", box=box.SIMPLE_HEAD)
+    for row in rows:
+        table.add_row(row.name, f"{row.mean:.4g}", f"{row.half_width:.2g}")
+    terminal.console().print(table)
+    lower, upper = record["lower"], record["upper"]
+    terminal.say(f"Bounds of the return: {lower:.5g} to {upper:.5g}, a gap of {upper - lower:.2g}.")
+    terminal.say(f"Beyond a health limit: {100.0 * record['beyond_limit']:.2g} % of the turns, discounted.")
+    if "value" in record:
+        value = record["value"]
+        terminal.say(f"{value['of']} is worth {value['mean']:.3g} ± {value['half_width']:.2g} (95 %).")
+
+
+def design(
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A shipped scenario, or a TOML file.")],
+    sensors: Annotated[int, typer.Option(min=1, help="How many to choose.")],
+    among: Annotated[
+        str | None,
+        typer.Option(metavar="NAMES", help="Candidates, by numbers or titles with commas; all by default."),
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the choice, as SVG or PNG.")] = None,
+    vtu: Annotated[
+        Path | None, typer.Option(help="Write the gauges of a wing as points with their ranks.")
+    ] = None,
+    worth: Annotated[
+        bool, typer.Option("--worth", help="Plan with the chosen and with all, and compare the returns.")
+    ] = False,
+    calibration: Calibration = None,
+    json: terminal.Json = False,
+) -> None:
+    """Choose the sensors that tell most of the state, and name what none of them separates."""
+    from twin_master.mission.sensor_design import chosen_sensors, drawn_readings, separations
+
+    knowledge = _knowledge(scenario, None, calibration)
+    titles = _titles(knowledge.scenario)
+    wanted = titles if among is None else tuple(among.split(","))
+    if not {*wanted} <= {*titles} or len({*wanted}) < len(wanted):
+        raise MissionInputError(
+            f"--among names different sensors ({titles[0]} to {titles[-1]}), and `{among}` came."
+        )
+    candidates, readings = [titles.index(name) for name in wanted], drawn_readings(knowledge)
+    found = chosen_sensors(readings, candidates, sensors)
+    names = [titles[sensor] for sensor in found.sensors]
+    apart = separations(knowledge, readings, candidates)
+    record: dict[str, Any] = {
+        "sensors": names,
+        "information": list(found.information),
+        "of_all": found.of_all,
+        "not_separated": [_between(knowledge, *place) for place, far in apart.items() if far < 1.0],
+    }
+    if worth:
+        others = [title for title in titles if title not in names]
+        rest = [title for title in titles if title not in wanted]
+        few, every = (_planned(_without(knowledge, some)).promised for some in (others, rest))
+        record["worth"] = {"chosen": [few.mean, few.half_width], "all": [every.mean, every.half_width]}
+    _draw_design(picture, vtu, knowledge, record, found.sensors)
+    if json:
+        terminal.print_json(record)
+        return
+    for name, told in zip(names, found.information, strict=True):
+        terminal.say(f"{name}: {told:.3f} bit with those before it.")
+    terminal.say(f"All {len(candidates)} candidates: {found.of_all:.3f} bit.")
+    for pair in record["not_separated"]:
+        terminal.say(f"No gauge separates {pair}: less than one standard deviation by all candidates.")
+    for what, (mean, half) in record.get("worth", {}).items():
+        terminal.say(f"Expected return planned with {what}: {mean:.4g} ± {half:.2g} (95 %).")
+
+
+def _between(knowledge: "Knowledge", name: str, level: int) -> str:
+    """Return two neighbouring levels of a state in words."""
+    from twin_master.report.view import printed_state
+
+    place = knowledge.scenario.state_names.index(name)
+    factor = knowledge.scenario.state[place]
+    scale, unit = printed_state(factor.unit)
+    low, high = (scale * value for value in factor.levels[level : level + 2])
+    return f"{name} of {low:g} {unit} from {high:g} {unit}"
+
+
+def _draw_design(
+    picture: Path | None, vtu: Path | None, knowledge: "Knowledge", record: Mapping[str, Any],
+    chosen: Sequence[int],
+) -> None:  # fmt: skip
+    import numpy as np
+
+    from fe.structure.field import write_vtu
+    from twin_master.report.plan import design_figure
+
+    wing = _wing(knowledge.scenario)
+    if vtu is not None:
+        if wing is None:
+            raise MissionInputError("--vtu needs a wing, whose design says where its gauges are.")
+        points, rank = np.insert(wing.gauges, 2, 0.0, axis=1), np.zeros(len(wing.gauges))
+        rank[list(chosen)] = np.arange(1, len(chosen) + 1)
+        write_vtu(vtu, points, ("vertex", np.arange(len(rank))[:, None]), {"rank": rank}, {})
+    if picture is not None:
+        places = None if wing is None else wing.gauges
+        outlines = [] if wing is None else [wing.outline, *wing.regions]
+        figure = design_figure(
+            record["information"], record["of_all"], record["sensors"], places, chosen, outlines
+        )
+        _draw(picture, figure)
+
+
+def _wing(scenario: "Scenario") -> "Planform | None":
+    """Return the wing that is believed from above; None for another asset."""
+    from fe.wing.design import load_design
+    from twin_master.assets.design_source import DESIGN_COPY
+    from twin_master.viewer.scene import planform_of
+
+    file = scenario.belief.all_files().get(DESIGN_COPY)
+    return planform_of(None if file is None else load_design(file), scenario)
