@@ -66,8 +66,10 @@ def rest_with_laws(
 
 def port_flexibility(motion: FmuMotion, state: State) -> FloatArray:
     """Return the displacements (P, P) of the ports at rest under unit forces at each."""
-    ports, zero = motion.ports, motion.rest(state, {})
-    moved = []
+    ports = motion.ports
+    if not len(ports.forces):  # nothing to push, and loads of zero may be outside of what the FMU takes
+        return np.zeros((0, 0))
+    zero, moved = motion.rest(state, {}), []
     for number, name in enumerate(ports.forces):
         size = ports.size(number)
         moved.append((motion.rest(state, {name: size}) - zero)[ports.x] / size)
