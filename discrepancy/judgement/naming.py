@@ -14,6 +14,7 @@ from discrepancy.fits.posterior import with_draws
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.search.hypotheses import Tell, in_silence
+from discrepancy.search.starting_points import acts_within
 from discrepancy.search.strategy import Search, search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
@@ -58,7 +59,8 @@ def name(
     tell("nothing follows the missing force: comparing whole simulations")
     second = search(problem, effects, tell, by_force=False)
     other = _named(problem, second)
-    if other[0].kind is not VerdictKind.NAMED_IN_PART or not _closes_fitted(problem, other):
+    causes = any(acts_within(term.effect, problem.setting) for term in other[2].candidate.terms)
+    if other[0].kind is not VerdictKind.NAMED_IN_PART or not causes or not _closes_fitted(problem, other):
         return first
     second.force, second.forces = found.force, found.forces
     return other
