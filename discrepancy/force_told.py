@@ -10,13 +10,10 @@ from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.force import ForceCourse, MissingForce
 from discrepancy.missing_force.hypotheses import key_of
 from discrepancy.missing_force.naming import ForceSearch
-from discrepancy.missing_force.shares import ForceShare, ForceShares, order_of
+from discrepancy.missing_force.shares import ForceShare, ForceShares, orders
 from discrepancy.models.port_units import port_unit
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
-
-LEAST_ORDER, ALIKE = 0.3, 0.05
-"""Share of the force's variance from which a variable is said to order it, and by which others are alike."""
 
 
 def told_force(problem: Problem, search: Search, fit: CandidateFit, missing: MissingForce) -> ForceAtPort:
@@ -37,14 +34,7 @@ def told_force(problem: Problem, search: Search, fit: CandidateFit, missing: Mis
         np.concatenate([getattr(item, name) for item in missing.courses])
         for name in ("force", "position", "speed", "time")
     )
-    scaled = [values / max(float(np.std(values)), 1e-300) for values in (position, speed)]
-    orders = {
-        "displacement": order_of(position, force),
-        "velocity": order_of(speed, force),
-        "amplitude": order_of(np.hypot(*scaled), np.abs(force)),
-        "time": order_of(time, force),
-    }
-    least = max(LEAST_ORDER, max(orders.values()) - ALIKE)
+    by_variable, ordered_by = orders(force, position, speed, time)
     rms, displacement, velocity = (float(np.sqrt(np.mean(item**2))) for item in (force, position, speed))
     shares = _shares(problem, search, fit) if missing.law else (None, None)
     ports = problem.model.ports()
@@ -52,8 +42,7 @@ def told_force(problem: Problem, search: Search, fit: CandidateFit, missing: Mis
     several = missing.law and len({place for _, place in laws}) > 1
     return ForceAtPort(
         missing.port, port_unit(missing.port, problem.model.inner), rms, displacement, velocity,
-        _largest(missing.courses), missing.evidence, missing.correlation_time, orders,
-        tuple(name for name, share in orders.items() if share >= least),
+        _largest(missing.courses), missing.evidence, missing.correlation_time, by_variable, ordered_by,
         " and ".join(f"{name} at {place}" for name, place in laws) if several else missing.law, *shares,
     )  # fmt: skip
 

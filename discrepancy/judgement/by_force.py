@@ -22,7 +22,8 @@ from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.force import MissingForce, missing_force
 from discrepancy.missing_force.hypotheses import key_of, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import ForceShare, order_of
+from discrepancy.missing_force.shares import ForceShare, orders
+from discrepancy.models.port_units import port_unit
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import ExplainedShare, Hypothesis, NamedEffect, Verdict, VerdictKind
@@ -35,8 +36,6 @@ Outcome = tuple[Verdict, Search, CandidateFit]
 
 LEAST_SHOWN = 0.1
 """Share of the missing force from which a hypothesis is shown as the best one where none is named."""
-LEAST_ORDER = 0.3
-"""Share of the force's variance from which a variable is said to order it."""
 MOST_TOLD = 12
 """Hypotheses that are listed."""
 
@@ -235,17 +234,11 @@ class _Said:
             columns = (motion.forces[port], *moving, trial.fine_time)
             rows.append(np.array([column[samples] for column in columns]))
         force, position, speed, time = np.concatenate(rows, axis=1)
-        scaled = [values / max(float(np.std(values)), 1e-300) for values in (position, speed)]
-        orders = {
-            "displacement": order_of(position, force),
-            "velocity": order_of(speed, force),
-            "time": order_of(time, force),
-            "amplitude": order_of(np.hypot(*scaled), np.abs(force)),
-        }
-        name = max(orders, key=lambda key: orders[key])
+        shares, names_of = orders(force, position, speed, time)
         ordered = "ordered by none of displacement, velocity, amplitude and time"
-        if orders[name] > LEAST_ORDER:
-            ordered = f"ordered by {name} ({100.0 * orders[name]:.0f} % of its variance)"
+        if names_of:
+            most = 100.0 * max(shares.values())
+            ordered = f"ordered by {' and '.join(names_of)} ({most:.0f} % of its variance)"
         size = float(np.sqrt(np.mean(force**2)))
         return (
             f"A force of {size:.3g} {self._unit(at)} (rms) is missing at {search.ports[port]!r}, {ordered}."
@@ -255,10 +248,7 @@ class _Said:
         """Return the unit of the force at the port of a hypothesis."""
         ports = self.court.search.ports
         places = [t.place for t in item.candidate.terms if t.place in ports]
-        scale = self.problem.setting.scales.ports.get(
-            places[0] if places else ports[next(iter(item.processes))]
-        )
-        return "of flow" if scale is not None and scale.of_state else "N (N m if it turns)"
+        return port_unit(places[0] if places else ports[next(iter(item.processes))], self.problem.model.inner)
 
     def _shape(self, best: Explained) -> str:
         """Return the sentence on the free shape of one law, unless trials not fitted speak against it."""

@@ -65,8 +65,6 @@ class MissingForce:
         Of the trials that were fitted.
     law : str
         Name of the effect drawn beside it; empty: none.
-    share : float or None
-        Share of the force's mean square that the law is; None without one.
     """
 
     port: str
@@ -75,30 +73,6 @@ class MissingForce:
     correlation_time: float
     courses: Sequence[ForceCourse]
     law: str = ""
-    share: float | None = None
-
-    @property
-    def sentence(self) -> str:
-        """Where it is, how large, and what a named law is of it."""
-        what, unit = ("flow", "") if self.of_state else ("force", " N (N m if the port turns)")
-        others = {name: value for name, value in self.evidence.items() if name != self.port}
-        nearest = max(others, key=lambda name: others[name]) if others else ""
-        ahead = self.evidence[self.port] - others[nearest] if others else 0.0
-        beside = ""
-        if others:
-            beside = f", {abs(ahead):.0f} nat {'more' if ahead >= 0.0 else 'less'} than at {nearest!r}"
-        found = (
-            f"A {what} of {self.size:.3g}{unit} root mean square is missing at the port {self.port!r} "
-            f"(evidence {self.evidence[self.port]:.0f} nat over none{beside})."
-        )
-        if self.share is not None:
-            found += f" {self.law[:1].upper()}{self.law[1:]} is {100.0 * max(self.share, 0.0):.3g} % of it."
-        return found
-
-    @property
-    def size(self) -> float:
-        """Root mean square of the force [N, N m or the port's flow]."""
-        return float(np.sqrt(np.mean(np.concatenate([item.force for item in self.courses]) ** 2)))
 
 
 def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
@@ -129,14 +103,9 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
     scale = search.problem.setting.scales.ports.get(port)
     of_state = bool(scale and scale.of_state)
     time = found.processes[at].time
-    return MissingForce(port, of_state, evidence, time, courses, named, _share(courses) if named else None)
+    return MissingForce(port, of_state, evidence, time, courses, named)
 
 
 def of_nothing(found: Explained) -> float:
     """Return the evidence [nat] without any missing force."""
     return found.view.solve(scaled(found.processes, 1e-9, 1.0)).evidence
-
-
-def _share(courses: Sequence[ForceCourse]) -> float:
-    left, whole = (np.concatenate([getattr(c, name) for c in courses]) for name in ("left", "force"))
-    return 1.0 - float(np.mean(left**2) / np.mean(whole**2))

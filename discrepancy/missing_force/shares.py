@@ -27,6 +27,8 @@ DRAWS, SEED = 2000, 0
 TURNS = 3
 """Times that the motion of a trial that was not fitted is looked at along the law that it shows."""
 BINS, LEAST_IN_BIN = 24, 4
+LEAST_ORDER, ALIKE = 0.3, 0.05
+"""Share of the force's variance from which a variable is said to order it, and by which others are alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,3 +235,18 @@ def order_of(variable: FloatArray, force: FloatArray) -> float:
     parts = np.array_split(force[np.argsort(variable, kind="stable")], bins)
     within = sum(float(np.sum((part - part.mean()) ** 2)) for part in parts) / (count - bins)
     return max(1.0 - within / max(float(np.var(force, ddof=1)), 1e-300), 0.0)
+
+
+def orders(
+    force: FloatArray, position: FloatArray, speed: FloatArray, time: FloatArray
+) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return the share of a force's variance by variable, and the variables (F,) that order it, alike."""
+    scaled = [values / max(float(np.std(values)), 1e-300) for values in (position, speed)]
+    shares = {
+        "displacement": order_of(position, force),
+        "velocity": order_of(speed, force),
+        "amplitude": order_of(np.hypot(*scaled), np.abs(force)),
+        "time": order_of(time, force),
+    }
+    least = max(LEAST_ORDER, max(shares.values()) - ALIKE)
+    return shares, tuple(name for name, share in shares.items() if share >= least)

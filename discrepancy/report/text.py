@@ -26,6 +26,8 @@ from reporting.words import counted, listing
 WORDS: dict[str, Any] = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 """What each kind of verdict means, also where the absolute fit could not be judged, and words of figures."""
 
+BEYOND_DOUBT = 1e6
+"""Evidence [nat] of which no more is told."""
 SAID: dict[str, str] = WORDS["said"]
 """Paragraphs and remarks."""
 
@@ -159,10 +161,10 @@ def force_sentence(force: ForceAtPort) -> str:
     if others:
         nearest = max(others, key=lambda name: others[name])
         ahead = own - others[nearest]
-        beside = f", {abs(ahead):,.0f} {'more' if ahead >= 0.0 else 'less'} than at {nearest}"
+        beside = f", {nats(abs(ahead))} {'more' if ahead >= 0.0 else 'less'} than at {nearest}"
     sentence = (
         f"A {what} of {number(force.rms)} {force.unit} (rms) is missing at {force.port}, at most "
-        f"{number(abs(most.force))} at {at}{number(most.speed)} {rate}{order} (evidence {own:,.0f} nat over "
+        f"{number(abs(most.force))} at {at}{number(most.speed)} {rate}{order} (evidence {nats(own)} nat over "
         f"none{beside})."
     )
     tested = [share for share in (force.fitted, force.held_out) if share is not None and share.tested]
@@ -280,3 +282,8 @@ def percent(share: float) -> str:
     """Return a share in percent; never 100 where a little is left."""
     text = 100.0 * share
     return "> 99.9" if 99.95 < text < 100.0 else f"{text:.1f}"
+
+
+def nats(evidence: float) -> str:
+    """Return an evidence; beyond all doubt its digits tell nothing."""
+    return f"{evidence:,.0f}" if abs(evidence) < BEYOND_DOUBT else f"more than {BEYOND_DOUBT:,.0f}"
