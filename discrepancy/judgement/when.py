@@ -6,7 +6,7 @@ from math import floor, log10
 from discrepancy.verdict import GapWindow, Moment, NamedEffect
 
 TOLD = 3
-"""Windows told in a sentence; the others are in the file."""
+"""Windows that are told one by one; of more the largest is, and all are in the file."""
 
 
 def moment_text(moment: Moment) -> str:
@@ -36,11 +36,15 @@ def when_sentence(windows: Sequence[GapWindow]) -> str:
         return ""
     if all(window.begin is None and window.end is None for window in found):
         return "The gap is there throughout the records."
-    told = sorted(found, key=lambda window: (window.begin is None, -window.size))[:TOLD]
-    parts = [f"in {window.trial!r} {window_text(window)}, {_times(window.size)} the noise" for window in told]
-    more = len(found) - len(told)
-    rest = f"; and {more} more" if more else ""
-    return f"The gap is there {'; '.join(parts)}{rest}."
+    told = sorted(found, key=lambda window: (window.begin is None, -window.size))
+    if len(told) > TOLD:
+        most = max(found, key=lambda window: window.size)
+        return f"The gap comes and goes, {len(found)} times; the largest is {_where(most)}."
+    return f"The gap is there {'; '.join(_where(window) for window in told)}."
+
+
+def _where(window: GapWindow) -> str:
+    return f"in {window.trial!r} {window_text(window)}, {_times(window.size)} the noise"
 
 
 def _times(size: float) -> str:

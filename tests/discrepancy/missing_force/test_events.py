@@ -151,6 +151,9 @@ def test_words_of_windows() -> None:
         "The gap is there in 'b' since 1.000 s (0.980 to 1.040), to the end of the record, 3 times the "
         "noise; in 'a' throughout the record, 4 times the noise."
     )
+    assert when_sentence((whole, part, part, part)) == (
+        "The gap comes and goes, 4 times; the largest is in 'a' throughout the record, 4 times the noise."
+    )
     left = GapWindow("b", ("x",), None, Moment(2.0, 1.5, 2.5), 0.0, 9.0, 2.0, with_effect=True)
     assert when_sentence((left,)) == ""
     assert time_line_figure(()) is None
