@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 
 from twin_master.network.sensor_model import GaussianSensorModel
 
@@ -25,6 +24,8 @@ def observation_classes(
     posterior beliefs, from all states alike, are close in the distance of Hellinger. The probability of a
     class is that of its members, weighed by their likelihood in each state.
     """
+    from scipy.cluster.vq import kmeans2  # reads a second of modules that a flight does not need
+
     states = sensor_model.state_count
     drawn = np.repeat(np.arange(states), -(-SAMPLES // states))
     result = []

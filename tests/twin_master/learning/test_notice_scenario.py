@@ -40,7 +40,8 @@ def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path: Path
     assert dict(Noticing()) == vars(MonitorSettings())
     for name in scenario_files():
         loaded = load_scenario(name)
-        off = name in ("paper_level_turns", "model_mismatch")  # what they measure is the filter alone
+        # what two measure is the filter alone, and inspections stand beside what notices watch
+        off = name in ("paper_level_turns", "model_mismatch", "inspected_wing")
         assert loaded.scenario.notice == (None if off else Noticing()), name
         assert not loaded.remark
         written = loaded.scenario.to_dict()
