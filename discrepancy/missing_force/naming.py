@@ -352,7 +352,7 @@ class ForceSearch:
             step = found.solution.mean[len(view.shared_precision) :] - effect
             far = np.where(np.abs(step) > SETTLED, step, 0.0)
             if far.any():  # a value that it cannot reach is not its own
-                loss = 0.5 * float(far @ np.linalg.solve(found.covariance, far))
+                loss = 0.5 * float(far @ np.linalg.lstsq(found.covariance, far, rcond=None)[0])
                 found = replace(found, evidence=found.evidence - loss)
             # along the motion of its base, which follows the readings, a hypothesis looks better than it is
             if best is None or turn == 1 or found.evidence > best.evidence:

@@ -90,7 +90,7 @@ def linear_step(system: ModalSystem, shape: FloatArray, constant: FloatArray, h:
 _STEPS: dict[tuple[bytes, bytes, float], tuple[FloatArray, ...]] = {}
 MOST_STEPS = 64
 """Linear steps that are kept, because the same structure is often moved again with other laws."""
-_TAYLOR = 10
+_TAYLOR = 14
 
 
 def exact_step(
@@ -149,7 +149,7 @@ def _exponential(
     scaled[:, :, f, s] = own  # the force changes by one over the step
     both = slice(0, 2 * count)
     norm = float(np.max(np.sum(np.abs(scaled[:, :, both]), axis=3), initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.125))))
+    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))  # squares double rounding
     scaled /= 2.0**squarings
     unity = np.eye(4 * count)
     result = np.broadcast_to(unity, scaled.shape)
