@@ -12,13 +12,9 @@ import pytest
 from fe.runtime.errors import CalculixError
 from fe.structure.operators import Structure, load_and_assemble
 from fe.verification.calculix_comparison import structure_agreement
-from fe.verification.calculix_job import calculix_program
 from fe.verification.calculix_models import structure_deck
+from tests.calculix_decks import needs_calculix
 
-needs_calculix = pytest.mark.skipif(
-    calculix_program() is None,
-    reason="CalculiX (ccx) is not installed; on Debian and Ubuntu: apt-get install calculix-ccx",
-)
 BODY = """length_unit = "mm"
 [[parameter]]
 name = "e"

@@ -10,14 +10,11 @@ from fe.full.operators import AffineOperators, assemble
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
 from fe.verification.calculix_comparison import modal_agreement, ring_down_agreement, static_agreement
-from fe.verification.calculix_job import calculix_program, read_frequencies, read_tables, run_calculix
+from fe.verification.calculix_job import read_frequencies, read_tables, run_calculix
 from fe.verification.calculix_models import wing_deck
 from fe.wing.design import WingDesign
+from tests.calculix_decks import needs_calculix
 
-needs_calculix = pytest.mark.skipif(
-    calculix_program() is None,
-    reason="CalculiX (ccx) is not installed; on Debian and Ubuntu: apt-get install calculix-ccx",
-)
 DAMAGED = (0.4, 0.6)
 
 
