@@ -17,6 +17,7 @@ from .cholesky import Cholesky, finite
 from .derivatives import TrialDerivatives
 from .linearisation import Base, Linearisation, Point
 from .problem import Problem
+from .remainder import Remainder
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -86,6 +87,8 @@ class CandidateFit:
     draws : (N, E) ndarray or None
         From the posterior of the scaled effect parameters, where it is wider than their covariance (see
         `posterior`).
+    remainder : Remainder or None
+        What it leaves beside the noise, where hypotheses are compared under a wider one.
     """
 
     candidate: Candidate
@@ -100,6 +103,7 @@ class CandidateFit:
     linearisations: tuple[Linearisation, ...] = field(repr=False)
     converged: bool = True
     draws: FloatArray | None = field(default=None, repr=False)
+    remainder: Remainder | None = field(default=None, repr=False)
 
     @property
     def effect_covariance(self) -> FloatArray:
@@ -294,7 +298,7 @@ class _Descent:
         prior += 0.5 * float(point.effect @ point.effect)
         for data, u in zip(problem.trials, point.local, strict=True):
             prior += 0.5 * float(data.unknowns.precision @ u**2)
-        objective = problem.misfit(sums) + problem.log_determinant(point) + prior
+        objective = problem.misfit(sums) + prior
         objective = objective if np.isfinite(objective) else np.inf
         return _State(point, objective, tuple(residuals), tuple(responses), sums, tuple(parts))
 

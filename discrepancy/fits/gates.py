@@ -1,6 +1,7 @@
 """Gates that a name must pass: absolute fit against the noise record, shape against its family."""
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from discrepancy.campaign.noise_tests import (
@@ -16,6 +17,8 @@ from fe.runtime.patch import ModelPatch
 from .candidate import Candidate
 from .fitting import CandidateFit
 from .problem import Problem
+
+FloatArray = NDArray[np.float64]
 
 ABSOLUTE_LEVEL = 1e-3
 """Level of the absolute gate; a true name fails it this often."""
@@ -66,17 +69,24 @@ def absolute_gate(problem: Problem, fit: CandidateFit) -> Gate:
 def absolute_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
     """Return name and p-value of each test of the absolute gate."""
     tests: list[tuple[str, float]] = []
-    freedom = problem.counts - fit.spent
+    samples = _dependent(problem, fit) ** 2
+    freedom, recorded = (problem.counts - fit.spent) / samples, problem.freedom / samples
     known = np.flatnonzero((problem.freedom > 0.0) & (freedom >= 1.0))
     p_values = []
     for number in known:
-        square = fit.sums[number] / freedom[number]
-        p_values.append(variance_p_value(square, freedom[number], problem.freedom[number]))
+        square = fit.sums[number] / freedom[number] / samples[number]
+        p_values.append(variance_p_value(square, freedom[number], recorded[number]))
         tests.append((f"variance of {problem.channel_names[number]}", p_values[-1]))
     if len(known) > 1:
-        together = pooled_variance_p_value(np.array(p_values), freedom[known], problem.freedom[known])
+        together = pooled_variance_p_value(np.array(p_values), freedom[known], recorded[known])
         tests.append(("variance of all channels", together))
     return [*tests, *prior_tests(problem, fit), *whiteness_tests(problem, fit)]
+
+
+def _dependent(problem: Problem, fit: CandidateFit) -> FloatArray:
+    """Return by how much (channels,) noise of a colour that its record admits is wider than white noise."""
+    left = fit.remainder
+    return np.ones(len(problem.channel_names)) if left is None else np.where(left.of_noise, left.factor, 1.0)
 
 
 def prior_tests(
@@ -110,20 +120,17 @@ def prior_tests(
 def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
     """Return name and p-value of the Ljung-Box test of each channel, its dynamic records combined."""
     found: dict[str, list[float]] = {}
+    coloured = _dependent(problem, fit) > 1.0
     for data, residual in zip(problem.trials, fit.residuals, strict=True):
         if not data.trial.is_dynamic or len(residual) < SHORTEST_SERIES:
             continue
         whole = bool(np.all(data.weight > 0.0))
         for column, name in enumerate(data.trial.channels):
+            if coloured[data.groups[column]]:
+                continue
             used = None if whole else data.weight[:, column] > 0.0
             found.setdefault(name, []).append(ljung_box(residual[:, column], used=used)[1])
     return [(f"whiteness of {name}", combine(p_values)) for name, p_values in found.items()]
-
-
-def is_noise_colour(fit: CandidateFit) -> bool:
-    """Whether all that a fit leaves beside white noise is the colour of the noise, as its records have it."""
-    remainder = fit.point.remainder
-    return remainder is None or not np.any(remainder.beyond_noise > 0.0)
 
 
 def shape_gate(named: CandidateFit, family: CandidateFit | None) -> Gate:

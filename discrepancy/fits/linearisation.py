@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .remainder import Remainder
-
 FloatArray = NDArray[np.float64]
 
 PARAMETER_STEP = 1e-2
@@ -51,14 +49,11 @@ class Point:
         Of each trial.
     effect : (E,) ndarray
         Of the candidate.
-    remainder : Remainder or None
-        What is left beside the noise; None for nothing.
     """
 
     shared: FloatArray
     local: tuple[FloatArray, ...]
     effect: FloatArray
-    remainder: Remainder | None = None
 
 
 @dataclass(frozen=True)

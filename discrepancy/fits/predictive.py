@@ -11,7 +11,6 @@ from discrepancy.location.residuals import FittedTrial, ResidualSet
 from .cholesky import Cholesky
 from .fitting import CandidateFit, TrialBlock, fit, trial_block
 from .problem import Problem
-from .remainder_inference import plain_point
 
 FloatArray = NDArray[np.float64]
 
@@ -52,7 +51,7 @@ def _fitted(problem: Problem, found: CandidateFit, *, sensitivities: bool) -> li
     ones = np.ones(len(problem.channel_names))
     for number, data in enumerate(problem.trials):
         block = trial_block(
-            problem, number, plain_point(found.point), found.linearisations[number], found.candidate,
+            problem, number, found.point, found.linearisations[number], found.candidate,
             found.residuals[number], ones,
         )  # fmt: skip
         local, shared = _halves(block)
@@ -61,7 +60,7 @@ def _fitted(problem: Problem, found: CandidateFit, *, sensitivities: bool) -> li
         # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
         follow = (shared - factor.solve(block.cross).T @ local).T @ shared_root[block.index]
         leverage = np.einsum("kn,kn->n", own, own)
-        if found.point.remainder is None:
+        if found.remainder is None:
             leverage = leverage + np.einsum("nk,nk->n", follow, follow)
         shape = found.residuals[number].shape
         sensitive = None
@@ -87,12 +86,12 @@ def _held_out(problem: Problem, found: CandidateFit, trials: tuple[Trial, ...]) 
     there = problem.with_trials(trials)
     nothing = tuple(np.zeros(data.unknowns.size) for data in there.trials)
     start = replace(found.point, local=nothing)
-    adapted = fit(there, found.candidate, start, local_only=True)
+    adapted = replace(fit(there, found.candidate, start, local_only=True), remainder=found.remainder)
     items = []
     ones = np.ones(len(there.channel_names))
     for number in range(len(there.trials)):
         block = trial_block(
-            there, number, plain_point(adapted.point), adapted.linearisations[number], adapted.candidate,
+            there, number, adapted.point, adapted.linearisations[number], adapted.candidate,
             adapted.residuals[number], ones,
         )  # fmt: skip
         local, shared = _halves(block)
@@ -104,7 +103,7 @@ def _held_out(problem: Problem, found: CandidateFit, trials: tuple[Trial, ...]) 
         shape = adapted.residuals[number].shape
         leverage = np.maximum(carried - own, -1.0 + 1e-9).reshape(shape)
         item = _item(there, number, adapted, leverage, None, held_out=True)
-        if found.point.remainder is not None:
+        if found.remainder is not None:
             item = replace(item, leverage=np.maximum(-own, -1.0 + 1e-9).reshape(shape))
         items.append(item)
     return items
@@ -122,10 +121,10 @@ def _item(
     data = problem.trials[number]
     trial = data.trial
     prediction = problem.prediction(number, found.point, found.responses[number])
-    residual = problem.residual(number, plain_point(found.point), found.responses[number])
+    residual = problem.residual(number, found.point, found.responses[number])
     variance = 1.0 + leverage if held_out else 1.0 + np.maximum(leverage, 0.0)
-    if found.point.remainder is not None and trial.is_dynamic:
-        variance = variance + found.point.remainder.beyond_noise[data.groups] ** 2
+    if found.remainder is not None and trial.is_dynamic:
+        variance = variance + found.remainder.size[data.groups] ** 2
     rates = None
     if trial.is_dynamic:
         rates = np.gradient(prediction, trial.interval, axis=0)

@@ -6,6 +6,8 @@ leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, R
 """
 
 from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -172,15 +174,7 @@ class Problem:
     def residual(self, number: int, point: Point, response: FloatArray) -> FloatArray:
         """Return the standardised residuals (N, C) of a trial."""
         data = self.trials[number]
-        return self.white(number, point, data.trial.values - self.prediction(number, point, response))
-
-    def white(
-        self, number: int, point: Point, columns: FloatArray, channels: Sequence[int] | None = None
-    ) -> FloatArray:
-        """Return columns (..., N, C) of a trial over s0, white under noise and remainder of a point."""
-        data = self.trials[number]
-        found = data.standardised(columns, channels)
-        return found if point.remainder is None else point.remainder.whitened(data, found, channels)
+        return data.standardised(data.trial.values - self.prediction(number, point, response))
 
     # -------------------------------------------------------------------------- derivatives
 
@@ -351,7 +345,7 @@ class Problem:
             scale = np.zeros(len(channels))
             scale[column] = self.shared.gain_scale[position]
             blocks.append((parts.response * scale)[np.newaxis])
-        dense = self.white(number, point, np.concatenate(blocks))
+        dense = data.standardised(np.concatenate(blocks))
 
         # order of the unknowns: zeros, own, calibrated parameters, gains, effect; rows: zero, own,
         # calibrated parameters, effect, gain
@@ -366,8 +360,6 @@ class Problem:
         owners = np.full(rows.shape[:2], size)
         if head:
             rows[:, 0] = data.by_zero
-            if point.remainder is not None:
-                rows[:, 0] = point.remainder.whitened(data, data.by_zero.T).T
             owners[data.unknowns.zero_columns, 0] = np.arange(zeros)
         rows[:, head:] = dense.transpose(2, 0, 1)
         owners[:, head : head + len(everywhere)] = everywhere
@@ -404,12 +396,6 @@ class Problem:
         """Return -ln L with the noise variances marginalised, up to a constant."""
         return float(misfits(self.freedom, self.counts, sums)[self.counts > 0].sum())
 
-    def log_determinant(self, point: Point) -> float:
-        """Return half the log determinant [nat] that the remainder of a point adds to -ln L."""
-        if point.remainder is None:
-            return 0.0
-        return sum(point.remainder.log_determinant(data) for data in self.trials)
-
     def precisions(self, sums: FloatArray) -> FloatArray:
         """Return the expected precision of each channel's noise over 1 / s0^2, given the residuals."""
         n0, n = self.freedom, self.counts
@@ -421,3 +407,21 @@ class Problem:
     def with_trials(self, trials: tuple[Trial, ...]) -> "Problem":
         """Return the same problem on other trials, with the same noise and global unknowns."""
         return Problem(self.campaign, self.model, self.setting, trials, like=self)
+
+    def widened(self, factors: FloatArray) -> "Problem":
+        """Return the problem with noise so many times (channels,) as wide in trials in motion, and known.
+
+        At rest too, where nothing is known of it.
+        """
+        wider = copy(self)
+        everywhere = self.freedom == 0.0
+        wider.trials = tuple(
+            replace(
+                data,
+                deviation=data.deviation
+                * np.where(everywhere[data.groups] | data.trial.is_dynamic, factors[data.groups], 1.0),
+            )
+            for data in self.trials
+        )
+        wider.freedom = np.where(factors != 1.0, inf, self.freedom)
+        return wider

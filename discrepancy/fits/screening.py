@@ -181,7 +181,7 @@ class Screen:
             response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
             gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
             moved = gains[at] * (response[:, at] - fit.responses[number][:, at])
-            d = problem.white(number, fit.point, moved, touched).T * piece.root[at]
+            d = data.standardised(moved, touched).T * piece.root[at]
             change[at] = d
             onto = piece.derivatives.onto(d * piece.root[at], touched)
             local = onto[: len(piece.own)]

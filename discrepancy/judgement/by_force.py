@@ -196,7 +196,7 @@ class _Said:
             hypotheses=tuple(
                 Hypothesis(
                     self.effects(item), item.evidence, weight, nan, nan,
-                    parameters_at(self.problem, item.shared, item.solution.covariance),
+                    parameters_at(self.problem, item.shared, item.told_covariance),
                 )
                 for weight, item in rows[:MOST_TOLD]
             ),
@@ -210,7 +210,7 @@ class _Said:
 
     def effects(self, item: Explained) -> tuple[NamedEffect, ...]:
         """Return the effects of a hypothesis with their intervals."""
-        ends = NINETY * np.sqrt(np.diag(item.covariance))
+        ends = NINETY * np.sqrt(np.diag(item.told_covariance)[len(item.shared) :])
         return effects_at(self.problem, item.candidate, item.effect, item.effect - ends, item.effect + ends)
 
     def _simulated(self, item: Explained) -> CandidateFit:
@@ -220,7 +220,7 @@ class _Said:
             shown = fit_to(self.problem, item.candidate, point, local_only=True)
         except (DiscrepancyError, np.linalg.LinAlgError):
             return self.found.none
-        return replace(shown, covariance=item.solution.covariance)
+        return replace(shown, covariance=item.told_covariance)
 
     def _of_the_force(self) -> str:
         """Return size and port of the missing force, and the variable that orders it."""

@@ -224,7 +224,7 @@ def _projected(
             problem, number, fit.point, fit.linearisations[number], fit.candidate, residual, weights
         )
         acting = np.array([k for k, item in enumerate(directions) if number in item], dtype=np.int64)
-        extra = [problem.white(number, fit.point, directions[k][number]) for k in acting]
+        extra = [problem.trials[number].standardised(directions[k][number]) for k in acting]
         weighted = [column * weights[data.groups] for column in extra]
         products = np.array([[np.vdot(a, b) for b in weighted] for a in extra]).reshape(2 * (len(acting),))
         whole[acting] += np.diag(products)

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.gates import ABSOLUTE_LEVEL, absolute_gate, is_noise_colour, prior_tests
+from discrepancy.fits.gates import ABSOLUTE_LEVEL, absolute_gate, prior_tests
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import key_of
 from discrepancy.search.honest_evidence import weigh_with_remainders
@@ -61,7 +61,7 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
     if not best.candidate.terms:
         leading = weighed.leading()
         return _unexplained(told, weighed, leading, first), found, leading
-    if best.point.remainder is None:  # what is left is noise: another gate is why it has no name
+    if best.remainder is None:  # what is left is noise: another gate is why it has no name
         within, probability, family = weighed.nameable(best)
         if len(within.candidate.terms) == len(best.candidate.terms):
             return _unexplained(told, weighed, best, first), found, weighed.shown(best)
@@ -73,7 +73,7 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
     if plain and probability >= SEARCH.sure and _is_coloured(best) and weighed.slimmer(best) is best:
         gates = (
             absolute_gate(problem, best), consistency_gate(problem, best),
-            held_out_gate(weighed.residuals(replace_remainder(best))),
+            held_out_gate(weighed.residuals(replace(best, remainder=None))),
         )  # fmt: skip
         if all(gate.passed is not False for gate in gates):
             return _named(told, best, probability, gates), found, best
@@ -116,14 +116,9 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
     return verdict, found, weighed.shown(best) if verdict.kind is VerdictKind.UNEXPLAINED else best
 
 
-def replace_remainder(found: CandidateFit) -> CandidateFit:
-    """Return a fit whose predictions have the noise alone about them."""
-    return replace(found, point=replace(found.point, remainder=None)) if found.point.remainder else found
-
-
 def _is_coloured(item: CandidateFit) -> bool:
     """Whether what a fit leaves is coloured as the noise itself may be."""
-    return item.point.remainder is not None and is_noise_colour(item)
+    return item.remainder is not None and item.remainder.is_noise
 
 
 def _too_small(told: Conclusion, p_none: float, gate: Gate) -> Verdict:
@@ -300,16 +295,17 @@ def _unexplained(
 
 def remainder_estimates(problem: Problem, found: CandidateFit) -> tuple[RemainderEstimate, ...]:
     """Return the remainders of a fit for the verdict."""
-    remainder = found.point.remainder
+    remainder = found.remainder
     if remainder is None:
         return ()
     rows = (
-        (name, *remainder.of(channel))
+        (name, remainder.size[channel], remainder.time[channel], remainder.frequency[channel])
         for channel, name in enumerate(problem.channel_names)
-        if remainder.beyond_noise[channel] > 0.0
+        if remainder.size[channel] > 0.0
     )
     return tuple(
-        RemainderEstimate(name, size, time, frequency / (2.0 * np.pi)) for name, size, time, frequency in rows
+        RemainderEstimate(name, float(size), float(time), float(frequency))
+        for name, size, time, frequency in rows
     )
 
 

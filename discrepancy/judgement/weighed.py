@@ -11,7 +11,7 @@ from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.remainder_inference import RemainderPrior, with_remainder
+from discrepancy.fits.wider_noise import noise_levels, refitted
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.search.starting_points import acts_within, are_related
@@ -47,9 +47,7 @@ class Weighed:
         if key not in self._shares:
             if () not in self._residuals:
                 self._residuals[()] = self.residuals(self.found.none)
-            best = self.found.best()
-            left = 1.0 / self.problem.precisions(best.sums)
-            noise = np.where(self.problem.freedom > 0.0, 1.0, left)
+            noise = noise_levels(self.problem, self.found.best())
             named: Mapping[str, float] = dict(zip(self.problem.channel_names, noise.tolist(), strict=True))
             self._shares[key] = Shares.of(self._residuals[()], self.residuals(item), named)
         return self._shares[key]
@@ -244,8 +242,8 @@ class Weighed:
         key = key_of(best.candidate)
         if key not in self._free:
             free = free_shape(self.problem, best, 0)
-            prior = RemainderPrior.of(self.problem, self.found.none)
-            self._free[key] = None if free is None else with_remainder(self.problem, free, prior, rounds=3)
+            wide = self.found.wide or self.problem
+            self._free[key] = None if free is None else refitted(self.problem, wide, free)
         return self._free[key]
 
     def freed(self, best: CandidateFit) -> CandidateFit | None:

@@ -1,54 +1,66 @@
-"""Hypotheses weighed again, each with the remainder that it leaves: evidence of independent samples.
+"""Hypotheses weighed again under what the best of them leaves: evidence of independent samples.
 
 The search itself goes by the noise as recorded: how far a fit is from the truth shows best there. Where no
 hypothesis leaves noise, thousands of nats separate what a model of a real thing cannot separate.
 """
 
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.remainder_inference import RemainderPrior, infer, with_remainder
-from discrepancy.missing_force.hypotheses import key_of
+from discrepancy.fits.problem import Problem
+from discrepancy.fits.wider_noise import left_by, refitted, widened
+from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.search_settings import SEARCH
 
 from .strategy import Search
 
+TURNS = 3
+"""Times that another hypothesis may turn out to be the best one."""
+
 
 def weigh_with_remainders(found: Search) -> None:
-    """Fit the hypotheses that matter together with their remainders; from then on these are compared.
+    """Fit the hypotheses that matter under the noise that the best of them leaves; compare these from now on.
 
     Notes
     -----
-    *Nothing missing* is always one of them. Which others matter is told by the remainder that their residuals
-    ask for as they are, before anything is fitted again.
+    *Nothing missing* is always one of them. Which others matter is told by their residuals as they are,
+    before anything is fitted again.
     """
-    problem = found.problem
-    prior = RemainderPrior.of(problem, found.none)
-    chosen = _chosen(found)
-    promised = {
-        key_of(item.candidate): found.score(item) + infer(problem, item, prior).gain for item in chosen
-    }
-    chosen.sort(key=lambda item: -promised[key_of(item.candidate)])
-    best = promised[key_of(chosen[0].candidate)] if chosen else 0.0
-    judged = {}
-    for number, item in enumerate([found.none, *chosen[: SEARCH.weighed_fits]]):
-        words = " and ".join(item.candidate.identifiers) or "nothing missing"
-        found.tell(f"weighing {words} with its remainder, {len(chosen[: SEARCH.weighed_fits]) - number} more")
-        key = key_of(item.candidate)
-        if item is not found.none and promised[key] < best - SEARCH.weighed_within:
-            continue
-        judged[key] = _weighed(found, item, prior)
+    best, chosen = found.best(), _chosen(found)
+    for _ in range(TURNS):
+        found.wide = widened(found.problem, left_by(found.problem, best))
+        found.judged = {}
+        judged = _judged(found, found.wide, chosen)
+        leading = max(judged.values(), key=found.score)
+        if key_of(leading.candidate) == key_of(best.candidate):
+            break
+        best = leading
+    found.judge(judged)
+
+
+def _judged(found: Search, wide: Problem, chosen: list[CandidateFit]) -> dict[Key, CandidateFit]:
+    """Return the most promising hypotheses under a noise."""
+    ranked = sorted(chosen, key=lambda item: _promised(found, wide, item), reverse=True)
+    least = _promised(found, wide, ranked[0]) - SEARCH.weighed_within if ranked else 0.0
+    able = [item for item in ranked[: SEARCH.weighed_fits] if _promised(found, wide, item) > least]
+    judged: dict[Key, CandidateFit] = {(): refitted(found.problem, wide, found.none)}
+    for number, item in enumerate(able):
+        words = " and ".join(item.candidate.identifiers)
+        found.tell(f"weighing {words} with its remainder, {len(able) - number - 1} more")
+        judged[key_of(item.candidate)] = refitted(found.problem, wide, found.exactly(item))
     leading = max(judged.values(), key=found.score).candidate.identifiers
     for item in list(found.all().values()):  # what the leading set holds is asked for by itself
         key, names = key_of(item.candidate), item.candidate.identifiers
         if names and set(names) < set(leading) and key not in judged:
-            judged[key] = _weighed(found, item, prior)
-    found.judge(judged)
+            judged[key] = refitted(found.problem, wide, found.exactly(item))
+    return judged
 
 
-def _weighed(found: Search, item: CandidateFit, prior: RemainderPrior) -> CandidateFit:
-    """Return a hypothesis fitted exactly with its remainders."""
-    exact = found.exactly(item) if item.candidate.terms else item
-    again = with_remainder(found.problem, exact, prior)
-    return exact if again is None else again
+def _promised(found: Search, wide: Problem, item: CandidateFit) -> float:
+    """Return the score that a fit has under a wider noise as it is."""
+    problem = found.problem
+    ratios = zip(problem.trials, wide.trials, strict=True)
+    scale = [data.deviation / wider.deviation for data, wider in ratios]
+    sums = problem.group_sums([one * row for one, row in zip(item.residuals, scale, strict=True)])
+    return found.score(item) + problem.misfit(item.sums) - wide.misfit(sums)
 
 
 def _chosen(found: Search) -> list[CandidateFit]:

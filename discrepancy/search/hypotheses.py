@@ -41,6 +41,8 @@ class Hypotheses:
         The most that a screen at the fit without effect promised of each effect [nat].
     tell : callable
         Takes a few words on what is fitted, and how much is left.
+    wide : Problem or None
+        That under what the best hypothesis leaves, by which the judged ones were fitted.
     """
 
     problem: Problem
@@ -51,6 +53,7 @@ class Hypotheses:
     judged: dict[Key, CandidateFit] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
     tell: Tell = in_silence
+    wide: Problem | None = None
 
     def __post_init__(self) -> None:
         self.exact[()] = self.none

@@ -65,7 +65,7 @@ def test_friction_beside_a_remainder_is_named_in_part(rig, effects, seed: int) -
     (estimate,) = verdict.effects[0].parameters
     half = 0.5 * (estimate.high - estimate.low)
     assert abs(estimate.value - truth["friction_ratio"]) < 2.5 * half
-    assert fit.point.remainder is not None
+    assert fit.remainder is not None
     assert () in found.judged
 
 
