@@ -7,10 +7,10 @@ import numpy as np
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.force import ForceCourse, MissingForce
-from discrepancy.missing_force.hypotheses import key_of
-from discrepancy.missing_force.naming import ForceSearch
-from discrepancy.missing_force.shares import ForceShare, ForceShares, orders
+from discrepancy.missing_force.force import ForceCourse, MissingForce, missing_force
+from discrepancy.missing_force.hypotheses import key_of, sees_forces
+from discrepancy.missing_force.naming import Explained, ForceSearch
+from discrepancy.missing_force.shares import OF_PREDICTIONS, ForceShare, ForceShares, orders
 from discrepancy.models.port_units import port_unit
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
@@ -58,13 +58,8 @@ def _shares(
     problem: Problem, search: Search, fit: CandidateFit
 ) -> tuple[ShareOfForce | None, ShareOfForce | None]:
     """Return the shares that a hypothesis is of the missing force, in fitted and in held-out trials."""
-    force, key = search.force, key_of(fit.candidate)
     try:
-        if force is None:
-            force = ForceSearch(problem)
-            force.locate()
-        found = next((item for item in search.forces if key_of(item.candidate) == key), None)
-        found = found or force.followed(force.whole, fit.candidate, fit.point.effect)
+        force, found = _along(problem, search, fit)
         if found is None:
             return None, None
         shares = ForceShares(force)
@@ -74,6 +69,30 @@ def _shares(
         return None, None
 
 
+def _along(problem: Problem, search: Search, fit: CandidateFit) -> tuple[ForceSearch, Explained | None]:
+    """Return the missing force of a problem, and the hypothesis along it that a fit is."""
+    force, key = search.force, key_of(fit.candidate)
+    if force is None:
+        force = ForceSearch(problem)
+        force.locate()
+    found = next((item for item in search.forces if key_of(item.candidate) == key), None)
+    if found is None and fit.candidate.terms:
+        found = force.followed(force.whole, fit.candidate, fit.point.effect)
+    return force, found
+
+
 def _share(share: ForceShare) -> ShareOfForce:
     sizes = (share.value, *share.interval, share.left, share.whole)
-    return ShareOfForce(*sizes, ahead=share.ahead, trials=share.trials, tested=share.tested)
+    return ShareOfForce(*sizes, ahead=share.of == OF_PREDICTIONS, trials=share.trials, tested=share.tested)
+
+
+def shown_force(problem: Problem, search: Search, fit: CandidateFit) -> MissingForce | None:
+    """Return the missing force, with the law of a verdict drawn through it; None where none can be seen."""
+    terms, ports = fit.candidate.terms, problem.model.ports()
+    if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
+        return None
+    try:
+        force, found = _along(problem, search, fit)
+        return missing_force(force, force.whole if found is None else found)
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # a picture that cannot be is left out
+        return None

@@ -26,7 +26,6 @@ from discrepancy.fits.gates import solver_share
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.by_force import shown_force
 from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
 from discrepancy.judgement.naming import name
@@ -46,7 +45,7 @@ from fe.runtime.patch import ModelPatch
 from reporting.words import be
 
 from .errors import CampaignDataError
-from .force_told import told_force
+from .force_told import shown_force, told_force
 from .model_choice import load_model
 from .search_settings import SEARCH
 from .verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind

@@ -106,6 +106,16 @@ class CandidateFit:
     remainder: Remainder | None = field(default=None, repr=False)
 
     @property
+    def effect(self) -> FloatArray:
+        """Scaled effect parameters (E,)."""
+        return self.point.effect
+
+    @property
+    def shared(self) -> FloatArray:
+        """Global unknowns (Q,)."""
+        return self.point.shared
+
+    @property
     def effect_covariance(self) -> FloatArray:
         """Covariance (E, E) of the scaled effect parameters."""
         count = self.candidate.size

@@ -1,8 +1,9 @@
-"""Hypotheses along the missing force before a court: which may be named, what speaks against the others."""
+"""Hypotheses before a court: which may be named, what speaks against the others."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Generic
 
 import numpy as np
 from scipy.special import logsumexp
@@ -12,55 +13,50 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import ABSOLUTE_LEVEL
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import Key, key_of
-from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import ForceShare, ForceShares
+from discrepancy.missing_force.shares import ForceShare
 from discrepancy.search.starting_points import acts_within
 from discrepancy.search_settings import SEARCH
+
+from .comparison import Comparison, H, Hypothetic
 
 COUNTER = -0.1
 """Share below which trials in which a law has hardly any force speak against it all the same."""
 
 
 @dataclass
-class Court:
-    """Hypotheses along the missing force, with the share that each is of it."""
+class Court(Generic[H]):
+    """Hypotheses that are compared in one way, with the share that each is of what is missing."""
 
     problem: Problem
-    search: ForceSearch
-    ranked: Sequence[Explained]
-    count: int
+    way: Comparison[H]
 
     @cached_property
-    def shares(self) -> ForceShares:
-        """What each is of the missing force."""
-        return ForceShares(self.search)
+    def ranked(self) -> Sequence[H]:
+        """Hypotheses, the most probable first."""
+        return self.way.ranked
 
     @cached_property
-    def _known(self) -> dict[tuple[int, bool], ForceShare]:
+    def _known(self) -> dict[tuple[int, bool], tuple[H, ForceShare]]:
         return {}
 
-    def share(self, item: Explained, *, held_out: bool) -> ForceShare:
-        """Return the share that a hypothesis is of the missing force."""
+    def share(self, item: H, *, held_out: bool) -> ForceShare:
+        """Return the share that a hypothesis is of what is missing."""
         key = (id(item), held_out)
         if key not in self._known:
-            self._known[key] = self.shares.of(item, held_out=held_out)
-        return self._known[key]
+            self._known[key] = item, self.way.share(item, held_out=held_out)
+        return self._known[key][1]
 
-    def told(self, item: Explained) -> ForceShare:
+    def told(self, item: H) -> ForceShare:
         """Return the share that counts: in trials not fitted, if there are any that can test it."""
-        if self.shares.has_held_out:
+        if self.way.has_held_out:
             outside = self.share(item, held_out=True)
             if outside.tested:
                 return outside
         return self.share(item, held_out=False)
 
-    def score(self, item: Explained) -> float:
-        """Return ln (evidence times prior) of a hypothesis [nat]."""
-        return self.search.score(item, self.count)
-
     # ---------------------------------------------------------------- who may be named
 
-    def against(self, item: Explained) -> str:
+    def against(self, item: H) -> str:
         """Return why a hypothesis is no name; empty where nothing speaks against it."""
         if not any(self.acts(term) for term in item.candidate.terms):
             return "it describes readings, causes nothing and leaves more than noise"
@@ -68,7 +64,7 @@ class Court:
         inside = self.share(item, held_out=False)
         if _is_little(inside, least):
             return f"it is {part(inside)} where it was fitted"
-        if self.shares.has_held_out and not self._survives(item, least):
+        if self.way.has_held_out and not self._survives(item, least):
             return f"it is {part(self.share(item, held_out=True))} in trials that were not fitted"
         names = self.problem.shared.gain_channels
         count = len(item.shared) - len(names)
@@ -77,9 +73,9 @@ class Court:
             u = item.shared[own][proper[own]]
             if u.size and chi2.sf(u @ u / SEARCH.widened**2, u.size) < ABSOLUTE_LEVEL:
                 return f"it needs {what} far beside their priors: are these what you would bet on?"
-        return ""
+        return self.way.against(item)
 
-    def _survives(self, item: Explained, least: float) -> bool:
+    def _survives(self, item: H, least: float) -> bool:
         """Whether trials that were not fitted bear a hypothesis out, or have no force by which they could."""
         outside = self.share(item, held_out=True)
         if not outside.tested:
@@ -91,20 +87,20 @@ class Court:
         return acts_within(term.effect, self.problem.setting)
 
     @cached_property
-    def contenders(self) -> list[Explained]:
+    def contenders(self) -> list[H]:
         """Hypotheses that data do not exclude and nothing speaks against, most probable first.
 
         Errors of the readings beside laws take up what is left, whatever it is: they are no part of a name.
         """
-        found: dict[Key, tuple[Explained, float]] = {}
+        found: dict[Key, tuple[H, float]] = {}
         for item in self.ranked:
             core = self._core(item)
             if core is not None and key_of(core.candidate) not in found and not self.against(core):
-                found[key_of(core.candidate)] = core, self.score(item)
+                found[key_of(core.candidate)] = core, self.way.score(item)
         best = max((score for _, score in found.values()), default=0.0)
         return [item for item, score in found.values() if score > best - SEARCH.contenders]
 
-    def _core(self, item: Explained) -> Explained | None:
+    def _core(self, item: H) -> H | None:
         """Return a hypothesis without errors of the readings beside its laws; None without an effect."""
         acts = [self.acts(term) for term in item.candidate.terms]
         if all(acts) or not any(acts):
@@ -115,10 +111,10 @@ class Court:
         known = next((one for one in self.ranked if key_of(one.candidate) == key_of(candidate)), None)
         if known is None:
             values = np.concatenate([parts[number] for number in kept])
-            known = self.search.followed(self.search.whole, candidate, values)
+            known = self.way.followed(candidate, values)
         return known
 
-    def slimmed(self, best: Explained) -> Explained:
+    def slimmed(self, best: H) -> H:
         """Return the simplest hypothesis that is as much of the missing force."""
         own = {_family(term) for term in best.candidate.terms}
         able = {key_of(item.candidate): item for item in (*self.ranked, *self._singles(best))}
@@ -131,9 +127,9 @@ class Court:
             and self.told(item).value > outside - SEARCH.slim
             and not self.against(item)
         ]  # fmt: skip
-        return min(simpler, key=lambda item: (_freedom(item), -self.score(item)), default=best)
+        return min(simpler, key=lambda item: (_freedom(item), -self.way.score(item)), default=best)
 
-    def _singles(self, best: Explained) -> list[Explained]:
+    def _singles(self, best: H) -> list[H]:
         """Return the effects of a hypothesis each alone, where there are several."""
         parts, terms = best.candidate.parts(best.effect), best.candidate.terms
         if len(terms) < 2:
@@ -141,40 +137,38 @@ class Court:
         known = {key_of(item.candidate) for item in self.ranked}
         alone = [(Candidate((term,)), part) for term, part in zip(terms, parts, strict=True)]
         found = [
-            self.search.followed(self.search.whole, candidate, part)
-            for candidate, part in alone
-            if key_of(candidate) not in known
+            self.way.followed(candidate, part) for candidate, part in alone if key_of(candidate) not in known
         ]
         return [item for item in found if item is not None]
 
-    def probability(self, item: Explained) -> float:
+    def probability(self, item: H) -> float:
         """Return the probability of a hypothesis with all that hold its effects or their families."""
         own = {_family(term) for term in item.candidate.terms}
         kept = [
             one for one in self.ranked if not one.candidate.terms or one is item or not self._refuted(one)
         ]
-        scores = np.array([self.score(one) for one in kept])
+        scores = np.array([self.way.score(one) for one in kept])
         holds = np.array([own <= {_family(term) for term in one.candidate.terms} for one in kept])
         if not holds.any():
             return 0.0
         return float(np.exp(logsumexp(scores[holds]) - logsumexp(scores)))
 
-    def _refuted(self, item: Explained) -> bool:
+    def _refuted(self, item: H) -> bool:
         """Whether trials show that a hypothesis is not what is missing."""
         if self.share(item, held_out=False).interval[1] < SEARCH.least_share:
             return True
-        return self.shares.has_held_out and not self._survives(item, 0.0)
+        return self.way.has_held_out and not self._survives(item, 0.0)
 
-    def rivals(self, best: Explained) -> list[Explained]:
+    def rivals(self, best: H) -> list[H]:
         """Return other names that neither evidence nor trials tell from the best one."""
         own, share = {_family(term) for term in best.candidate.terms}, self.told(best)
-        found: list[Explained] = []
+        found: list[H] = []
         for item in self.contenders:
             families = {_family(term) for term in item.candidate.terms}
             same = names(item) == names(best) or (families == own and _is_free(item))
             if same or names(item) > names(best) or len(item.candidate.terms) > len(best.candidate.terms):
                 continue
-            close = self.score(item) > self.score(best) - SEARCH.force_rival
+            close = self.way.score(item) > self.way.score(best) - SEARCH.force_rival
             known = any(names(item) == names(other) for other in found)
             if close and not known and not share.told_from(self.told(item)):
                 found.append(item)
@@ -190,22 +184,17 @@ def _family(term: Term) -> tuple[str, str]:
     return term.effect.family, term.place
 
 
-def names(item: Explained) -> set[tuple[str, str]]:
+def names(item: Hypothetic) -> set[tuple[str, str]]:
     """Return effects and places of a hypothesis."""
     return {(term.effect.identifier, term.place) for term in item.candidate.terms}
 
 
-def _is_free(item: Explained) -> bool:
+def _is_free(item: Hypothetic) -> bool:
     return any(term.free_shape for term in item.candidate.terms)
 
 
-def _freedom(item: Explained) -> tuple[int, int]:
+def _freedom(item: Hypothetic) -> tuple[int, int]:
     return len(item.candidate.terms), sum(term.free_shape for term in item.candidate.terms)
-
-
-def of_what(share: ForceShare) -> str:
-    """Return what a share is one of."""
-    return "what the missing force does to predictions" if share.ahead else "the missing force"
 
 
 def percent(share: ForceShare) -> str:
@@ -216,4 +205,4 @@ def percent(share: ForceShare) -> str:
 
 def part(share: ForceShare) -> str:
     """Return a share with its interval, and what it is one of."""
-    return f"{percent(share)} of {of_what(share)}"
+    return f"{percent(share)} of {share.of}"

@@ -1,296 +1,374 @@
-"""Verdicts where no hypothesis leaves noise alone: named in part, a group with shares, or unexplained.
+"""Verdicts where no simulation leaves noise alone: named in part, a group, unexplained.
 
-Every hypothesis, *nothing missing* included, carries its remainder (Kennedy and O'Hagan 2001); the evidence
-then counts independent samples. A set of effects is named in part that is probable so and that explains most
-of the gap on trials that it did not see, where no other set does as well.
+A set of effects is named in part that is probable and is most of what is missing, in the trials that were
+fitted and in those that were not, with what was calibrated within twice its prior deviations. Hypotheses are
+compared along the missing force where one can be seen, else by whole simulations under what they leave.
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Generic
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
 
+from discrepancy.catalogue.entry import NINETY
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.gates import ABSOLUTE_LEVEL, absolute_gate, prior_tests
+from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import key_of
+from discrepancy.missing_force.shares import ForceShare, orders
 from discrepancy.search.honest_evidence import weigh_with_remainders
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import Gate, NamedEffect, RemainderEstimate, Verdict, VerdictKind
+from discrepancy.verdict import (
+    ExplainedShare,
+    Gate,
+    Hypothesis,
+    NamedEffect,
+    RemainderEstimate,
+    Verdict,
+    VerdictKind,
+)
 
-from .conclusion import Conclusion, named_effects
+from .comparison import ByForce, ByReadings, Comparison, H
+from .conclusion import Conclusion, effects_at, named_effects, parameters_at, plain_names
 from .consistency_gate import consistency_gate
-from .explained_share import Shares
+from .court import Court, names, part, percent
 from .practical_size import UNSTATED_GAIN, is_one_driven_channel, small_terms
 from .proof import held_out_gate
-from .trial_by_trial import sizes_by_trial
-from .weighed import Weighed, plain
 
+FloatArray = NDArray[np.float64]
 Outcome = tuple[Verdict, Search, CandidateFit]
 
+LEAST_SHOWN = 0.1
+"""Share of what is missing from which a hypothesis is shown as the best one where none is named."""
+MOST_TOLD = 12
+"""Hypotheses that are listed."""
 
-def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Outcome:
-    """Return the verdict where what the best hypothesis leaves is not the recorded noise.
+
+def judged_in_part(problem: Problem, found: Search, first: Verdict) -> Outcome:
+    """Return the verdict where what the best simulation leaves is not the recorded noise.
 
     Parameters
     ----------
     problem : Problem
         Campaign and model.
     found : Search
-        All candidates as fitted to recorded noise; compared with their remainders from here on.
+        All candidates as fitted to recorded noise, and hypotheses along the missing force if it is seen.
     first : Verdict
-        What they led to.
+        What the simulations led to.
 
     Returns
     -------
     Verdict, Search, CandidateFit
         As `naming.name` returns them; the fit is that of the best hypothesis for an unexplained gap too.
     """
+    if found.force is not None:
+        return _Said(problem, found, first, ByForce(problem, found)).verdict()
     weigh_with_remainders(found)
-    weighed = Weighed(problem, found)
-    weighed.leave_out_stand_ins()
-    weighed.join_relatives()
-    best = found.best()
-    probabilities = found.set_probabilities()
-    told = Conclusion.of(problem, found, best, probabilities)
-    gate, p_none = absolute_gate(problem, found.nothing), probabilities.get((), 0.0)
-    if p_none > 1.0 - SEARCH.sure and gate.passed is not False and _is_coloured(found.nothing):
-        if p_none >= SEARCH.unsure:
-            return _nothing(told, found.nothing, gate), found, found.nothing
-        return _too_small(told, p_none, gate), found, found.nothing
-    if not best.candidate.terms:
-        leading = weighed.leading()
-        return _unexplained(told, weighed, leading, first), found, leading
-    if best.remainder is None:  # what is left is noise: another gate is why it has no name
-        within, probability, family = weighed.nameable(best)
-        if len(within.candidate.terms) == len(best.candidate.terms):
-            return _unexplained(told, weighed, best, first), found, weighed.shown(best)
-        verdict = _in_part(told, weighed, within, probability, family, first)
-        named = verdict.kind is not VerdictKind.UNEXPLAINED
-        return verdict, found, within if named else weighed.shown(best)
-    probability = weighed.probability(best)
-    plain = not best.candidate.is_family and weighed.freed(best) is None
-    if plain and probability >= SEARCH.sure and _is_coloured(best) and weighed.slimmer(best) is best:
-        gates = (
-            absolute_gate(problem, best), consistency_gate(problem, best),
-            held_out_gate(weighed.residuals(replace(best, remainder=None))),
-        )  # fmt: skip
-        if all(gate.passed is not False for gate in gates):
-            return _named(told, best, probability, gates), found, best
-    best, probability, family = weighed.nameable(best)
-    verdict = _in_part(told, weighed, best, probability, family, first)
-    return verdict, found, weighed.shown(best) if verdict.kind is VerdictKind.UNEXPLAINED else best
+    way = ByReadings(problem, found)
+    coloured = _beside_coloured_noise(problem, found, way)
+    if coloured is not None:
+        return coloured
+    way.add_families()
+    return _Said(problem, found, first, way).verdict()
 
 
 def without_sliver(problem: Problem, found: Search, first: Verdict, fit: CandidateFit) -> Outcome:
     """Return the verdict on a set that was named, one of whose effects may explain next to nothing.
 
-    Where what is left is nearly noise, such an effect stands for what is left as well as a remainder does. It
-    stays if the evidence of the whole set is above that of the set without it and a remainder by far.
+    Where what is left is nearly noise, such an effect stands for what is left as well as wider noise does. It
+    stays if the evidence of the whole set is above that of the set without it by far.
 
     Parameters
     ----------
     problem, found, first
-        As of `judged_with_remainder`.
+        As of `judged_in_part`.
     fit : CandidateFit
         Of the set that was named.
     """
-    weighed = Weighed(problem, found)
-    names, share = set(plain(fit)), weighed.shares(fit).value
+    way = ByReadings(problem, found)
+    court = Court(problem, way)
     small = small_terms(problem, fit, unstated=UNSTATED_GAIN)
-    alone = weighed.laws_of(fit) if is_one_driven_channel(problem) else plain(fit)
-    kept = {name for name, size in zip(plain(fit), small, strict=True) if size is None and name in alone}
-    singles = [item for item in found.exact.values() if item.candidate.terms and set(plain(item)) < names]
-    closing = [item for item in singles if weighed.shares(item).value > share - SEARCH.sliver]
-    if not closing and kept == names:
+    terms, one_channel = fit.candidate.terms, is_one_driven_channel(problem)
+    kept = {
+        (term.label, term.place) for term, size in zip(terms, small, strict=True)
+        if size is None and (court.acts(term) or not one_channel)
+    }  # fmt: skip
+    whole_key, share = set(key_of(fit.candidate)), court.told(fit).value
+    less = [
+        item
+        for item in found.exact.values()
+        if item.candidate.terms and set(key_of(item.candidate)) < whole_key
+    ]
+    if kept == whole_key and not any(court.told(item).value > share - SEARCH.sliver for item in less):
         return first, found, fit
     weigh_with_remainders(found)
-    weighed = Weighed(problem, found)
     whole = found.judged.get(key_of(fit.candidate), fit)
-    best = weighed.slimmer(whole, kept)
-    if best is whole:
-        found.judge({})
-        return first, found, fit
-    verdict = _in_part(Conclusion.of(problem, found, best, found.set_probabilities()), weighed, best,
-                       weighed.probability(best), "", first)  # fmt: skip
-    return verdict, found, weighed.shown(best) if verdict.kind is VerdictKind.UNEXPLAINED else best
+    for item in sorted(found.judged.values(), key=lambda one: len(one.candidate.terms)):
+        own = set(key_of(item.candidate))
+        if not own or not own < whole_key or court.told(item).value < share - SEARCH.sliver:
+            continue
+        if own == kept or found.score(item) > found.score(whole) - SEARCH.sliver_gain:
+            said = _Said(problem, found, first, way)
+            return said.in_part(item, said.court.probability(item))
+    found.judge({})
+    return first, found, fit
+
+
+def _beside_coloured_noise(problem: Problem, found: Search, way: ByReadings) -> Outcome | None:
+    """Return the verdict where all that is left is the colour of the noise, as its records have it."""
+    nothing, best = found.nothing, found.best()
+    probabilities = found.set_probabilities()
+    told = Conclusion.of(problem, found, best, probabilities)
+    gate, p_none = absolute_gate(problem, nothing), probabilities.get((), 0.0)
+    if p_none > 1.0 - SEARCH.sure and gate.passed is not False and _is_coloured(nothing):
+        hints = sorted(name for name, p in told.inclusion.items() if p > 1.0 - SEARCH.sure)
+        more: dict[str, Any] = {"gates": (gate,), "remainders": remainder_estimates(problem, nothing)}
+        if p_none >= SEARCH.unsure:
+            sentence = (
+                "The model explains the data within their noise, which is coloured as its records admit."
+            )
+            return told.verdict(VerdictKind.NOTHING_MISSING, sentence, p_none, **more), found, nothing
+        sentence = (
+            "Something may be missing, but too small for these data to tell from noise that is coloured"
+        )
+        sentence += f"; the nearest are {', '.join(hints[:4])}." if hints else "."
+        total = min(p_none + sum(told.inclusion[name] for name in hints), 1.0)
+        return (
+            told.verdict(VerdictKind.BELOW_LIMIT, sentence, total, group=tuple(hints), **more),
+            found,
+            nothing,
+        )
+    court = Court(problem, way)
+    if not best.candidate.terms or best.candidate.is_family or not _is_coloured(best):
+        return None
+    probability = court.probability(best)
+    gates: tuple[Gate, ...] = (
+        absolute_gate(problem, best), consistency_gate(problem, best),
+        held_out_gate(way.residuals(replace(best, remainder=None))),
+    )  # fmt: skip
+    if probability < SEARCH.sure or any(gate.passed is False for gate in gates):
+        return None
+    named = named_effects(problem, best)
+    sentence = f"The model lacks {_words(named)} (probability {_certain(probability)})."
+    more = {"effects": named, "gates": gates, "remainders": remainder_estimates(problem, best)}
+    return told.verdict(VerdictKind.NAMED, sentence, probability, **more), found, best
 
 
 def _is_coloured(item: CandidateFit) -> bool:
-    """Whether what a fit leaves is coloured as the noise itself may be."""
     return item.remainder is not None and item.remainder.is_noise
 
 
-def _too_small(told: Conclusion, p_none: float, gate: Gate) -> Verdict:
-    """Return the verdict that an effect may be there, too small to tell from coloured noise."""
-    hints = sorted(name for name, p in told.inclusion.items() if p > 1.0 - SEARCH.sure)
-    total = p_none + sum(told.inclusion[name] for name in hints)
-    return told.verdict(
-        VerdictKind.BELOW_LIMIT,
-        "Something may be missing, but too small for these data to tell from noise that is coloured"
-        + (f"; the nearest are {', '.join(hints[:4])}." if hints else "."),
-        min(total, 1.0), group=tuple(hints), gates=(gate,),
-        remainders=remainder_estimates(told.problem, told.found.nothing),
-    )  # fmt: skip
+@dataclass(frozen=True)
+class _Said(Generic[H]):
+    """What is said of hypotheses: the verdicts of each kind, with the fit that stands for each."""
 
+    problem: Problem
+    found: Search
+    first: Verdict
+    way: Comparison[H]
 
-def _nothing(told: Conclusion, best: CandidateFit, gate: Gate) -> Verdict:
-    """Return the verdict that the noise is coloured, and nothing missing."""
-    return told.verdict(
-        VerdictKind.NOTHING_MISSING,
-        "The model explains the data within their noise, which is coloured as its records admit.",
-        told.found.set_probabilities()[()],
-        gates=(gate,),
-        remainders=remainder_estimates(told.problem, best),
-    )
+    @cached_property
+    def court(self) -> Court[H]:
+        """Which of them may be named."""
+        return Court(self.problem, self.way)
 
+    def verdict(self) -> Outcome:
+        """Return the verdict."""
+        court = self.court
+        if not court.contenders:
+            return self.unexplained()
+        best = court.slimmed(court.contenders[0])
+        members = [best, *court.rivals(best)]
+        probability = sum(court.probability(item) for item in members)
+        if 1 < len(members) <= SEARCH.largest_group:
+            return self.group(members, probability)
+        if probability < SEARCH.sure or self.way.gain(members[0]) < SEARCH.bayes_factor:
+            return self.unexplained(members[0], probability)
+        return self.in_part(members[0], probability)
 
-def _named(told: Conclusion, best: CandidateFit, probability: float, gates: tuple[Gate, ...]) -> Verdict:
-    """Return the verdict that names a set beside noise that is coloured."""
-    named = named_effects(told.problem, best)
-    sentence = f"The model lacks {_words(named)} (probability {_certain(probability)})."
-    return told.verdict(
-        VerdictKind.NAMED, sentence, probability, effects=named, gates=gates,
-        remainders=remainder_estimates(told.problem, best),
-    )  # fmt: skip
-
-
-def _in_part(
-    told: Conclusion,
-    weighed: Weighed,
-    best: CandidateFit,
-    probability: float,
-    family: str,
-    first: Verdict,
-) -> Verdict:
-    """Return the verdict named in part, or a group with shares; unexplained where neither may be said."""
-    problem = told.problem
-    explained = weighed.shares(best).summary()
-    why = _no_name(problem, weighed, best)
-    if why:
-        return _unexplained(told, weighed, best, first, why=why)
-    rivals = weighed.rivals(best)
-    gates = (absolute_gate(problem, best),)
-    more = {
-        "explained": explained, "remainders": remainder_estimates(problem, best), "gates": gates,
-    }  # fmt: skip
-    left = (
-        f"what is left is {explained.left:.2g} times the noise and unexplained"
-        if explained.left > 0.0
-        else "nothing is left beyond the noise"
-    )
-    members = [best, *rivals]
-    if rivals and not any(weighed.laws_of(item) for item in members):
-        alike = " and ".join(dict.fromkeys(_words(named_effects(problem, item)) for item in members))
-        why = f"It is no name, as {alike} describe the readings alike: none has a pattern that is its own."
-        return _unexplained(told, weighed, best, first, why=why)
-    if rivals and len(rivals) < SEARCH.largest_group:
-        told_of = [
-            f"{_words(named_effects(problem, item))} ({100.0 * weighed.shares(item).value:.0f} %)"
-            for item in members
-        ]
+    def in_part(self, best: H, probability: float) -> Outcome:
+        """Return the verdict that names a hypothesis in part."""
+        effects, share = self.effects(best), self.court.told(best)
+        family = ", ".join(sorted({t.effect.family for t in best.candidate.terms if t.free_shape}))
+        named = _words([effect for effect in effects if not effect.shape])
+        free = f"an effect of the family {family}, with a shape of its own," if family else ""
+        what = " and ".join(text for text in (named, free) if text)
+        inside = self.way.has_held_out and not share.held_out
         sentence = (
-            f"Either {', '.join(told_of[:-1])} or {told_of[-1]} closes this share of the gap on "
-            f"{explained.trials} trials; these data cannot tell which, and {left}."
+            f"{_capital(what)} is missing (probability {_certain(probability)}): "
+            f"{part(share)} {_where(share)}"
+            f"{'; in the trials held out it has hardly any force' if inside else ''}; "
+            f"{self.way.left(best, share)}."
+            f"{self._shape(best)}"
         )
-        return told.verdict(
-            VerdictKind.GROUP, sentence, sum(weighed.probability(item) for item in members),
-            effects=tuple(effect for item in members for effect in named_effects(problem, item)),
-            group=tuple(" + ".join(sorted(plain(item))) for item in members), **more,
+        return self._verdict(
+            VerdictKind.NAMED_IN_PART, sentence, probability, best, [best], effects=effects, family=family,
+            gates=(absolute_gate(self.problem, self.found.best()),),
         )  # fmt: skip
-    why = _no_winner(problem, weighed, best, len(rivals), probability)
-    if why:
-        return _unexplained(told, weighed, best, first, why=why)
-    beside = _beside(problem, best)
-    left += f", with {beside}" if beside else ""
-    named = named_effects(problem, best)
-    what = f"An effect of the family {family}, with a shape of its own," if family else _words(named)
-    sentence = (
-        f"{what[0].upper()}{what[1:]} closes {_share_words(weighed.shares(best))} of the gap on "
-        f"{explained.trials} trials (probability {_certain(probability)}); {left}."
-        f"{_exponents(problem, weighed, best)}"
-    )
-    return told.verdict(
-        VerdictKind.NAMED_IN_PART, sentence, probability, effects=named, family=family, **more
-    )
 
-
-def _no_name(problem: Problem, weighed: Weighed, best: CandidateFit) -> str:
-    """Return why the best set is no name whatever its rivals; empty where nothing speaks against one."""
-    following = [item.sentence() for item in sizes_by_trial(problem, best) if item.follows]
-    if following:
-        return " ".join(following)
-    if weighed.is_mixed(best):
-        return "It is no name, as it takes an error of the readings beside a law."
-    low = weighed.shares(best).summary().low
-    if low < SEARCH.least_share:
-        return f"It is no name, as it may close less than {100.0 * SEARCH.least_share:.0f} %."
-    # the gap is what parameters and gains could not close by themselves: what is left of it moves them
-    nearly_all = low > 1.0 - SEARCH.rival_share
-    beside = _beside(problem, best, SEARCH.widened, own=nearly_all)
-    return f"It is no name, as it needs {beside}: are these priors what you would bet on?" if beside else ""
-
-
-def _no_winner(
-    problem: Problem, weighed: Weighed, best: CandidateFit, rivals: int, probability: float
-) -> str:
-    """Return why the best set is no name beside its rivals; empty where nothing speaks against one."""
-    if rivals:
-        return f"{rivals} other sets explain as much: that tells nothing."
-    if probability < SEARCH.sure:
-        return f"It is no name, as its probability is {probability:.2g}: a name needs {SEARCH.sure:g}."
-    describing = weighed.better_description(best)
-    if describing is None:
-        return ""
-    words = _words(named_effects(problem, describing))
-    return f"It is no name, as {words}, which describes readings and causes nothing, is more probable."
-
-
-def _beside(problem: Problem, best: CandidateFit, widened: float = 1.0, *, own: bool = False) -> str:
-    """Return which unknowns have left their priors, in words; `own`: of the effects alone."""
-    tests = prior_tests(problem, best, widened, own=own)
-    return " and ".join(name for name, p in tests if p * len(tests) < ABSOLUTE_LEVEL)
-
-
-def _exponents(problem: Problem, weighed: Weighed, best: CandidateFit) -> str:
-    """Return the sentence on the shape of a single law, its own or freed for it, with intervals."""
-    free = best if best.candidate.is_family else weighed.free(best)
-    if free is None:
-        return ""
-    (effect,) = named_effects(problem, free)
-    spread = np.sqrt(np.diag(free.effect_covariance))[-len(effect.shape) :]
-    told_of = [
-        f"{item.description.split(' (')[0]} {item.value:.2g} ({item.low:.2g} to {item.high:.2g})"
-        for item, deviation in zip(effect.shape, spread, strict=True)
-        if deviation < SEARCH.told_by_data
-    ]
-    return f" With a shape of its own: {', '.join(told_of)}." if told_of else ""
-
-
-def _unexplained(
-    told: Conclusion, weighed: Weighed, leading: CandidateFit, first: Verdict, *, why: str = ""
-) -> Verdict:
-    """Return the verdict that there is a gap without a name, and how much the best hypothesis explains."""
-    leading, sentence, explained = weighed.shown(leading), first.sentence, None
-    failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
-    nearest = sorted(first.resembles) == sorted(plain(leading))  # else it would name two as the nearest
-    if first.kind is not VerdictKind.UNEXPLAINED or (failed and not nearest):
-        sentence = f"There is a gap that no effect of the catalogue fits. {failed}".strip()
-    if leading.candidate.terms:
-        explained = weighed.shares(leading).summary()
-        words = _words(named_effects(told.problem, leading))
-        sentence += (
-            f" The best hypothesis, {words}, closes {_share_words(weighed.shares(leading))} of the gap on "
-            f"{explained.trials} trials."
+    def group(self, members: Sequence[H], probability: float) -> Outcome:
+        """Return the verdict that one of several hypotheses is what is missing, what they share first."""
+        share = self.court.told(members[0])
+        words = [f"{_words(self.effects(item))} ({percent(self.court.told(item))})" for item in members]
+        sentence = (
+            f"Either {', '.join(words[:-1])} or {words[-1]} is this share of {share.of} "
+            f"{_where(share)}; these data cannot tell which."
         )
-    else:
-        sentence += weighed.little()
-    sentence += f" {why}" if why else ""
-    return told.verdict(
-        VerdictKind.UNEXPLAINED, sentence, first.probability, gates=first.gates,
-        resembles=plain(leading) or first.resembles, explained=explained,
-        remainders=remainder_estimates(told.problem, leading),
+        common = set.intersection(*(names(item) for item in members))
+        both = [e for e in self.effects(members[0]) if (e.identifier, e.place) in common]
+        if both:
+            sentence = f"{_capital(_words(both))} is missing. {sentence}"
+        return self._verdict(
+            VerdictKind.GROUP, sentence, min(probability, 1.0), members[0], members,
+            effects=tuple(effect for item in members for effect in self.effects(item)),
+            group=tuple(" + ".join(sorted(plain_names(item.candidate.identifiers))) for item in members),
+            gates=(absolute_gate(self.problem, self.found.best()),),
+        )  # fmt: skip
+
+    def unexplained(self, close: H | None = None, probability: float = 0.0) -> Outcome:
+        """Return the verdict that a force is missing which has no name: how large, and what orders it.
+
+        `close`: what has a probability that is too small for a name.
+        """
+        court = self.court
+        failed = next((gate.reason for gate in self.first.gates if gate.passed is False), "")
+        sentence = f"There is a gap that no effect of the catalogue fits. {failed}".strip()
+        sentence = f"{sentence} {self._of_the_force()}".strip()
+        effective = [item for item in court.ranked if item.candidate.terms]
+        shown = close or max(effective, key=lambda item: court.told(item).value, default=None)
+        if shown is not None and court.told(shown).value < LEAST_SHOWN:
+            shown = None
+        if shown is None:
+            sentence += " No hypothesis is a tenth of it."
+        else:
+            share, why = court.told(shown), court.against(shown)
+            if close is not None:
+                why = f"its probability is {probability:.2g}: a name needs {SEARCH.sure:g}"
+            sentence += (
+                f" The best hypothesis, {_words(self.effects(shown))}, is {part(share)} {_where(share)}"
+                f"{f'; it is no name, as {why}' if why else ''}."
+            )
+        resembles = () if shown is None else plain_names(shown.candidate.identifiers)
+        return self._verdict(
+            VerdictKind.UNEXPLAINED, sentence, self.first.probability, shown, [], resembles=resembles,
+            gates=self.first.gates,
+        )  # fmt: skip
+
+    def _verdict(
+        self,
+        kind: VerdictKind,
+        sentence: str,
+        probability: float,
+        stands: H | None,
+        first: Sequence[H],
+        **more: Any,
+    ) -> Outcome:
+        court = self.court
+        scores = np.array([self.way.score(item) for item in court.ranked])
+        weights = np.exp(scores - logsumexp(scores)).tolist()
+        rows = sorted(
+            zip(weights, court.ranked, strict=True),
+            key=lambda row: (not any(row[1] is item for item in first), -row[0]),
+        )
+        inclusion: dict[str, float] = {}
+        for weight, item in rows:
+            for name in dict.fromkeys(plain_names(item.candidate.identifiers)):
+                inclusion[name] = inclusion.get(name, 0.0) + weight
+        fit = self.found.none if stands is None else self.way.fitted(stands)
+        verdict = Verdict(
+            kind, sentence, probability, self.way.gain(stands or court.ranked[0]), inclusion=inclusion,
+            explained=None if stands is None else explained_share(court.told(stands)),
+            hypotheses=tuple(
+                Hypothesis(
+                    self.effects(item), evidence, weight, chi_square, freedom,
+                    parameters_at(self.problem, item.shared, self.way.covariance(item)),
+                )
+                for weight, item in rows[:MOST_TOLD]
+                for evidence, chi_square, freedom in (self.way.sizes(item),)
+            ),
+            remainders=remainder_estimates(self.problem, fit),
+            **more,
+        )  # fmt: skip
+        return verdict, self.found, fit
+
+    def effects(self, item: H) -> tuple[NamedEffect, ...]:
+        """Return the effects of a hypothesis with their intervals."""
+        ends = NINETY * np.sqrt(np.diag(self.way.covariance(item))[len(item.shared) :])
+        return effects_at(self.problem, item.candidate, item.effect, item.effect - ends, item.effect + ends)
+
+    def _of_the_force(self) -> str:
+        """Return size and port of the missing force, and the variable that orders it; empty: none is seen."""
+        if not isinstance(self.way, ByForce):
+            return ""
+        search = self.way.search
+        at = search.best()
+        (port,) = at.processes
+        rows = []
+        for trial, motion in zip(at.view.trials, at.motions, strict=True):
+            samples = slice(None, None, trial.parts)
+            moving = motion.positions[:, port], motion.speeds[:, port]
+            columns = (motion.forces[port], *moving, trial.fine_time)
+            rows.append(np.array([column[samples] for column in columns]))
+        force, position, speed, time = np.concatenate(rows, axis=1)
+        shares, names_of = orders(force, position, speed, time)
+        ordered = "ordered by none of displacement, velocity, amplitude and time"
+        if names_of:
+            most = 100.0 * max(shares.values())
+            ordered = f"ordered by {' and '.join(names_of)} ({most:.0f} % of its variance)"
+        size = float(np.sqrt(np.mean(force**2)))
+        unit = self.way.unit(at)
+        return f"A force of {size:.3g} {unit} (rms) is missing at {search.ports[port]!r}, {ordered}."
+
+    def _shape(self, best: H) -> str:
+        """Return the sentence on the free shape of one law, unless trials not fitted speak against it."""
+        (term, *others), told = best.candidate.terms, self.court.told
+        freed = replace(term, free_shape=True)
+        ranked = self.court.ranked
+        free = next((item for item in ranked if item.candidate.terms == (freed,)), None)
+        if others or free is None or told(free).value < told(best).value - SEARCH.slim:
+            return ""
+        spread = np.sqrt(np.diag(self.way.covariance(free)))[len(free.shared) + len(term.effect.parameters) :]
+        shown = [
+            f"{item.description.split(' (')[0]} {item.value:.2g} ({item.low:.2g} to {item.high:.2g})"
+            for item, deviation in zip(self.effects(free)[0].shape, spread, strict=True)
+            if deviation < SEARCH.told_by_data
+        ]
+        return f" With a shape of its own: {', '.join(shown)}." if shown else ""
+
+
+def explained_share(share: ForceShare) -> ExplainedShare:
+    """Return the record of a share of the missing force."""
+    before, after, noise = (float(column.sum()) for column in (share.before, share.after, share.noise))
+    of_noise = min(noise / before, 1.0)
+    remainder = min(max(after - noise, 0.0) / before, 1.0 - of_noise)
+    return ExplainedShare(
+        share.value, *share.interval, float(np.sqrt(max(after - noise, 0.0) / max(noise, 1e-300))),
+        1.0 - of_noise - remainder, remainder, of_noise, "held-out" if share.held_out else "fitted",
     )  # fmt: skip
+
+
+def _where(share: ForceShare) -> str:
+    kind = "not fitted" if share.held_out else "fitted"
+    return (
+        f"in {share.trials} trials that were {kind}" if share.trials > 1 else f"in one trial that was {kind}"
+    )
+
+
+def _words(effects: Sequence[NamedEffect]) -> str:
+    return " and ".join(f"{effect.name}{f' at {effect.place}' if effect.place else ''}" for effect in effects)
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _certain(probability: float) -> str:
+    return "> 0.999" if probability > 0.9995 else f"{probability:.3f}"
 
 
 def remainder_estimates(problem: Problem, found: CandidateFit) -> tuple[RemainderEstimate, ...]:
@@ -307,16 +385,3 @@ def remainder_estimates(problem: Problem, found: CandidateFit) -> tuple[Remainde
         RemainderEstimate(name, float(size), float(time), float(frequency))
         for name, size, time, frequency in rows
     )
-
-
-def _words(named: tuple[NamedEffect, ...]) -> str:
-    return " and ".join(f"{effect.name}{f' at {effect.place}' if effect.place else ''}" for effect in named)
-
-
-def _certain(probability: float) -> str:
-    return "> 0.999" if probability > 0.9995 else f"{probability:.3f}"  # never one
-
-
-def _share_words(shares: Shares) -> str:
-    found = shares.summary()
-    return f"{100.0 * found.value:.0f} % ({100.0 * found.low:.0f} to {100.0 * found.high:.0f})"

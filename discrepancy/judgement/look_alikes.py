@@ -12,7 +12,7 @@ TOLD = 3
 
 
 def with_untested(verdict: Verdict, setting: Setting, effects: Sequence[Effect]) -> Verdict:
-    """Return a verdict on a group or on several effects that says first what could not be tested.
+    """Return a verdict on a group or on several effects that says what could not be tested.
 
     A cause that needs another trial or a port is no member of a group, however like one it acts: those that
     are easily taken for a member are named.
@@ -29,10 +29,9 @@ def with_untested(verdict: Verdict, setting: Setting, effects: Sequence[Effect])
     names = [effect.name for effect in untested[:TOLD]]
     rest = len(untested) - len(names)
     listed = f"{', '.join(names)} and {rest} more" if rest else " and ".join(names)
-    tested = len(effects) - len(untested)
-    sentence = verdict.sentence[0].lower() + verdict.sentence[1:]
     return replace(
-        verdict, sentence=f"Of the {tested} effects that these trials can test (not {listed}), {sentence}"
+        verdict,
+        sentence=f"{verdict.sentence} These trials cannot test all effects that may act so: {listed}.",
     )
 
 

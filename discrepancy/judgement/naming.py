@@ -20,10 +20,9 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain
 
-from .by_force import judged_by_force
 from .conclusion import Conclusion, best_of, named_effects, plain_names
 from .consistency_gate import consistency_gate
-from .in_part import judged_with_remainder, without_sliver
+from .in_part import judged_in_part, without_sliver
 from .practical_size import LEAST_SIZE, is_one_driven_channel, small_terms
 from .proof import held_out_gate
 
@@ -96,12 +95,12 @@ def _named(problem: Problem, found: Search) -> tuple[Verdict, Search, CandidateF
     )
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
     if verdict.kind is VerdictKind.GROUP and found.force is not None:
-        return judged_by_force(problem, found, verdict)
+        return judged_in_part(problem, found, verdict)
     if stands or not (misfits or verdict.kind in open_kinds):
         return verdict, found, fit
     if found.force is not None:
-        return judged_by_force(problem, found, verdict)
-    return judged_with_remainder(problem, found, verdict)
+        return judged_in_part(problem, found, verdict)
+    return judged_in_part(problem, found, verdict)
 
 
 def _all_small(problem: Problem, found: Search, verdict: Verdict, fit: CandidateFit) -> bool:

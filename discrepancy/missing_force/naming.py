@@ -51,10 +51,9 @@ SETTLED = 0.05
 """Steps of the unknowns of an effect: how many, the longest, and that after which no other follows."""
 LEAST_PART = 0.2
 """Least part of a step that is taken where steps turn back."""
-BLOCKS = 24
 ALONG = 0.5
-"""Share of what is left of an unknown law, in a block of that many, that may be hidden along a named one:
-intervals of laws beside a weaker law held 4 of 9 hidden values without it."""
+"""Share of what is left of an unknown law that may be hidden along a named one: without it intervals beside a
+weaker law hold 4 of 9 hidden values."""
 SLOPE = 0.05
 """Standard normal step of the derivatives of an effect."""
 
@@ -113,34 +112,30 @@ class Explained:
         """Of all unknowns, shared ones first, wide enough for what is left to lie along the laws in part.
 
         The process is a force in time that has nothing to do with the motion. What is left of another law
-        has: as much of it as is seen beside the columns may be hidden along them. How much is left is taken
-        from the middle one of blocks in time, as what acts once (a push) is not along a law.
+        has: as much of it as is seen beside the columns may be hidden along them.
         """
         at, covariance = len(self.view.shared_precision), self.solution.covariance
+        if not len(self.effect):
+            return covariance
         wider = np.zeros((len(self.effect),) * 2)
-        for port in self.processes:
-            columns, left, law = self._forces_at(port)
+        for port, process in self.processes.items():
+            columns = self._columns_at(port)
             acting = np.flatnonzero(columns.any(axis=1))
-            blocks = np.array_split(np.arange(len(law)), BLOCKS)
-            ratios = [np.sum(left[b] ** 2) / np.sum(law[b] ** 2) for b in blocks if np.any(law[b])]
-            if not len(acting) or not ratios:
-                continue
-            size = ALONG**2 * float(np.median(ratios)) * float(np.mean(law**2))
-            gram = columns[acting] @ columns[acting].T / len(law)
-            wider[np.ix_(acting, acting)] += size * np.linalg.inv(gram + size * np.eye(len(acting)))
+            if len(acting):
+                size = (ALONG * process.size) ** 2
+                gram = columns[acting] @ columns[acting].T / columns.shape[1]
+                wider[np.ix_(acting, acting)] += size * np.linalg.inv(gram + size * np.eye(len(acting)))
         follow = np.linalg.lstsq(covariance[at:, at:], covariance[at:], rcond=None)[0].T
         return np.asarray(covariance + follow @ wider @ follow.T)
 
-    def _forces_at(self, port: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return columns (E, T), what is left (T,) and laws (T,) at a port, at the samples of all trials."""
+    def _columns_at(self, port: int) -> FloatArray:
+        """Return the forces (E, T) of the effects at a port, at the samples of all trials."""
         rows = []
-        for number, (trial, motion) in enumerate(zip(self.view.trials, self.motions, strict=True)):
+        for number, trial in enumerate(self.view.trials):
             nothing = np.zeros(len(trial.fine_time))
-            effects = [item[number].forces.get(port, nothing) for item in self.view.effects]
-            forces = [*effects, motion.left.get(port, nothing), motion.laws.get(port, nothing)]
-            rows.append(np.array([force[:: trial.parts] for force in forces]))
-        *columns, left, law = np.concatenate(rows, axis=1)
-        return np.array(columns).reshape(len(self.effect), -1), left, law
+            forces = [item[number].forces.get(port, nothing) for item in self.view.effects]
+            rows.append(np.array([np.asarray(force)[:: trial.parts] for force in forces]))
+        return np.concatenate(rows, axis=-1)
 
 
 class ForceSearch:

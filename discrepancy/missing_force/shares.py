@@ -23,6 +23,8 @@ WITHIN = 2.0
 """Prior deviations within which parameters stay where the missing force without any effect is told."""
 TESTED = 0.1
 """Share of the missing force from which on a law has one that these trials can test."""
+OF_FORCE, OF_PREDICTIONS = "the missing force", "what the missing force does to predictions"
+OF_READINGS = "the gap"
 DRAWS, SEED = 2000, 0
 TURNS = 3
 """Times that the motion of a trial that was not fitted is looked at along the law that it shows."""
@@ -46,9 +48,9 @@ class ForceShare:
     left, whole : float
         Root mean square of the force at the port of the law (or where most is missing) beside it, and of all
         of it [N, N m or the port's flow].
-    ahead : bool
-        Whether squares are of what the forces do to readings over a block, from its begin: the error of
-        predictions; else of the forces, over what they do to the state.
+    of : str
+        What it is a share of: of the forces, over what they do to the state, of what they do to readings over
+        a block, from its begin (the error of predictions), or of the gap between readings and simulation.
     tested : bool
         Whether the law has a force there that could be seen.
     """
@@ -60,7 +62,7 @@ class ForceShare:
     trials: int
     left: float
     whole: float
-    ahead: bool
+    of: str
     tested: bool
 
     @property
@@ -164,10 +166,10 @@ class ForceShares:
                 len(motions),
                 left,
                 whole,
-                ahead,
+                of,
                 not laws or own**2 > TESTED * whole**2,
             )
-            for table, ahead in ((np.array(of_force).T, False), (np.array(of_readings).T, True))
+            for table, of in ((np.array(of_force).T, OF_FORCE), (np.array(of_readings).T, OF_PREDICTIONS))
         ]
         return max(shares, key=lambda share: share.interval[0])
 

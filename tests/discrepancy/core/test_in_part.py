@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from discrepancy.campaign.records import NoiseRecord
-from discrepancy.judgement.explained_share import Shares
+from discrepancy.judgement.in_part import explained_share
 from discrepancy.judgement.naming import name
+from discrepancy.missing_force.shares import OF_READINGS, ForceShare
 from discrepancy.verdict import VerdictKind
 
 FloatArray = NDArray[np.float64]
@@ -60,7 +61,7 @@ def test_friction_beside_a_remainder_is_named_in_part(rig, effects, seed: int) -
     shares = (verdict.explained.effect, verdict.explained.remainder, verdict.explained.noise)
     assert sum(shares) == pytest.approx(1.0)
     assert {item.channel for item in verdict.remainders} == {"x3", "g1"}
-    assert "of the gap on held-out trials" in verdict.sentence
+    assert "of the gap in 2 trials that were not fitted" in verdict.sentence
     assert verdict.inclusion["coulomb_friction"] >= 0.95
     (estimate,) = verdict.effects[0].parameters
     half = 0.5 * (estimate.high - estimate.low)
@@ -104,14 +105,19 @@ def test_shares_and_their_interval() -> None:
     generator = np.random.default_rng(1)
     noise = np.full(40, 10.0)
     gap = generator.uniform(50.0, 150.0, 40)
-    shares = Shares(noise + gap, noise + 0.5 * gap * generator.uniform(0.8, 1.2, 40), noise, "held-out")
-    found = shares.summary()
+
+    def shares(after: FloatArray) -> ForceShare:
+        sizes = (True, 4, 1.0, 2.0)
+        return ForceShare(noise + gap, after, noise, *sizes, OF_READINGS, tested=True)
+
+    half = shares(noise + 0.5 * gap * generator.uniform(0.8, 1.2, 40))
+    found = explained_share(half)
     assert found.value == pytest.approx(0.5, abs=0.05)
     assert found.low < 0.5 < found.high
     assert found.effect + found.remainder + found.noise == pytest.approx(1.0)
-    assert shares.summary() == found
-    better = Shares(shares.before, noise + 0.3 * gap, noise, "held-out")
-    assert better.told_from(shares)
-    assert not shares.told_from(better)
-    closed = Shares(shares.before, 0.9 * noise, noise, "held-out").summary()
+    assert found.trials == "held-out"
+    better = shares(noise + 0.3 * gap)
+    assert better.told_from(half)
+    assert not half.told_from(better)
+    closed = explained_share(shares(0.9 * noise))
     assert (closed.value, closed.left, closed.remainder) == (1.0, 0.0, 0.0)

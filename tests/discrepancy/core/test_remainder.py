@@ -112,9 +112,7 @@ def test_colour_of_the_noise_is_told_from_a_remainder(kit) -> None:  # type: ign
         white = generator.standard_normal(len(time))
         samples = scale * root @ white if of_noise else 0.02 * white
         record = NoiseRecord(float(samples.std()), 199.0, samples - samples.mean(), 0.01, "pre-trigger")
-        problem = kit.closed_problem(
-            seed=6, kinds=("ringdown",), samples=400, extra=coloured(1.5, 0.03, 0.0)
-        )
+        problem = kit.closed_problem(seed=6, kinds=("ringdown",), samples=400, extra=coloured(1.5, 0.03, 0.0))
         channels = dict(problem.campaign.channels)
         channels["y1"] = replace(channels["y1"], noise=record)
         campaign = replace(problem.campaign, channels=channels)
