@@ -67,7 +67,7 @@ def test_size_time_and_frequency_are_found(kit, size: float, tau: float, frequen
 
 
 def test_evidence_under_a_wider_noise_is_that_of_a_campaign_with_such_noise(kit) -> None:  # type: ignore[no-untyped-def]
-    """Optimum, covariance and evidence are those of the same campaign whose records say so, but a constant."""
+    """Optimum, covariance and evidence are those of the same campaign whose records say so."""
     problem = kit.closed_problem(seed=4, kinds=("ringdown",), samples=300, extra=coloured(3.0, 0.15, 0.0))
     none = none_of(problem)
     left = left_by(problem, none)
