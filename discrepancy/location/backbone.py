@@ -15,7 +15,6 @@ from math import log, nan, sqrt
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import savgol_coeffs
 
 from calibration.dynamics.damped_cosine import DampedCosines, Solution
 from discrepancy.errors import FitError
@@ -249,65 +248,3 @@ def at_amplitude(curves: Sequence[Backbone], amplitude: float, factor: float = 2
     return BackboneValue(
         amplitude, float(mean[0]), float(scatter[0]), float(mean[2]), float(scatter[2]), len(table)
     )
-
-
-@dataclass(frozen=True, eq=False)
-class RestoringForceSurface:
-    """Acceleration of a single-mode motion over its displacement and velocity (Masri and Caughey 1979).
-
-    Attributes
-    ----------
-    displacement, velocity, acceleration : (N,) ndarray
-        [signal's unit, per s, per s^2]; minus the acceleration is the restoring force per modal mass.
-    acceleration_error : float
-        Standard error of each acceleration from the noise; nan if that is not known.
-    """
-
-    displacement: FloatArray
-    velocity: FloatArray
-    acceleration: FloatArray
-    acceleration_error: float
-
-
-def restoring_force_surface(
-    time: FloatArray,
-    signal: FloatArray,
-    frequency: float,
-    *,
-    noise_deviation: float | None = None,
-    window: float = 0.3,
-) -> RestoringForceSurface:
-    """Return the restoring-force surface of a signal with one mode.
-
-    Derivatives are those of a polynomial of degree six fitted in a window about each sample; half a window at
-    both ends is left out, and the signal's mean over its last quarter is taken as rest.
-
-    Parameters
-    ----------
-    time, signal : (N,) ndarray
-        Evenly spaced record [s], [any unit].
-    frequency : float
-        Of the mode [Hz]; a second mode must have been taken out before.
-    noise_deviation : float, optional
-        Standard deviation of the noise [signal's unit].
-    window : float
-        Length in periods. At 0.3 the cubic term of a spring with 30 % cubic force is found within 0.2 %, at
-        0.5 within 4 %, with a third of the noise.
-
-    Raises
-    ------
-    FitError
-        If a window has fewer than nine samples or the record is shorter than two of them.
-    """
-    interval = _check(time, signal, (frequency,), 0.0)
-    width = round(window / (frequency * interval)) | 1
-    if width < 9 or time.size < 2 * width:
-        raise FitError(
-            f"The window of {window:g} periods has {width} samples, but at least 9 and at most half the "
-            f"record of {time.size} are needed: sample faster or change `window`."
-        )
-    rest = float(np.mean(signal[-max(time.size // 4, 1) :]))
-    kernels = [savgol_coeffs(width, 6, deriv=order, delta=interval) for order in range(3)]
-    x, v, a = (np.convolve(signal - rest, kernel, "valid") for kernel in kernels)
-    error = nan if noise_deviation is None else noise_deviation * float(np.linalg.norm(kernels[2]))
-    return RestoringForceSurface(x, v, a, error)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from discrepancy.errors import FitError
-from discrepancy.location.backbone import Backbone, at_amplitude, backbones, restoring_force_surface
+from discrepancy.location.backbone import Backbone, at_amplitude, backbones
 
 REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 TIME = 0.005 * np.arange(2000)
@@ -137,27 +137,6 @@ def test_value_at_an_amplitude_is_the_mean_over_trials() -> None:
     assert at_amplitude([line(0.0)], 50.0).trial_count == 0
 
 
-def test_surface_of_a_cubic_spring() -> None:
-    kappa, zeta = 0.3, 0.01
-    time = 0.002 * np.arange(2500)
-    found = solve_ivp(
-        lambda t, y: [y[1], -2 * zeta * OMEGA * y[1] - OMEGA**2 * (y[0] + kappa * y[0] ** 3)],
-        (0.0, time[-1]), [1.0, 0.0], t_eval=time, rtol=1e-10, atol=1e-12,
-    )  # fmt: skip
-    generator = np.random.default_rng(2)
-    noisy = found.y[0] + 1e-3 * generator.standard_normal(time.size)
-    surface = restoring_force_surface(time, noisy, 5.0, noise_deviation=1e-3)
-    x, v, a = surface.displacement, surface.velocity, surface.acceleration
-    design = np.column_stack([-x, -(x**3), -v])
-    stiffness, cubic, damping = np.linalg.lstsq(design, a, rcond=None)[0]
-    assert stiffness == pytest.approx(OMEGA**2, rel=0.01)
-    assert cubic == pytest.approx(kappa * OMEGA**2, rel=0.03)
-    assert damping == pytest.approx(2 * zeta * OMEGA, rel=0.06)
-    clean = restoring_force_surface(time, found.y[0], 5.0)
-    assert np.isnan(clean.acceleration_error)
-    assert np.std(a - clean.acceleration) == pytest.approx(surface.acceleration_error, rel=0.1)
-
-
 def test_bad_input_is_refused() -> None:
     signal = _viscous()
     for settings, words in (
@@ -175,8 +154,6 @@ def test_bad_input_is_refused() -> None:
     broken[5] = np.nan
     with pytest.raises(FitError, match="finite"):
         backbones(TIME, broken, (5.0,))
-    with pytest.raises(FitError, match="at least 9"):
-        restoring_force_surface(TIME, signal, 50.0)
 
 
 def test_the_real_wing_stiffens_and_its_damping_falls_as_it_comes_to_rest() -> None:
