@@ -155,10 +155,6 @@ class SearchSettings:
     """Of these, how many are fitted with them at most."""
     weighed_within: float = 60.0
     """Log evidence below the best one from which on they are not: a fit with its remainder moves by less."""
-    rival: float = 2.0
-    """Log evidence within which an equally long set keeps another from being named."""
-    rival_share: float = 0.1
-    """Explained share within which it does, if held-out data do not tell the two apart."""
     least_share: float = 0.5
     """Lower end of the explained share that a name in part needs."""
     widened: float = 2.0
@@ -173,8 +169,6 @@ class SearchSettings:
     it was chosen among all that may stand there."""
     stand_in_range: float = 3.0
     """Prior deviations beyond which a stand-in (clock, gain, drift, line) names nothing in part."""
-    least_periods: float = 3.0
-    """Periods that a line has in the longest record at least."""
 
     # ---------------------------------------------------------------- what is judged is computed finely
     solver_share: float = 0.1

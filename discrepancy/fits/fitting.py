@@ -85,8 +85,7 @@ class CandidateFit:
     converged : bool
         Whether the last step was short enough.
     draws : (N, E) ndarray or None
-        From the posterior of the scaled effect parameters, where it is wider than their covariance (see
-        `posterior`).
+        Of the scaled effect parameters, where they are wider than their covariance (see `posterior`).
     remainder : Remainder or None
         What it leaves beside the noise, where hypotheses are compared under a wider one.
     """
@@ -118,13 +117,8 @@ class CandidateFit:
     @property
     def effect_covariance(self) -> FloatArray:
         """Covariance (E, E) of the scaled effect parameters."""
-        count = self.candidate.size
-        return self.covariance[len(self.covariance) - count :, len(self.covariance) - count :]
-
-    @property
-    def base(self) -> Base:
-        """What chord steps of other candidates need of this fit."""
-        return Base(self.point, self.linearisations)
+        first = len(self.covariance) - self.candidate.size
+        return self.covariance[first:, first:]
 
     @property
     def chi_square(self) -> float:

@@ -22,7 +22,7 @@ from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain
 
 from .conclusion import Conclusion, best_of, named_effects, plain_names
 from .consistency_gate import consistency_gate
-from .in_part import judged_in_part, without_sliver
+from .in_part import judged_by_readings, judged_in_part, without_sliver
 from .practical_size import LEAST_SIZE, is_one_driven_channel, small_terms
 from .proof import held_out_gate
 
@@ -56,13 +56,11 @@ def name(
     if found.force is None or first[0].kind is not VerdictKind.UNEXPLAINED:
         return first
     tell("nothing follows the missing force: comparing whole simulations")
-    second = search(problem, effects, tell, by_force=False)
-    other = _named(problem, second)
+    other = judged_by_readings(problem, found, first[0])
+    found.judge({})
     causes = any(acts_within(term.effect, problem.setting) for term in other[2].candidate.terms)
-    if other[0].kind is not VerdictKind.NAMED_IN_PART or not causes or not _closes_fitted(problem, other):
-        return first
-    second.force, second.forces = found.force, found.forces
-    return other
+    named = other[0].kind is VerdictKind.NAMED_IN_PART
+    return other if named and causes and _closes_fitted(problem, other) else first
 
 
 def _closes_fitted(problem: Problem, outcome: tuple[Verdict, Search, CandidateFit]) -> bool:

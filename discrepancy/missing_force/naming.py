@@ -35,6 +35,8 @@ WIDE = 3.0
 SIZES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
 TIMES = (0.5, 1.5)
 """Processes, over the most probable one without effect, beside which all effects are tried."""
+LARGEST_RATIO = 1e100
+"""Of an effect to a gap that is nought."""
 MOST_PORTS = 4
 """Ports at which forces may be missing at once."""
 BESIDE = 0.1
@@ -341,7 +343,7 @@ class ForceSearch:
             forces = [np.ravel(force) for part in column for force in part.forces.values()]
             sizes = forces or [part.readings.ravel() for part in column]
             own = float(np.sqrt(np.mean(np.concatenate(sizes) ** 2)))
-            precision.append((max(own, 1e-300) / (WIDE * gap[bool(forces)])) ** 2)
+            precision.append(min(max(own, 1e-300) / (WIDE * gap[bool(forces)]), LARGEST_RATIO) ** 2)
         whole = replace(
             base.view, motions=base.motions, effects=(*base.view.effects, *columns),
             precision=(*base.view.precision, *precision),

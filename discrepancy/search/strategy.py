@@ -12,7 +12,7 @@ from discrepancy.errors import ModelError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
-from discrepancy.fits.linearisation import Point
+from discrepancy.fits.linearisation import Base, Point
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
@@ -129,7 +129,12 @@ class Search(Hypotheses):
         """Fit a candidate by chord steps from a base, None where it cannot; see `fit` for `give_up`."""
         start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
         return attempt(
-            self.problem, candidate, start, base=base.base, iterations=SEARCH.chord_steps, give_up=give_up
+            self.problem,
+            candidate,
+            start,
+            base=Base(base.point, base.linearisations),
+            iterations=SEARCH.chord_steps,
+            give_up=give_up,
         )
 
     def exactly(self, rough: CandidateFit) -> CandidateFit:
@@ -407,9 +412,7 @@ STRATEGY = (
 """Simple causes before others: one effect, one law of free shape, more effects, any two; then fewer again."""
 
 
-def search(
-    problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence, *, by_force: bool = True
-) -> Search:
+def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:
     """Fit the model without effect, then search the catalogue.
 
     Parameters
@@ -421,8 +424,6 @@ def search(
         or ended is tried so too.
     tell : callable
         Takes a few words on what is fitted, and how much is left.
-    by_force : bool
-        Whether the missing force leads, where it can be seen.
 
     Returns
     -------
@@ -437,7 +438,7 @@ def search(
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
     usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)
-    if not (by_force and found.by_force()):
+    if not found.by_force():
         found.run()
     return found
 

@@ -13,7 +13,7 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.linearisation import PARAMETER_STEP
+from discrepancy.fits.linearisation import PARAMETER_STEP, Base
 from discrepancy.fits.problem import Problem
 
 FloatArray = NDArray[np.float64]
@@ -133,7 +133,9 @@ def test_chord_steps_are_exact_at_the_base_and_second_order_away(kit, bench, cat
             local=(*none.point.local[:number], none.point.local[number] + size * away[1]),
             effect=np.array([0.3]),
         )
-        chord = problem.linearise(number, point, candidate, none.base, derivatives=False).response
+        chord = problem.linearise(
+            number, point, candidate, Base(none.point, none.linearisations), derivatives=False
+        ).response
         exact = problem.linearise(number, point, candidate, derivatives=False).response
         errors.append(float(np.abs((chord - exact) / problem.trials[number].deviation).max()))
     assert errors[0] < 1e-9
