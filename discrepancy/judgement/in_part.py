@@ -68,11 +68,6 @@ def judged_in_part(problem: Problem, found: Search, first: Verdict) -> Outcome:
     """
     if found.force is not None:
         return _Said(problem, found, first, ByForce(problem, found)).verdict()
-    return judged_by_readings(problem, found, first)
-
-
-def judged_by_readings(problem: Problem, found: Search, first: Verdict) -> Outcome:
-    """Return what `judged_in_part` does, by whole simulations."""
     weigh_with_remainders(found)
     way = ByReadings(problem, found)
     coloured = _beside_coloured_noise(problem, found, way)

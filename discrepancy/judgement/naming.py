@@ -22,7 +22,7 @@ from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain
 
 from .conclusion import Conclusion, best_of, named_effects, plain_names
 from .consistency_gate import consistency_gate
-from .in_part import judged_by_readings, judged_in_part, without_sliver
+from .in_part import judged_in_part, without_sliver
 from .practical_size import LEAST_SIZE, is_one_driven_channel, small_terms
 from .proof import held_out_gate
 
@@ -56,8 +56,10 @@ def name(
     if found.force is None or first[0].kind is not VerdictKind.UNEXPLAINED:
         return first
     tell("nothing follows the missing force: comparing whole simulations")
-    other = judged_by_readings(problem, found, first[0])
-    found.judge({})
+    second = Search(problem, found.effects, found.none, tell=tell)
+    second.run()
+    other = _named(problem, second)
+    second.force, second.forces = found.force, found.forces
     causes = any(acts_within(term.effect, problem.setting) for term in other[2].candidate.terms)
     named = other[0].kind is VerdictKind.NAMED_IN_PART
     return other if named and causes and _closes_fitted(problem, other) else first

@@ -259,6 +259,7 @@ class Search(Hypotheses):
         the best effect fits, families compete only if others fit as well: its own is for the shape gate.
         """
         singles = [item for item in self.exact.values() if len(item.candidate.terms) == 1]
+        singles = [item for item in singles if not item.candidate.is_family]
         singles = sorted(singles, key=self.score, reverse=True)[: SEARCH.exact_fits]
         fitting = [item for item in singles if absolute_gate(self.problem, item).passed is not False]
         if fitting and fitting[0] is singles[0]:
