@@ -181,7 +181,8 @@ def info(
     json: terminal.Json = False,
 ) -> None:
     """Say what an FMU is: version, capabilities, variables with units and ranges."""
-    from fmu_asset.archive.fmu_file import describe_fmu, inspect_fmu
+    from fmu_asset.archive.declared import describe_fmu
+    from fmu_asset.archive.fmu_file import inspect_fmu
     from uav_twin.console_table import console_table
 
     description, obstacle = inspect_fmu(file)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,8 @@ NUMERIC_KINDS = frozenset(
 )
 _LARGEST_ARRAY = 10_000_000
 FLOAT_KINDS = frozenset({"Real", "Float32", "Float64"})
+READABLE = ("output", "local", "calculatedParameter")
+"""Causalities of what can be the source of a connection."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,10 @@ class VariableInfo:
         For each number of the shape the name of the structural parameter that it is, if it is one.
     clocked : bool
         Whether it changes with a clock of FMI 3 only.
+    items : dict of str to int
+        Of an enumeration.
+    dependencies : tuple of str or None
+        Names of the variables that an output depends on directly; None if that is not declared.
     """
 
     name: str
@@ -61,6 +67,8 @@ class VariableInfo:
     shape: tuple[int, ...] = ()
     dimensions: tuple[str | None, ...] = ()
     clocked: bool = False
+    items: dict[str, int] = field(default_factory=dict, hash=False)
+    dependencies: tuple[str, ...] | None = None
 
     @property
     def size(self) -> int:
@@ -205,6 +213,19 @@ class FmuDescription:
         """Return the variable of that name, or None."""
         return self._by_name.get(name)
 
+    @cached_property
+    def feedthrough(self) -> dict[str, frozenset[str]]:
+        """For each variable that can be read, the inputs that it depends on directly.
+
+        An output without declared dependencies depends on all inputs, as FMI says.
+        """
+        inputs = frozenset(v.name for v in self.variables if v.causality == "input")
+        return {
+            v.name: inputs if v.dependencies is None else inputs & {*v.dependencies}
+            for v in self.variables
+            if v.causality in READABLE
+        }
+
     def exchange_kind(self, variable: VariableInfo) -> str:
         """Return the base type in which a variable is set and read: enumerations are integers."""
         if variable.kind != "Enumeration":
@@ -252,6 +273,11 @@ def read_declared(
     for variable in declared.modelVariables:
         if (element := unsigned.get(variable.name)) is not None:
             variable.min, variable.max = element.get("min"), element.get("max")
+    known = {
+        unknown.variable.name: tuple(str(variable.name) for variable in unknown.dependencies)
+        for unknown in declared.outputs
+        if unknown.variable is not None and unknown.dependencies is not None
+    }
     fixed = getattr(chosen, "fixedInternalStepSize", None)
     return FmuDescription(
         path=file,
@@ -268,7 +294,9 @@ def read_declared(
         can_serialise_state=bool(chosen.canSerializeFMUstate),
         can_vary_step=bool(vary),
         can_interpolate_inputs=bool(lines),
-        variables=tuple(_variable(variable) for variable in declared.modelVariables),
+        variables=tuple(
+            _variable(variable, known.get(variable.name)) for variable in declared.modelVariables
+        ),
         units=tuple(_unit(unit) for unit in declared.unitDefinitions),
         interface=interface,
         interfaces=tuple(name for name, given in offered.items() if given is not None),
@@ -294,7 +322,7 @@ def _checked(name: str, shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(shape)
 
 
-def _variable(declared: Any) -> VariableInfo:
+def _variable(declared: Any, dependencies: tuple[str, ...] | None) -> VariableInfo:
     declared_type = declared.declaredType
 
     def of(attribute: str) -> Any:
@@ -318,6 +346,8 @@ def _variable(declared: Any) -> VariableInfo:
         shape=_checked(declared.name, declared.shape or ()),
         dimensions=tuple(d.variable and str(d.variable.name) for d in declared.dimensions or ()),
         clocked=bool(declared.clocks),
+        items={str(item.name): int(item.value) for item in getattr(declared_type, "items", None) or ()},
+        dependencies=dependencies,
     )
 
 
@@ -341,28 +371,9 @@ def _visible(record: dict[str, Any]) -> dict[str, Any]:
     return {name: visible(value) if isinstance(value, str) else value for name, value in record.items()}
 
 
-def describe_fmu(description: FmuDescription, roles: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return an FMU's description as plain records, with the role of each variable if known.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        As `read_fmu` returns it.
-    roles : mapping of str to str, optional
-        Role by variable name.
-
-    Returns
-    -------
-    dict
-        Plain values, JSON-serialisable.
-    """
+def describe_fmu(description: FmuDescription) -> dict[str, Any]:
+    """Return an FMU's description as plain records, JSON-serialisable."""
     record: dict[str, Any] = _visible(asdict(description))
     record["path"] = str(description.path)
-    record["platforms"] = list(description.platforms)
-    record["interfaces"] = list(description.interfaces)
-    record["units"] = [asdict(unit) for unit in description.units]
-    record["variables"] = [
-        _visible(asdict(variable)) | {"role": (roles or {}).get(variable.name, "")}
-        for variable in description.variables
-    ]
+    record["variables"] = [_visible(variable) for variable in record["variables"]]
     return record

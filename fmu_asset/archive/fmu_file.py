@@ -1,6 +1,7 @@
 """An FMU file from outside: sound, safe to extract, of a kind that can be flown, and what it declares."""
 
 import hashlib
+import json
 import lzma
 import os
 import re
@@ -20,18 +21,7 @@ from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.plan import Interface
 from reporting.words import one_line
 
-from .declared import FmuDescription, UnitInfo, VariableInfo, describe_fmu, read_declared
-
-__all__ = [
-    "FmuDescription",
-    "UnitInfo",
-    "VariableInfo",
-    "describe_fmu",
-    "extract_fmu",
-    "inspect_fmu",
-    "plain_folder",
-    "read_fmu",
-]
+from .declared import FmuDescription, read_declared
 
 # A model FMU of hundreds of megabytes exists; one that unpacks to more than this is a mistake or an attack.
 LARGEST_EXTRACTED_BYTES = 4 * 1024**3
@@ -39,6 +29,9 @@ _LARGEST_RATIO = 200
 _SMALL_ENOUGH = 256 * 1024**2
 _MOST_ENTRIES = 100_000
 _DEEPEST = 100
+DESIGN_RECORD = "design.json"
+"""Name of the file in the folder `resources` that says of which design an FMU of ours was made."""
+_LONGEST_RECORD = 10_000
 _LARGEST_DESCRIPTION = 256 * 1024**2
 _UNREADABLE = (OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
@@ -306,3 +299,18 @@ def _model_description(file: Path) -> Element:
     if root.tag != "fmiModelDescription":
         raise FmuFileError(f"The model description of {file} begins with <{root.tag}>; it is damaged.")
     return root
+
+
+def design_record(design_hash: str) -> bytes:
+    """Return the content of the file."""
+    return (json.dumps({"design_hash": design_hash}) + "\n").encode()
+
+
+def packed_design_hash(path: str | os.PathLike[str]) -> str:
+    """Return the hash of the design that an FMU was made of; empty where it does not tell."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open(f"resources/{DESIGN_RECORD}") as file:
+            found = json.loads(file.read(_LONGEST_RECORD))["design_hash"]
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError, zipfile.BadZipFile):
+        return ""
+    return found if isinstance(found, str) else ""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from fe.runtime.reduced_arrays import ReducedArrays
-from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
+from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface

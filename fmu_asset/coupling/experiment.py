@@ -64,9 +64,14 @@ def system_experiment(
     CouplingError
         If a value is of no component.
     """
-    described = [declared.description for declared in wiring.declared.values()]
     declared_step = min(
-        (size for d in described for size in (d.fixed_step or d.step_size,) if size is not None), default=None
+        (
+            size
+            for d in wiring.declared.values()
+            for size in (d.fixed_step or d.step_size,)
+            if size is not None
+        ),
+        default=None,
     )
     start, steps, size = steps_to(span[0] or 0.0, span[1], step_size or declared_step)
     observed = every_output(wiring)
@@ -96,7 +101,7 @@ def every_output(wiring: Wiring) -> dict[str, str]:
     observed = {name: wiring.units[name] or "1" for name in wiring.outward}
     shown = {port.end for port in wiring.outward.values()}
     for component, item in wiring.declared.items():
-        for variable in item.variables.values():
+        for variable in item.variables:
             own = Endpoint(component, variable.name) not in shown
             if own and variable.causality == "output" and variable.single:
                 observed[f"{component}.{variable.name}"] = variable.unit or "1"

@@ -180,7 +180,7 @@ class Layout:
         }
         for name, moving in zip(self.names, self.moving, strict=True):
             own = any(wiring.variable(end).continuous for end in given if end.component == name)
-            linear.append(wiring.declared[name].description.can_interpolate_inputs and (own or any(moving)))
+            linear.append(wiring.declared[name].can_interpolate_inputs and (own or any(moving)))
         if not any(linear):
             raise BindingError(
                 f"The binding {self._binding.name} asks for linear interpolation of inputs, but no component "
@@ -251,7 +251,7 @@ class Layout:
 
     def _any_output(self, name: str) -> str:
         """Return an output to look at for a component of which nothing is asked."""
-        for variable in self._wiring.declared[name].variables.values():
+        for variable in self._wiring.declared[name].variables:
             if variable.causality == "output" and variable.single:
                 return variable.name
         raise CouplingError(

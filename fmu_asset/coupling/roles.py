@@ -2,12 +2,11 @@
 
 from typing import NamedTuple
 
-from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.archive.declared import READABLE, UnitInfo
 from fmu_asset.door.binding import INPUT_ROLES, Binding
 from fmu_asset.door.units import Conversion, between
 from fmu_asset.errors import BindingError
 
-from .declared import READABLE
 from .structure import Endpoint, listed
 from .wiring import ConnectedVariable, Wiring, composed
 
@@ -132,7 +131,7 @@ def _unit(
 ) -> Conversion:
     """Return the conversion from the binding's unit to the system's, or the other way if `outward`."""
     known = (
-        wiring.declared[end.component].description.units
+        wiring.declared[end.component].units
         if end.component
         else (*wiring.structure.units, *_defined(wiring, end))
     )
@@ -148,4 +147,4 @@ def _unit(
 def _defined(wiring: Wiring, end: Endpoint) -> tuple[UnitInfo, ...]:
     """Return the unit definitions of the FMUs behind a connector, which may have lent it its unit."""
     ports = [*wiring.inward.get(end.variable, ()), *filter(None, [wiring.outward.get(end.variable)])]
-    return tuple(unit for port in ports for unit in wiring.declared[port.end.component].description.units)
+    return tuple(unit for port in ports for unit in wiring.declared[port.end.component].units)

@@ -95,7 +95,7 @@ def wiring_hash(wiring: Wiring, binding: Binding, algorithm: str, iterations: in
     """Return the SHA-256 of all that the meaning of a state depends on; places of files do not count."""
     record = {
         "components": [
-            [c.name, wiring.declared[c.name].description.sha256, wiring.settings[c.name], c.substeps]
+            [c.name, wiring.declared[c.name].sha256, wiring.settings[c.name], c.substeps]
             + ([] if c.interface is None else [c.interface])
             for c in wiring.structure.components
         ],

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.door.binding import expand
 from fmu_asset.errors import CouplingError
 from fmu_asset.instances.plan import Interface

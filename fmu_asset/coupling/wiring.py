@@ -2,15 +2,14 @@
 
 import difflib
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
-from fmu_asset.archive.fmu_file import UnitInfo, VariableInfo
+from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, VariableInfo
+from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.units import IDENTITY, Conversion, between
 from fmu_asset.errors import CouplingError
 
-from .declared import READABLE, DeclaredFmu, read_declared
 from .schedule import Link, Schedule, schedule
 from .structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure, listed
 
@@ -59,7 +58,7 @@ class Wiring:
         As given, without what was left out.
     left_out : list of str
         The names of these settings.
-    declared : dict of str to DeclaredFmu
+    declared : dict of str to FmuDescription
         The FMUs by component.
     feeds : tuple of Feed
         Connections between components.
@@ -92,8 +91,8 @@ class Wiring:
                     f"The system {structure.name} has two components named {name!r}; each needs a name of "
                     "its own."
                 )
-        self.declared: dict[str, DeclaredFmu] = {
-            c.name: read_declared(c.fmu, c.interface) for c in structure.components
+        self.declared: dict[str, FmuDescription] = {
+            c.name: read_fmu(c.fmu, c.interface) for c in structure.components
         }
         self.left_out: list[str] = []
         if leave_out_unknown:
@@ -121,7 +120,7 @@ class Wiring:
             name: {
                 output: inputs
                 for output, inputs in declared.feedthrough.items()
-                if declared.variables[output].causality == "output" or Endpoint(name, output) in used
+                if self.variable(end := Endpoint(name, output)).causality == "output" or end in used
             }
             for name, declared in self.declared.items()
         }
@@ -138,12 +137,12 @@ class Wiring:
         """
         self.structure.component(end.component)
         declared = self.declared[end.component]
-        variable = declared.variables.get(end.variable)
+        variable = declared.variable(end.variable)
         if variable is None:
-            near = difflib.get_close_matches(end.variable, list(declared.variables), 1, 0.6)
+            near = difflib.get_close_matches(end.variable, [v.name for v in declared.variables], 1, 0.6)
             hint = f"; did you mean {near[0]!r}?" if near else "."
             raise CouplingError(
-                f"The component {end.component!r} ({declared.description.path.name}) has no variable "
+                f"The component {end.component!r} ({declared.path.name}) has no variable "
                 f"{end.variable!r}{hint}"
             )
         return variable
@@ -255,13 +254,13 @@ class Wiring:
         return composed(unit, own)
 
     def _definitions(self, end: Endpoint) -> tuple[UnitInfo, ...]:
-        return self.declared[end.component].description.units if end.component else self.structure.units
+        return self.declared[end.component].units if end.component else self.structure.units
 
     # ------------------------------------------------------------------ parameters
 
     def _known(self, component: Component) -> Component:
-        variables = self.declared[component.name].variables
-        settings = {name: setting for name, setting in component.settings.items() if name in variables}
+        known = self.declared[component.name].variable
+        settings = {name: setting for name, setting in component.settings.items() if known(name)}
         self.left_out += [f"{component.name}.{name}" for name in component.settings if name not in settings]
         return replace(component, settings=settings)
 
@@ -292,14 +291,14 @@ class Wiring:
             raise CouplingError(f"{end} cannot be set: it {what}; only single numbers are set in a system.")
         value = setting.value
         if isinstance(value, str):
-            items: Mapping[str, int] = self.declared[end.component].items.get(end.variable, {})
+            items = variable.items
             if variable.kind == "Enumeration" and value in items:
                 return float(items[value])
             raise CouplingError(
                 f"{end} cannot be set to {value!r}: it is of the type {variable.kind}"
                 + (f" with the items {listed(items)}." if items else ", and a number is needed.")
             )
-        own = self.declared[end.component].description.units
+        own = self.declared[end.component].units
         units = (*setting.units, *self.structure.units, *own)
         conversion = between(setting.unit, units, variable.unit, own)
         if conversion is None:

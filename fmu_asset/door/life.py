@@ -8,7 +8,7 @@ from typing import Any, NoReturn, Self
 import numpy as np
 import numpy.typing as npt
 
-from fmu_asset.archive.declared import FmuDescription, describe_fmu
+from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.errors import (
     FmuCallError,
@@ -21,7 +21,7 @@ from fmu_asset.errors import (
 from fmu_asset.instances.base import STATUS_NAMES
 from fmu_asset.worker.client import WorkerInstance
 
-from .binding import INPUT_ROLES, Binding, load_binding
+from .binding import Binding, load_binding
 from .exchange import Exchange, Values, plain_values
 from .observation import Observation
 from .placement import Housing, limits_of
@@ -131,32 +131,6 @@ class OpenedFmu(SteppedAsset):
             If a value is not finite, not whole or outside its range.
         """
         self._exchange.settings(parameters)
-
-    def describe(self) -> dict[str, Any]:
-        """Return what the FMU is and how it is bound, as plain records for a listing.
-
-        Returns
-        -------
-        dict
-            `file`, `sha256`, `size`, `guid`, ... as in `FmuDescription`, `variables` as a list of
-            records with their role, and the binding's name, step size and state method.
-        """
-        roles = {
-            scalar.variable: f"{role}.{name}"
-            for role in (*INPUT_ROLES, "parameter", "monitor")
-            for name, scalar in getattr(self._binding, role).items()
-        }
-        for name, vector in self._binding.observation.items():
-            roles.update(dict.fromkeys(vector.variables, f"observation.{name}"))
-        for name, port in self._binding.port.items():
-            for quantity, vector in port.quantities.items():
-                roles.update(dict.fromkeys(vector.variables, f"port.{name}.{quantity}"))
-        return describe_fmu(self._description, roles) | {
-            "binding": self._binding.name,
-            "step_size": self._binding.step_size,
-            "decimation": self._binding.binding.decimation,
-            "state_method": self.state_method,
-        }
 
     # ------------------------------------------------------------------ life
 

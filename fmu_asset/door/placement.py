@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.archive.declared import FmuDescription
-from fmu_asset.archive.extraction import Extraction
+from fmu_asset.archive.fmu_file import extract_fmu
 from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances import open_instance
@@ -26,6 +26,20 @@ from .restart import FirstStep, Instance, ResetTrial, Start, Way
 
 _logger = logging.getLogger(__name__)
 _said: set[str] = set()
+
+
+class Extraction:
+    """An extracted FMU, at `folder`; it is removed when nothing refers to this any more.
+
+    Raises
+    ------
+    FmuFileError
+        If it cannot be extracted.
+    """
+
+    def __init__(self, description: FmuDescription) -> None:
+        self.folder: Path = extract_fmu(description)
+        weakref.finalize(self, remove_folder, self.folder)
 
 
 class Housing:
@@ -164,18 +178,13 @@ class Housing:
         shared = self._extraction
         # After a crash the files of the FMU are not trusted either.
         crashed = self.instance is not None and self.instance.lost
-        if shared is not None and (crashed or not shared.usable):
-            shared = None
-        if shared is not None:
-            shared.hold()
         self.close()
-        if shared is None:
+        if shared is None or crashed or not shared.folder.is_dir():
             shared = Extraction(self._description)
-            shared.hold()
         try:
             instance = self._open(replace(self._plan, folder=str(shared.folder)))
         except BaseException:
-            shared.release()
+            del shared  # so that its folder goes now, and not with the traceback
             raise
         self.instance, self._extraction = instance, shared
         # Also at the end of the interpreter, or when the asset is forgotten without being closed.
@@ -200,7 +209,7 @@ class Housing:
 
     def close(self) -> None:
         """Free the instance, end the worker and remove what nobody else uses."""
-        self.instance = None
+        self.instance = self._extraction = None
         self._release()
 
 
@@ -208,7 +217,6 @@ def _release(instance: Instance, extraction: Extraction) -> None:
     instance.close()
     if isinstance(instance, FmuInstance):
         forget_modules(str(extraction.folder))
-    extraction.release()
 
 
 def say_sandbox(path: Path, grants: Grants | None) -> None:

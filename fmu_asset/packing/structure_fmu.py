@@ -15,7 +15,7 @@ from typing import Literal, TypedDict, Unpack
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
-from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
+from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.compiled.compiler import PLATFORM, Platform
 from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
 from fmu_asset.errors import FmuBuildError, PatchFileError

@@ -4,7 +4,7 @@ from dataclasses import replace
 from math import isfinite
 from typing import Any
 
-from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.coupling.structure import Setting, SettingValue
 from fmu_asset.errors import SspError
 

@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, register_namespace, tostring
 
-from fmu_asset.archive.fmu_file import UnitInfo, VariableInfo
+from fmu_asset.archive.declared import UnitInfo, VariableInfo
 from fmu_asset.coupling.structure import Component, Connection, Endpoint, Setting
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import number
@@ -99,7 +99,7 @@ def _units(wiring: Wiring) -> dict[str, UnitInfo]:
     """Return the units that can be written: with exponents, and meaning the same in all FMUs."""
     found: dict[str, UnitInfo] = {}
     ambiguous = set()
-    sources = [*wiring.structure.units, *(u for d in wiring.declared.values() for u in d.description.units)]
+    sources = [*wiring.structure.units, *(u for d in wiring.declared.values() for u in d.units)]
     for unit in sources:
         if unit.exponents is None:
             continue
@@ -187,7 +187,7 @@ def _type(
         SubElement(element, tag("ssc", "Real"), {} if unit is None else {"unit": unit})
     elif variable.base_type == "Enumeration":
         name = f"{end.component}.{variable.name}"
-        enumerations[name] = wiring.declared[end.component].items.get(variable.name, {})
+        enumerations[name] = variable.items
         SubElement(element, tag("ssc", "Enumeration"), name=name)
     else:
         SubElement(element, tag("ssc", variable.base_type))
@@ -206,7 +206,7 @@ def _component(
         name=component.name,
         type="application/x-fmu-sharedlibrary",
         source=_resource(component),
-        implementation=_IMPLEMENTATIONS[wiring.declared[component.name].description.interface],
+        implementation=_IMPLEMENTATIONS[wiring.declared[component.name].interface],
     )
     used = dict.fromkeys(
         end.variable
@@ -291,8 +291,7 @@ def _parameter_set(wiring: Wiring, names: Mapping[Endpoint, str], units: Mapping
         elif variable.base_type == "Boolean":
             SubElement(parameter, tag("ssv", "Boolean"), value="true" if value else "false")
         elif variable.base_type == "Enumeration":
-            items = wiring.declared[end.component].items.get(variable.name, {})
-            item = next((key for key, number_ in items.items() if number_ == int(value)), None)
+            item = next((key for key, number_ in variable.items.items() if number_ == int(value)), None)
             if item is None:
                 raise SspError(f"{end} = {value:g} is no item of its enumeration.")
             SubElement(parameter, tag("ssv", "Enumeration"), value=item)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_asset.archive.fmu_file import UnitInfo, VariableInfo
+from fmu_asset.archive.declared import UnitInfo, VariableInfo
 from fmu_asset.door.binding import Binding, WorkerLimits, expand, load_binding
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset

@@ -304,16 +304,6 @@ def test_the_fmu_itself_refuses_and_says_why(
         assert after.time == 2.0
 
 
-def test_describe_lists_variables_with_their_roles(fmu: Path, binding: Binding) -> None:
-    record = FmiAsset(fmu, binding).describe()
-    json.dumps(record)
-    roles = {variable["name"]: variable["role"] for variable in record["variables"]}
-    assert roles["load_factor"] == "control.load_factor"
-    assert roles["strain[7]"] == "observation.strain"
-    assert roles["mass.pitot"] == "parameter.pitot_mass"
-    assert record["state_method"] == "serialised"
-
-
 @pytest.mark.parametrize("response", [1.0, 2.0], ids=["quasi-static", "transient"])
 def test_the_load_point_moves_by_its_compliance(
     fmu: Path, binding: Binding, model: ReducedModel, response: float

@@ -16,7 +16,7 @@ from fmpy.ssp.ssd import read_ssd
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.companions.build import build_companion
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import (
