@@ -17,6 +17,8 @@ NUMERIC_KINDS = frozenset(
 )
 _LARGEST_ARRAY = 10_000_000
 FLOAT_KINDS = frozenset({"Real", "Float32", "Float64"})
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+"""In the order of `UnitInfo.exponents`."""
 READABLE = ("output", "local", "calculatedParameter")
 """Causalities of what can be the source of a connection."""
 
@@ -353,11 +355,7 @@ def _variable(declared: Any, dependencies: tuple[str, ...] | None) -> VariableIn
 
 def _unit(declared: Any) -> UnitInfo:
     base = declared.baseUnit
-    exponents = (
-        None
-        if base is None
-        else tuple(int(getattr(base, symbol)) for symbol in ("kg", "m", "s", "A", "K", "mol", "cd", "rad"))
-    )
+    exponents = None if base is None else tuple(int(getattr(base, symbol)) for symbol in BASE_UNITS)
     return UnitInfo(
         name=str(declared.name),
         exponents=exponents,

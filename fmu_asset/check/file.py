@@ -4,8 +4,7 @@ import zipfile
 from collections.abc import Iterator
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription
-from fmu_asset.door.unit_symbols import meaning_of
-from fmu_asset.door.units import contradictions
+from fmu_asset.door.units import contradictions, meaning_of
 from fmu_asset.packing.structure_fmu import recorded_content_hash
 
 from .flight import Told

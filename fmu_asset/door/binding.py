@@ -34,7 +34,7 @@ from fmu_asset.instances.plan import Interface
 from reporting.section import Section, checked
 from reporting.toml_file import read_toml
 
-from .unit_symbols import same_dimension
+from .units import same_dimension
 
 INPUT_ROLES = ("control", "health", "load")
 """Roles whose variables are sent at every step, in the order in which they are sent; ports follow."""

@@ -12,7 +12,7 @@ from fmu_asset.errors import BindingError
 
 from .binding import PORT_QUANTITIES, Binding, parse_binding
 from .exchange import Exchange
-from .unit_symbols import same_dimension
+from .units import same_dimension
 
 _HEALTH = re.compile(r"health|damage|wear|foul|crack|degrad|fault|stiffness_?loss", re.IGNORECASE)
 _LOAD = re.compile(

@@ -4,7 +4,7 @@ from dataclasses import replace
 from math import isfinite
 from typing import Any
 
-from fmu_asset.archive.declared import UnitInfo
+from fmu_asset.archive.declared import BASE_UNITS, UnitInfo
 from fmu_asset.coupling.structure import Setting, SettingValue
 from fmu_asset.errors import SspError
 
@@ -21,9 +21,7 @@ def read_units(root: Any, kind: str) -> tuple[UnitInfo, ...]:
     found = []
     for unit in root.findall(f"{kind}:Units/ssc:Unit", NAMESPACES):
         base = unit.find(tag("ssc", "BaseUnit"))
-        exponents = tuple(
-            int(base.get(symbol, "0")) for symbol in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-        )
+        exponents = tuple(int(base.get(symbol, "0")) for symbol in BASE_UNITS)
         found.append(
             UnitInfo(
                 unit.get("name"),

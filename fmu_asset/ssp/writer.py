@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, register_namespace, tostring
 
-from fmu_asset.archive.declared import UnitInfo, VariableInfo
+from fmu_asset.archive.declared import BASE_UNITS, UnitInfo, VariableInfo
 from fmu_asset.coupling.structure import Component, Connection, Endpoint, Setting
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import number
@@ -18,7 +18,6 @@ from .package import NAMESPACES, OWN_ANNOTATION, OWN_NAMESPACE, SSD_NAME, parse_
 
 SSV_NAME = "resources/parameters.ssv"
 SSM_NAME = "resources/parameters.ssm"
-_SYMBOLS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
 _IMPLEMENTATIONS = {"co-simulation": "CoSimulation", "model-exchange": "ModelExchange"}
@@ -115,7 +114,7 @@ def _write_units(parent: Element, kind: str, units: Mapping[str, UnitInfo]) -> N
     holder = SubElement(parent, tag(kind, "Units"))
     for unit in units.values():
         element = SubElement(holder, tag("ssc", "Unit"), name=unit.name)
-        base = {s: str(power) for s, power in zip(_SYMBOLS, unit.exponents or (), strict=True) if power}
+        base = {s: str(power) for s, power in zip(BASE_UNITS, unit.exponents or (), strict=True) if power}
         if (unit.factor, unit.offset) != (1.0, 0.0):
             base |= {"factor": number(unit.factor), "offset": number(unit.offset)}
         SubElement(element, tag("ssc", "BaseUnit"), base)
