@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fmu_asset.door.binding import INPUT_ROLES, Binding
-from fmu_asset.door.observation import Observation
+from fmu_asset.door.reading import Observation
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.stepped import SteppedAsset
 from fmu_asset.errors import (
@@ -20,11 +20,11 @@ from fmu_asset.errors import (
     IterationError,
 )
 
-from .layout import Layout
-from .roles import Roles, resolve_roles
+from .layout import Part, parts_of
+from .roles import parameter_values, resolve_roles
 from .saved import CoupledState, wiring_hash
 from .schedule import Schedule, loop_sentence
-from .structure import SystemStructure, listed
+from .structure import Endpoint, SystemStructure, listed
 from .wiring import Wiring
 
 Algorithm = Literal["gauss_seidel", "jacobi"]
@@ -97,23 +97,17 @@ class CoupledAsset(SteppedAsset):
         loops = self._wiring.schedule.loops
         if loops and iterations == 1 and not self._jacobi:  # Jacobi delays every connection
             raise AlgebraicLoopError(loop_sentence(loops))
-        self._roles: Roles = resolve_roles(self._wiring, binding)
-        self._ranges = {
-            (role, name): (
-                -math.inf if item.minimum is None else item.minimum,
-                math.inf if item.maximum is None else item.maximum,
-            )
-            for role in INPUT_ROLES
-            for name, item in binding.inputs(role).items()
+        self._roles = resolve_roles(self._wiring, binding)
+        self._parts = parts_of(self._wiring, binding, self._roles)
+        self._take_parameters(parameters or {})
+        self._held = {name: dict(part.constants) for name, part in self._parts.items()}
+        self._now = {end: 0.0 for part in self._parts.values() for end in part.ends}
+        self._before = self._earlier = dict(self._now)
+        self._stepped: set[str] = set()
+        self._assets = {
+            name: self._open(part, isolated=isolated, step_timeout=step_timeout)
+            for name, part in self._parts.items()
         }
-        self._layout = Layout(self._wiring, binding, self._roles)
-        self._parameters = {name: float(value) for name, value in (parameters or {}).items()}
-        self._parameter_values = self._layout.parameters(self._parameters)
-        self._held: list[dict[str, float]] = [dict(constants) for constants in self._layout.constants]
-        self._now = [0.0] * self._layout.output_count
-        self._before = self._earlier = list(self._now)
-        self._stepped: set[int] = set()
-        self._assets = self._open(isolated, step_timeout)
         if iterations > 1:
             self._check_restorable()
         self._digest = wiring_hash(self._wiring, binding, algorithm, iterations, tolerance)
@@ -139,9 +133,7 @@ class CoupledAsset(SteppedAsset):
     def log(self) -> tuple[tuple[str, str], ...]:
         """The last messages of the FMUs: status, and component with text."""
         return tuple(
-            (status, f"{name}: {text}")
-            for name, asset in zip(self._layout.names, self._assets, strict=True)
-            for status, text in asset.log
+            (status, f"{name}: {text}") for name, asset in self._assets.items() for status, text in asset.log
         )
 
     # ------------------------------------------------------------------ life
@@ -149,7 +141,7 @@ class CoupledAsset(SteppedAsset):
     def close(self) -> None:
         """End all workers; the asset can be opened again by `reset`."""
         self._phase = "closed"
-        for asset in self._assets:
+        for asset in self._assets.values():
             asset.close()
 
     def reset(
@@ -166,26 +158,26 @@ class CoupledAsset(SteppedAsset):
         before it. An input whose source comes later starts at the FMU's own start value.
         """
         if parameters is not None:
-            self._parameter_values = self._layout.parameters(parameters)
-            self._parameters = {name: float(value) for name, value in parameters.items()}
-        self._held[:] = [dict(constants) for constants in self._layout.constants]
+            self._take_parameters(parameters)
+        self._held = {name: dict(part.constants) for name, part in self._parts.items()}
         self._place(control, health, load)
         self._phase = "broken"
-        known: set[int] = set()
+        known: set[str] = set()
         try:
-            for index in self._layout.order:
-                start = dict(self._held[index])
-                names, pick = self._layout.fed[index]
-                fed = zip(names, pick.places, pick.of(self._now, self._now), strict=True)
-                start.update({name: value for name, place, value in fed if place in known})
-                self._assets[index].reset(self._settings(index), load=start or None)
-                span = self._layout.spans[index]
-                self._now[span] = self._assets[index].observe().values.tolist()
-                known.update(range(span.start, span.stop))
+            for name in self.schedule.order:
+                part, asset = self._parts[name], self._assets[name]
+                fed = {
+                    variable: port.of(self._now, self._now)
+                    for variable, port in part.fed.items()
+                    if port.end.component in known
+                }
+                asset.reset(self._settings(part), load=(self._held[name] | fed) or None)
+                self._now.update(zip(part.ends, asset.observe().values.tolist(), strict=True))
+                known.add(name)
         except FmuError as error:
             self.close()
-            raise self._named(error, index) from error
-        self._before = list(self._now)
+            raise _named(error, name) from error
+        self._before = dict(self._now)
         self._index = 0
         self._phase = "ready"
 
@@ -209,10 +201,10 @@ class CoupledAsset(SteppedAsset):
         """
         self._opened()
         self._place(control, health, load)
-        self._earlier, self._before = self._before, list(self._now)
+        self._earlier, self._before = self._before, dict(self._now)
         self._stepped.clear()
         self._phase = "broken"
-        for group, circular in self._layout.groups:
+        for group, circular in zip(self.schedule.groups, self.schedule.circular, strict=True):
             if circular and self._iterations > 1:
                 self._iterate(group)
             else:
@@ -238,14 +230,16 @@ class CoupledAsset(SteppedAsset):
         """
         if self._phase != "ready":
             raise FmuStateError("There is no state to save before the first reset or step.")
+        states = [asset.save_state() for asset in self._assets.values()]
         return CoupledState(
             system=self._digest,
             index=self._index,
             parameters=self._parameters,
             held=self._held,
-            outputs=self._now,
-            before=self._before,
-            components=[asset.save_state() for asset in self._assets],
+            outputs=[*self._now.values()],
+            before=[*self._before.values()],
+            sizes=[len(state) for state in states],
+            body=b"".join(states),
         ).to_bytes()
 
     def restore_state(self, content: bytes) -> None:
@@ -261,84 +255,80 @@ class CoupledAsset(SteppedAsset):
             raise FmuStateError(
                 "The state was saved with another system of FMUs, binding or algorithm; use that one."
             )
+        components = saved.components
         self._phase = "broken"
-        self._parameter_values = self._layout.parameters(saved.parameters)
-        self._parameters = dict(saved.parameters)
-        for index, (asset, state) in enumerate(zip(self._assets, saved.components, strict=True)):
+        self._take_parameters(saved.parameters)
+        for (name, asset), state in zip(self._assets.items(), components, strict=True):
             try:
                 asset.restore_state(state)
             except FmuError as error:
-                raise self._named(error, index) from error
-        self._held = [dict(held) for held in saved.held]
-        self._now, self._before = list(saved.outputs), list(saved.before)
+                raise _named(error, name) from error
+        self._held = saved.held
+        self._now = dict(zip(self._now, saved.outputs, strict=True))
+        self._before = dict(zip(self._now, saved.before, strict=True))
         self._index = saved.index
         self._phase = "ready"
 
     # ------------------------------------------------------------------ stepping
 
-    def _pass(self, group: Sequence[int], source: list[float]) -> None:
-        for index in group:
-            held = self._held[index]
-            names, pick = self._layout.fed[index]
-            values = pick.of(source, self._before)
-            asset = self._assets[index]
+    def _pass(self, group: Sequence[str], source: dict[Endpoint, float]) -> None:
+        for name in group:
+            part, asset, held = self._parts[name], self._assets[name], self._held[name]
+            fed = {variable: port.of(source, self._before) for variable, port in part.fed.items()}
             try:
-                if self._layout.linear[index]:
-                    asset.hold(load=dict(zip(names, self._draw(index, values, source), strict=True)))
-                held.update(zip(names, values, strict=True))
+                if part.linear:
+                    asset.hold(load=self._draw(part, fed, source))
+                held.update(fed)
                 seen = asset.step(load=held)
-                for _ in range(self._layout.substeps[index] - 1):
+                for _ in range(part.substeps - 1):
                     seen = asset.step()
             except FmuError as error:
-                raise self._named(error, index) from error
-            self._now[self._layout.spans[index]] = seen.values.tolist()
+                raise _named(error, name) from error
+            self._now.update(zip(part.ends, seen.values.tolist(), strict=True))
             if source is self._now:
-                self._stepped.add(index)
+                self._stepped.add(name)
         self._stepped.update(group)
 
-    def _draw(self, index: int, values: list[float], source: list[float]) -> list[float]:
-        """Return where the lines of the inputs that others feed begin; `values` becomes where they end.
+    def _draw(self, part: Part, fed: dict[str, float], source: dict[Endpoint, float]) -> dict[str, float]:
+        """Return where the lines of the inputs that others feed begin; `fed` becomes where they end.
 
         Where the source is not there yet, its last line goes on, within the range of the input.
         """
-        names, pick = self._layout.fed[index]
-        begins = pick.of(self._before, self._before)
-        earlier = pick.of(self._earlier, self._earlier)
-        for position, tap in enumerate(pick.taps):
-            if not self._layout.moving[index][position]:
-                begins[position] = values[position]
-            elif tap.delayed or source is self._before or self._layout.owner[tap.place] not in self._stepped:
-                low, high = self._assets[index].input_range("load", names[position])
-                values[position] = min(max(2.0 * begins[position] - earlier[position], low), high)
+        begins = {}
+        for variable, port in part.fed.items():
+            begin = begins[variable] = port.of(self._before, self._before)
+            if variable not in part.moving:
+                begins[variable] = fed[variable]
+            elif port.delayed or source is self._before or port.end.component not in self._stepped:
+                low, high = self._assets[part.name].input_range("load", variable)
+                end = 2.0 * begin - port.of(self._earlier, self._earlier)
+                fed[variable] = min(max(end, low), high)
         return begins
 
-    def _iterate(self, group: Sequence[int]) -> None:
+    def _iterate(self, group: Sequence[str]) -> None:
         """Repeat the step of a circle of components until what they exchange has settled."""
-        states = {index: self._assets[index].save_state() for index in group}
-        spans = [self._layout.spans[index] for index in group]
-        own = {place for span in spans for place in range(span.start, span.stop)}
-        watched = sorted(own & {place for index in group for place in self._layout.fed[index][1].places})
+        states = {name: self._assets[name].save_state() for name in group}
+        exchanged = {port.end for name in group for port in self._parts[name].fed.values()}
+        watched = [end for end in self._now if end in exchanged and end.component in group]
         for iteration in range(self._iterations):
-            last = list(self._now)
+            last = dict(self._now)
             if iteration:
-                for index, state in states.items():
+                for name, state in states.items():
                     try:
-                        self._assets[index].restore_state(state)
+                        self._assets[name].restore_state(state)
                     except FmuError as error:
-                        raise self._named(error, index) from error
+                        raise _named(error, name) from error
             self._pass(group, last if self._jacobi else self._now)
-            change = {place: abs(self._now[place] - last[place]) for place in watched}
+            change = {end: abs(self._now[end] - last[end]) for end in watched}
             if iteration and all(
-                size <= self._tolerance * max(1.0, abs(last[place])) for place, size in change.items()
+                size <= self._tolerance * max(1.0, abs(last[end])) for end, size in change.items()
             ):
                 return
         worst = max(watched, key=change.__getitem__)
-        names = listed(self._layout.names[index] for index in group)
-        last_change = f"{self._layout.output_name(worst)} still changes by {change[worst]:.3g}"
         raise IterationError(
-            f"The components {names} did not settle in {self._iterations} iterations of the step from "
-            f"t = {self.time:g} s ({last_change}); allow more iterations or a larger tolerance, make the "
-            "step smaller, or delay one of their connections."
+            f"The components {listed(group)} did not settle in {self._iterations} iterations of the step "
+            f"from t = {self.time:g} s ({worst} still changes by {change[worst]:.3g}); allow more iterations "
+            "or a larger tolerance, make the step smaller, or delay one of their connections."
         )
 
     def _place(
@@ -350,29 +340,29 @@ class CoupledAsset(SteppedAsset):
         for role, values in zip(INPUT_ROLES, (control, health, load), strict=True):
             if not values:
                 continue
-            slots = self._layout.entries[role]
+            slots, items = self._roles.inputs[role], self._binding.inputs(role)
             for name, value in values.items():
-                entries = slots.get(name)
-                if entries is None:
+                if name not in slots:
                     raise BindingError(
                         f"The binding {self._binding.name} has no {role} {name!r}; it has {listed(slots)}."
                     )
                 if not isinstance(value, int | float):
                     raise FmuInputError(f"{role}.{name} must be a number, but is {value!r}.")
-                low, high = self._ranges[role, name]
+                low, high = items[name].ends
                 if value < low or value > high:
                     raise FmuInputError(
                         f"{role}.{name} = {value:g} lies outside {low:g} to {high:g}, its range in the "
                         f"binding {self._binding.name}."
                     )
-                for index, variable, conversion in entries:
-                    self._held[index][variable] = float(conversion.to_fmu(value))
+                for port in slots[name]:
+                    number = float(port.conversion.to_fmu(value))
+                    self._held[port.end.component][port.end.variable] = number
 
     def _observation(self) -> Observation:
         now, before = self._now, self._before
-        names, monitors = self._layout.monitored
-        extra = dict(zip(names, monitors.of(now, before), strict=True))
-        return Observation(np.array(self._layout.observed.of(now, before)), self.time, extra)
+        values = np.array([port.of(now, before) for port in self._roles.observations])
+        extra = {name: port.of(now, before) for name, port in self._roles.monitors.items()}
+        return Observation(values, self.time, extra)
 
     def _opened(self) -> None:
         if self._phase == "broken":
@@ -385,50 +375,48 @@ class CoupledAsset(SteppedAsset):
         if self._phase == "new":
             self.reset()
 
-    def _named(self, error: FmuError, index: int) -> FmuError:
-        sentence = f"component {self._layout.names[index]}: {error.sentence}"
-        return type(error)(sentence, error.messages, error.time)
+    def _open(self, part: Part, *, isolated: bool, step_timeout: float | None) -> FmiAsset:
+        try:
+            return FmiAsset(
+                self._wiring.structure.component(part.name).fmu,
+                part.binding,
+                isolated=isolated,
+                step_timeout=step_timeout,
+                parameters=self._settings(part),
+            )
+        except FmuError as error:
+            raise _named(error, part.name) from error
 
-    def _open(self, isolated: bool, step_timeout: float | None) -> list[FmiAsset]:
-        assets = []
-        for index, component in enumerate(self._wiring.structure.components):
-            try:
-                asset = FmiAsset(
-                    component.fmu,
-                    self._layout.component_binding(index),
-                    isolated=isolated,
-                    step_timeout=step_timeout,
-                    parameters=self._settings(index),
-                )
-            except FmuError as error:
-                raise self._named(error, index) from error
-            assets.append(asset)
-        return assets
+    def _take_parameters(self, given: Mapping[str, float]) -> None:
+        self._tuned = parameter_values(self._binding, self._roles, given)
+        self._parameters = {name: float(value) for name, value in given.items()}
 
-    def _settings(self, index: int) -> dict[str, float]:
-        return {**self._layout.settings[index], **self._parameter_values[index]}
+    def _settings(self, part: Part) -> dict[str, float]:
+        return part.settings | self._tuned.get(part.name, {})
 
     def _check_restorable(self) -> None:
-        for index in {i for group, circular in self._layout.groups if circular for i in group}:
-            if self._assets[index].state_method != "serialised":
-                raise CouplingError(
-                    f"The component {self._layout.names[index]!r} cannot save and restore its state, which "
-                    "iterations need; allow one iteration only, or delay a connection."
-                )
+        for group, circular in zip(self.schedule.groups, self.schedule.circular, strict=True):
+            for name in group if circular else ():
+                if self._assets[name].state_method != "serialised":
+                    raise CouplingError(
+                        f"The component {name!r} cannot save and restore its state, which iterations need; "
+                        "allow one iteration only, or delay a connection."
+                    )
 
     def describe(self) -> dict[str, Any]:
         """Return the system as plain records for a listing."""
         plan = self.schedule
         return {
             "system": self._wiring.structure.name,
-            "components": {
-                name: str(asset.description.path)
-                for name, asset in zip(self._layout.names, self._assets, strict=True)
-            },
+            "components": {name: str(asset.description.path) for name, asset in self._assets.items()},
             "order": list(plan.order),
-            "linear": [name for name, on in zip(self._layout.names, self._layout.linear, strict=True) if on],
+            "linear": [name for name, part in self._parts.items() if part.linear],
             "held": [f"{link.source} -> {link.target}" for link in plan.held],
             "loops": [" -> ".join(str(end) for end in loop) for loop in plan.loops],
             "binding": self._binding.name,
             "step_size": self._interval,
         }
+
+
+def _named(error: FmuError, component: str) -> FmuError:
+    return type(error)(f"component {component}: {error.sentence}", error.messages, error.time)

@@ -1,5 +1,6 @@
 """A binding resolved against a system of FMUs: which ends its roles stand for, and in which units."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from fmu_asset.archive.declared import READABLE, UnitInfo
@@ -78,6 +79,30 @@ def resolve_roles(wiring: Wiring, binding: Binding) -> Roles:
     )
 
 
+def parameter_values(
+    binding: Binding, roles: Roles, given: Mapping[str, float]
+) -> dict[str, dict[str, float]]:
+    """Return the parameters that binding and caller set, by component and variable, in the FMUs' units.
+
+    Raises
+    ------
+    BindingError
+        If the binding has no such parameter.
+    """
+    for name in given:
+        if name not in roles.parameters:
+            raise BindingError(
+                f"The binding {binding.name} has no parameter {name!r}; it has {listed(roles.parameters)}."
+            )
+    fixed = {key: item.value for key, item in binding.parameter.items() if item.value is not None}
+    values: dict[str, dict[str, float]] = {}
+    for key, value in {**fixed, **given}.items():
+        for port in roles.parameters[key]:
+            own = values.setdefault(port.end.component, {})
+            own[port.end.variable] = port.conversion.to_fmu(float(value))
+    return values
+
+
 def _targets(wiring: Wiring, name: str, unit: str, where: str, kind: str) -> tuple[ConnectedVariable, ...]:
     end = wiring.structure.locate(name)
     if not end.component:
@@ -101,7 +126,7 @@ def _targets(wiring: Wiring, name: str, unit: str, where: str, kind: str) -> tup
             f"{where} names {name!r}, which is declared as {variable.causality} of the type {variable.kind}; "
             f"a numeric {kind} is needed."
         )
-    if any(feed.target == end for feed in wiring.feeds):
+    if end in wiring.feeds:
         raise BindingError(f"{where} names {name!r}, which is fed by a connection already.")
     return (ConnectedVariable(end, _unit(unit, variable.unit, wiring, end, where, outward=False), False),)
 

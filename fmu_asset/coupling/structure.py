@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.door.binding import expand
@@ -14,8 +14,7 @@ ConnectorKind = Literal["input", "output", "parameter"]
 SettingValue = float | bool | str
 
 
-@dataclass(frozen=True, order=True)
-class Endpoint:
+class Endpoint(NamedTuple):
     """An end of a connection: a variable of a component, or (`component` empty) a connector of the system."""
 
     component: str

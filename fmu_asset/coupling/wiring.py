@@ -2,6 +2,7 @@
 
 import difflib
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,24 +23,20 @@ _FITS = {
 """For each type of a source, the types of targets that can take it."""
 
 
-class Feed(NamedTuple):
-    """A connection between two components, its units resolved: target = factor * source + offset."""
-
-    source: Endpoint
-    target: Endpoint
-    conversion: Conversion
-    delayed: bool
-
-
 class ConnectedVariable(NamedTuple):
-    """A variable behind a connector of the system.
+    """A variable of a component as it is seen elsewhere, its units resolved.
 
-    variable = factor * connector + offset for inputs and parameters, and the other way round for outputs.
+    variable = factor * connector + offset for inputs and parameters, and the other way round for outputs and
+    what feeds other components.
     """
 
     end: Endpoint
     conversion: Conversion
     delayed: bool
+
+    def of(self, now: Mapping[Endpoint, float], before: Mapping[Endpoint, float]) -> float:
+        """Return the value of an output, from those of this moment and of the beginning of the step."""
+        return self.conversion.to_fmu((before if self.delayed else now)[self.end])
 
 
 class Wiring:
@@ -60,7 +57,7 @@ class Wiring:
         The names of these settings.
     declared : dict of str to FmuDescription
         The FMUs by component.
-    feeds : tuple of Feed
+    feeds : dict of Endpoint to ConnectedVariable
         Connections between components.
     inward : dict of str to tuple of ConnectedVariable
         For each input and parameter of the system, where it goes.
@@ -101,7 +98,7 @@ class Wiring:
         self.settings = {c.name: self._settings(c) for c in structure.components}
         self._connectors = {connector.name: connector for connector in structure.connectors}
         self.units: dict[str, str | None] = {c.name: c.unit for c in structure.connectors}
-        self._joined: list[Feed] = []
+        self.feeds: dict[Endpoint, ConnectedVariable] = {}
         self.inward: dict[str, tuple[ConnectedVariable, ...]] = {
             c.name: () for c in structure.connectors if c.kind != "output"
         }
@@ -109,8 +106,7 @@ class Wiring:
         taken: dict[Endpoint, Endpoint] = {}
         for connection in structure.connections:
             self._connect(connection, taken)
-        self.feeds: tuple[Feed, ...] = tuple(self._joined)
-        links = [Link(feed.source, feed.target) for feed in self.feeds if not feed.delayed]
+        links = [Link(port.end, target) for target, port in self.feeds.items() if not port.delayed]
         self.schedule: Schedule = schedule(names, links, self._feedthrough())
 
     def _feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
@@ -186,7 +182,7 @@ class Wiring:
         source, target = self._readable(connection.source), self._writable(connection.target, ("input",))
         self._fit(connection, source, target)
         conversion = self._converted(connection, source.unit, target.unit)
-        self._joined.append(Feed(connection.source, connection.target, conversion, connection.delayed))
+        self.feeds[connection.target] = ConnectedVariable(connection.source, conversion, connection.delayed)
 
     def _enter(self, connection: Connection) -> None:
         connector = self._connector(connection.source, ("input", "parameter"), "the source")

@@ -22,6 +22,7 @@ displacement and velocity where another FMU can be coupled). `[record]` names va
 FMU's own units, and `[limits]` says what the FMU's worker may take.
 """
 
+import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -76,6 +77,14 @@ class Input(Scalar):
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
             raise ValueError(f"minimum {self.minimum:g} is larger than maximum {self.maximum:g}")
         return self
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The range in `unit`, infinite where it has no end."""
+        return (
+            -math.inf if self.minimum is None else self.minimum,
+            math.inf if self.maximum is None else self.maximum,
+        )
 
 
 class Parameter(Input):

@@ -13,7 +13,7 @@ from reporting.progress import Progress
 from .binding import INPUT_ROLES, Binding
 from .draft import trial_binding
 from .history_file import InputHistories
-from .observation import Observation
+from .reading import Observation
 from .session import FmiAsset
 from .simulation import ObservationHistory
 

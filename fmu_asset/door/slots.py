@@ -2,28 +2,34 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmu_asset.archive.declared import VariableInfo
-from fmu_asset.errors import FmuInputError
+from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
+from fmu_asset.errors import BindingError, FmuInputError
+from fmu_asset.instances.plan import Settings
 
-from .units import Conversion
+from .binding import Binding
+from .layout import find
+from .units import IDENTITY, Conversion
 
 
 class Slot(NamedTuple):
     """Where an input goes: positions in the request block, range in the FMU's unit, conversion."""
 
-    position: int
+    label: str
     positions: Sequence[int]
     low: float
     high: float
     conversion: Conversion
-    label: str
-    whole: bool
-    direct: bool
     variable: VariableInfo
+
+    @property
+    def whole(self) -> bool:
+        """Whether it takes whole numbers only."""
+        return self.variable.kind not in FLOAT_KINDS
 
 
 def checked(slot: Slot, value: float) -> float:
@@ -55,7 +61,7 @@ def put(target: Any, slot: Slot, given: float | Sequence[float]) -> None:
     if len(slot.positions) == 1:
         if not isinstance(given, float | int | str) and np.size(given) == 1:
             given = float(np.ravel(given)[0])
-        target[slot.position] = checked(slot, given)  # type: ignore[arg-type]
+        target[slot.positions[0]] = checked(slot, given)  # type: ignore[arg-type]
         return
     if np.ndim(given) == 0 or len(np.ravel(given)) != len(slot.positions):
         count = 1 if np.ndim(given) == 0 else len(np.ravel(given))
@@ -86,3 +92,33 @@ def value_range(variable: VariableInfo) -> tuple[float, float]:
 def in_unit(variable: VariableInfo) -> str:
     """Return the unit of a variable with a blank before it, for a sentence; nothing if it has none."""
     return "" if variable.unit in (None, "1") else f" {variable.unit}"
+
+
+def configured(description: FmuDescription, binding: Binding) -> tuple[FmuDescription, Settings]:
+    """Return what an FMU declares with the structural parameters of a binding, and what is set for them.
+
+    Raises
+    ------
+    BindingError
+        If the FMU has no such structural parameter, or is run by model exchange.
+    FmuInputError
+        If a value is no whole number or out of range, or makes an array too large.
+    """
+    found: Settings = []
+    lengths: dict[str | None, int] = {}
+    for name, value in binding.binding.structural_parameters.items():
+        label = f"structural_parameters.{name}"
+        where = f"{label} of the binding {binding.name}"
+        variable = find(description, name, where, "structuralParameter").variable
+        number = [0.0]
+        put(number, Slot(label, (0,), *value_range(variable), IDENTITY, variable), value)
+        found.append((variable.kind, variable.reference, number))
+        lengths[name] = int(number[0])
+    if not lengths:
+        return description, found
+    if description.interface == "model-exchange":
+        raise BindingError(
+            f"{description.path} is run by model exchange; structural parameters are set in co-simulation "
+            "only."
+        )
+    return replace(description, variables=tuple(v.resized(lengths) for v in description.variables)), found

@@ -398,8 +398,8 @@ def test_nested_systems_parameters_and_mappings(theirs: Pack, tmp_path: Path) ->
     assert wiring.settings["damage"] == {
         "initial.z1": pytest.approx(0.4), "initial.z2": pytest.approx(0.04), "seed": 17.0,
     }  # fmt: skip
-    (feed,) = wiring.feeds
-    assert (str(feed.source), str(feed.target)) == ("damage.z1", "structure.wing.health.z1")
+    ((target, feed),) = wiring.feeds.items()
+    assert (str(feed.end), str(target)) == ("damage.z1", "structure.wing.health.z1")
     assert feed.conversion == (0.5, 0.0)
     assert wiring.outward["loss"].conversion == (pytest.approx(100.0), 0.0)
     assert {str(port.end): port.conversion for port in wiring.inward["n"]} == {
