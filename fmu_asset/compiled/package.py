@@ -6,19 +6,18 @@ from importlib.metadata import distribution, version
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
+from xml.etree.ElementTree import Element, SubElement
 
 from fe.runtime.reduced_arrays import ReducedArrays
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
-from fmu_asset.description import documentation_page, model_description
+from fmu_asset.description import arrays_of, documentation_page, model_description, xml_bytes
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.table import Roles
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
-from .arrays import arrays_of
 from .compiler import PLATFORM, Platform, compile_library
 from .data_file import data_file_bytes
-from .description3 import build_description, model_description3
 from .exchange import exchange_table
 from .variable_header import variable_sources
 
@@ -110,31 +109,22 @@ def compiled_members(
     listed = sorted(name for name in sources if name.endswith(".c"))
     sources["CMakeLists.txt"] = _cmake_lists(identifier, listed, fmi)
     if fmi == 3:
-        sources["buildDescription.xml"] = build_description(identifier, listed)
-        model_description_text = model_description3(
-            model_name=model_name,
-            identifier=identifier,
-            guid=placeholder,
-            table=table,
-            arrays=arrays,
-            units=units,
-            description=description,
-            version=version("uav-twin"),
-        )
-    else:
-        model_description_text = model_description(
-            model_name=model_name,
-            identifier=identifier,
-            guid=placeholder,
-            table=table,
-            units=units,
-            description=description,
-            version=version("uav-twin"),
-            generation_tool="uav-twin",
-            source_files=listed,
-        )
+        sources["buildDescription.xml"] = _build_description(identifier, listed)
+    described = model_description(
+        model_name=model_name,
+        identifier=identifier,
+        guid=placeholder,
+        table=table,
+        units=units,
+        description=description,
+        version=version("uav-twin"),
+        generation_tool="uav-twin",
+        source_files=listed,
+        fmi=fmi,
+        arrays=arrays,
+    )
     return {
-        "modelDescription.xml": model_description_text,
+        "modelDescription.xml": described,
         "documentation/index.html": documentation_page(
             table, description, host=HOST, fmi=fmi, interface=interface
         ),
@@ -143,6 +133,16 @@ def compiled_members(
         **{f"sources/{name}": content for name, content in sources.items()},
         **{f"sources/{name}": content for name, content in fmi_headers(fmi).items()},
     }
+
+
+def _build_description(identifier: str, source_files: Sequence[str]) -> bytes:
+    """Return sources/buildDescription.xml: which sources the binary of that identifier is made of."""
+    root = Element("fmiBuildDescription", fmiVersion="3.0")
+    configuration = SubElement(root, "BuildConfiguration", modelIdentifier=identifier)
+    listed = SubElement(configuration, "SourceFileSet", language="C11")
+    for name in source_files:
+        SubElement(listed, "SourceFile", name=name)
+    return xml_bytes(root)
 
 
 def _cmake_lists(identifier: str, names: Sequence[str], fmi: FmiVersion) -> bytes:

@@ -3,11 +3,9 @@
 import math
 from collections.abc import Iterable, Sequence
 
-from fmu_asset.description import LOG_CATEGORIES
+from fmu_asset.description import LOG_CATEGORIES, ArrayVariable
 from fmu_asset.slaves.table import Roles
 from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable
-
-from .arrays import ArrayVariable
 
 _NOTE = "/* Made by the build of the FMU from its table of variables; a change here is lost. */\n"
 

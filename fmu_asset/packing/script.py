@@ -18,10 +18,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from xml.etree.ElementTree import Element, SubElement
 
 from fmu_asset.archive.declared import BASE_UNITS
-from fmu_asset.description import number
+from fmu_asset.description import number, xml_bytes
 from fmu_asset.errors import FmuBuildError
 
 from .contents import (
@@ -171,8 +171,7 @@ def _description(file: Path, model: type[Any], identifier: str) -> bytes:
     for index, variable in enumerate(variables, 1):
         if variable.get("causality") == "output":
             SubElement(unknowns, "Unknown", index=str(index))
-    indent(root)
-    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
+    return xml_bytes(root)
 
 
 def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Element:

@@ -4,12 +4,12 @@ import os
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from xml.etree.ElementTree import Element, SubElement, indent, register_namespace, tostring
+from xml.etree.ElementTree import Element, SubElement, register_namespace
 
 from fmu_asset.archive.declared import BASE_UNITS, UnitInfo, VariableInfo
 from fmu_asset.coupling.structure import Component, Connection, Endpoint, Setting
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.description import number
+from fmu_asset.description import number, xml_bytes
 from fmu_asset.errors import SspError
 from fmu_asset.packing.contents import archive_bytes
 from reporting.files import atomic_write_bytes
@@ -69,9 +69,9 @@ def ssp_bytes(
     names = dict(parameter_names or {})
     units = _units(wiring)
     members = {
-        SSD_NAME: _xml(_description(wiring, units, stop_time)),
-        SSV_NAME: _xml(_parameter_set(wiring, names, units)),
-        SSM_NAME: _xml(_mapping(wiring, names)),
+        SSD_NAME: xml_bytes(_description(wiring, units, stop_time)),
+        SSV_NAME: xml_bytes(_parameter_set(wiring, names, units)),
+        SSM_NAME: xml_bytes(_mapping(wiring, names)),
     }
     for name, kind in ((SSD_NAME, "ssd"), (SSV_NAME, "ssv"), (SSM_NAME, "ssm")):
         validate(parse_xml(members[name], name), kind, name)
@@ -87,11 +87,6 @@ def _resource(component: Component) -> str:
             f"The component {component.name!r} needs a name of ASCII letters, digits, `_` and `-`."
         )
     return f"resources/{plain}.fmu"
-
-
-def _xml(root: Element) -> bytes:
-    indent(root)
-    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
 
 
 def _units(wiring: Wiring) -> dict[str, UnitInfo]:
