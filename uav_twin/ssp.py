@@ -40,13 +40,11 @@ def export(
 ) -> None:
     """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
     from fmu_asset.errors import SspError
+    from fmu_asset.packing.contents import checked_target
     from twin_master.assets.system_export import export_design, export_scenario
     from twin_master.scenario.reading import load_scenario
 
-    if out.suffix != ".ssp":
-        raise SspError(f"An SSP file must have the suffix .ssp, but {out} was given.")
-    if out.exists() and not replace:
-        raise SspError(f"{out} exists: choose another --out or give --replace.")
+    checked_target(out, replace=replace, what="An SSP file", suffix=".ssp", error=SspError)
     progress = terminal.progress()
     if _is_design(what):
         design = None if what == "uav_wing" else Path(what)

@@ -15,7 +15,7 @@ from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.resources import files
 from pathlib import Path
 
-from fmu_asset.errors import FmuBuildError
+from fmu_asset.errors import FmuBuildError, FmuError
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
 
@@ -58,19 +58,26 @@ class FmuInfo:
     size: int
 
 
-def checked_target(path: str | os.PathLike[str], *, replace: bool) -> Path:
-    """Return where an FMU may be written.
+def checked_target(
+    path: str | os.PathLike[str],
+    *,
+    replace: bool,
+    what: str = "An FMU",
+    suffix: str = ".fmu",
+    error: type[FmuError] = FmuBuildError,
+) -> Path:
+    """Return where an FMU, or something else with a suffix of its own, may be written.
 
     Raises
     ------
-    FmuBuildError
+    error
         If the suffix is wrong, or the file exists and may not be replaced.
     """
     target = Path(path)
-    if target.suffix != ".fmu":
-        raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
+    if target.suffix != suffix:
+        raise error(f"{what} must have the suffix {suffix}, but {target} was given.")
     if target.exists() and not replace:
-        raise FmuBuildError(f"{target} exists: choose another name, or give --replace.")
+        raise error(f"{target} exists: choose another --out or give --replace.")
     return target
 
 

@@ -235,7 +235,7 @@ def test_files_are_not_overwritten_unasked(structure: SystemStructure, tmp_path:
     wiring = Wiring(structure)
     path = write_ssp(wiring, tmp_path / "x.ssp")
     before = path.read_bytes()
-    with pytest.raises(SspError, match="exists: choose another name"):
+    with pytest.raises(SspError, match="exists: choose another --out"):
         write_ssp(wiring, path)
     with pytest.raises(SspError, match=r"suffix \.ssp"):
         write_ssp(wiring, tmp_path / "x.zip")
