@@ -103,7 +103,8 @@ def simulate(
     import tempfile
 
     from fmu_asset.coupling.asset import CoupledAsset
-    from fmu_asset.coupling.experiment import fly_system, system_experiment
+    from fmu_asset.coupling.experiment import system_experiment
+    from fmu_asset.door.experiment import fly
     from fmu_asset.door.history_file import write_history
     from fmu_asset.ssp.check import join_ssp, left_out_sentence
     from fmu_asset.ssp.reader import read_ssp
@@ -125,7 +126,7 @@ def simulate(
             isolated=not in_process,
             parameters=planned.parameters,
         ) as asset:
-            history = fly_system(asset, planned, terminal.progress())
+            history = fly(asset, planned, terminal.progress())
             if out is not None:
                 write_history(out, asset, (file.name, hash_file(file)), history)
             if plot is not None:

@@ -2,23 +2,27 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import numpy as np
 
-from fmu_asset.door.binding import INPUT_ROLES, Binding
+from fmu_asset.door.binding import Binding
+from fmu_asset.door.exchange import Inputs, Values
 from fmu_asset.door.reading import Observation
 from fmu_asset.door.session import FmiAsset
+from fmu_asset.door.simulation import ObservationHistory
 from fmu_asset.door.stepped import SteppedAsset
 from fmu_asset.errors import (
     AlgebraicLoopError,
     BindingError,
     CouplingError,
+    FmuEndedError,
     FmuError,
     FmuInputError,
     FmuStateError,
     IterationError,
 )
+from reporting.progress import Progress, SilentProgress
 
 from .layout import Part, parts_of
 from .roles import parameter_values, resolve_roles
@@ -82,7 +86,7 @@ class CoupledAsset(SteppedAsset):
         tolerance: float = 1e-9,
         isolated: bool = True,
         step_timeout: float | None = None,
-        parameters: Mapping[str, float] | None = None,
+        parameters: Values | None = None,
     ) -> None:
         if algorithm not in ALGORITHMS:
             raise CouplingError(f"The algorithm must be one of {listed(ALGORITHMS)}, and {algorithm!r} came.")
@@ -144,14 +148,7 @@ class CoupledAsset(SteppedAsset):
         for asset in self._assets.values():
             asset.close()
 
-    def reset(
-        self,
-        parameters: Mapping[str, float] | None = None,
-        *,
-        control: Mapping[str, float] | None = None,
-        health: Mapping[str, float] | None = None,
-        load: Mapping[str, float] | None = None,
-    ) -> None:
+    def reset(self, parameters: Values | None = None, **inputs: Unpack[Inputs]) -> None:
         """Go back to the start; arguments and errors are those of `FmiAsset.reset`.
 
         The components are initialised in the order of `schedule`; each takes the initial outputs of those
@@ -160,7 +157,7 @@ class CoupledAsset(SteppedAsset):
         if parameters is not None:
             self._take_parameters(parameters)
         self._held = {name: dict(part.constants) for name, part in self._parts.items()}
-        self._place(control, health, load)
+        self._place(inputs)
         self._phase = "broken"
         known: set[str] = set()
         try:
@@ -200,7 +197,7 @@ class CoupledAsset(SteppedAsset):
             If a circle of components does not settle.
         """
         self._opened()
-        self._place(control, health, load)
+        self._place({"control": control, "health": health, "load": load})
         self._earlier, self._before = self._before, dict(self._now)
         self._stepped.clear()
         self._phase = "broken"
@@ -217,6 +214,39 @@ class CoupledAsset(SteppedAsset):
         """Return the observation of this moment without a step."""
         self._opened()
         return self._observation()
+
+    def simulate(self, *, steps: int | None = None, progress: Progress | None = None) -> ObservationHistory:
+        """Make many steps of the system from where it is, its inputs held.
+
+        Where an FMU ends its simulation, the result ends with the step before and says so in `ended`.
+
+        Parameters
+        ----------
+        steps : int, optional
+            Number of steps N; one if absent.
+        progress : Progress, optional
+            Where progress is shown.
+
+        Raises
+        ------
+        FmuError
+            As `step`.
+        """
+        count, seen, ended = steps or 1, [], ""
+        with (progress or SilentProgress()).stage("Simulating", total=count, unit="steps") as stage:
+            for _ in range(count):
+                try:
+                    seen.append(self.step())
+                except FmuEndedError as error:
+                    ended = error.sentence
+                    break
+                stage.advance()
+        return ObservationHistory(
+            np.array([item.time for item in seen]),
+            np.array([item.values for item in seen]).reshape(len(seen), len(self._roles.observations)),
+            {name: np.array([item.extra[name] for item in seen]) for name in self._roles.monitors},
+            ended,
+        )
 
     # ------------------------------------------------------------------ state
 
@@ -331,24 +361,17 @@ class CoupledAsset(SteppedAsset):
             "or a larger tolerance, make the step smaller, or delay one of their connections."
         )
 
-    def _place(
-        self,
-        control: Mapping[str, float] | None,
-        health: Mapping[str, float] | None,
-        load: Mapping[str, float] | None,
-    ) -> None:
-        for role, values in zip(INPUT_ROLES, (control, health, load), strict=True):
-            if not values:
-                continue
-            slots, items = self._roles.inputs[role], self._binding.inputs(role)
-            for name, value in values.items():
+    def _place(self, inputs: Mapping[str, Any]) -> None:
+        for role, values in inputs.items():
+            slots = self._roles.inputs.get(role, {})
+            for name, value in (values or {}).items():
                 if name not in slots:
                     raise BindingError(
                         f"The binding {self._binding.name} has no {role} {name!r}; it has {listed(slots)}."
                     )
                 if not isinstance(value, int | float):
                     raise FmuInputError(f"{role}.{name} must be a number, but is {value!r}.")
-                low, high = items[name].ends
+                low, high = self._binding.inputs(role)[name].ends
                 if value < low or value > high:
                     raise FmuInputError(
                         f"{role}.{name} = {value:g} lies outside {low:g} to {high:g}, its range in the "
@@ -387,7 +410,7 @@ class CoupledAsset(SteppedAsset):
         except FmuError as error:
             raise _named(error, part.name) from error
 
-    def _take_parameters(self, given: Mapping[str, float]) -> None:
+    def _take_parameters(self, given: Mapping[str, Any]) -> None:
         self._tuned = parameter_values(self._binding, self._roles, given)
         self._parameters = {name: float(value) for name, value in given.items()}
 

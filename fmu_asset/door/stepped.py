@@ -2,9 +2,14 @@
 
 from abc import ABC, abstractmethod
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, Self, Unpack
+
+from reporting.progress import Progress
 
 from .binding import Binding
+from .exchange import Inputs, Values
+from .reading import Observation
+from .simulation import ObservationHistory
 
 
 class SteppedAsset(ABC):
@@ -37,8 +42,16 @@ class SteppedAsset(ABC):
         """Units of `Observation.extra` by name."""
 
     @abstractmethod
-    def reset(self) -> None:
+    def reset(self, parameters: Values | None = None, **inputs: Unpack[Inputs]) -> None:
         """Go back to the start."""
+
+    @abstractmethod
+    def observe(self) -> Observation:
+        """Return the observation of this moment without a step."""
+
+    @abstractmethod
+    def simulate(self, *, steps: int | None = None, progress: Progress | None = None) -> ObservationHistory:
+        """Make many steps from where the asset is, its inputs held."""
 
     @abstractmethod
     def close(self) -> None:
