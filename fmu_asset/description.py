@@ -2,12 +2,13 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from html import escape
+from importlib.metadata import version
 from itertools import groupby
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from fmu_asset.slaves.variables import ENUMERATIONS, UNITS, EnumerationType, FmuVariable, Unit
+from fmu_asset.slaves.variables import ENUMERATIONS, EnumerationType, FmuVariable, Unit
 
 _ELEMENT = re.compile(r"(?P<stem>.+)(?:\[(?P<index>[0-9]+)\]|\.(?P<label>[^.]+))")
 LOG_CATEGORIES = {
@@ -17,6 +18,43 @@ LOG_CATEGORIES = {
     "logStatusFatal": "Log messages with fmi2Fatal status.",
     "logAll": "Log all messages.",
 }
+
+
+PLACEHOLDER = "0_content_0_"
+"""Stands for the tag, the first characters of the content hash, until that is known."""
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What an FMU declares, whatever it is made of.
+
+    Attributes
+    ----------
+    name : str
+        Model name, with which the model identifier begins.
+    description : str
+        One sentence for people.
+    table : tuple of FmuVariable
+        The variables, in order of their value reference. Local ones are states, and then as many derivatives.
+    units : tuple of Unit
+        Units of the table.
+    enumerations : tuple of EnumerationType
+        Enumerations of the table.
+    dependencies : mapping of str to sequence of str
+        For each output, the inputs that it depends on directly; an output that is missing depends on all.
+    """
+
+    name: str
+    description: str
+    table: tuple[FmuVariable, ...]
+    units: tuple[Unit, ...]
+    enumerations: tuple[EnumerationType, ...] = ENUMERATIONS
+    dependencies: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @property
+    def identifier(self) -> str:
+        """Model identifier, the stem of the binary, before the content hash is known."""
+        return f"{self.name}_{PLACEHOLDER}"
 
 
 def number(value: float) -> str:
@@ -79,41 +117,26 @@ def _label(name: str) -> str:
 
 
 def model_description(
+    declared: Declaration,
     *,
-    identifier: str,
-    guid: str,
-    table: Sequence[FmuVariable],
-    description: str,
-    version: str,
     generation_tool: str,
     source_files: Sequence[str] = (),
-    model_name: str = "uav_wing",
-    units: Sequence[Unit] = UNITS,
-    enumerations: Sequence[EnumerationType] = ENUMERATIONS,
-    dependencies: Mapping[str, Sequence[str]] | None = None,
     fmi: int = 2,
     arrays: Sequence[ArrayVariable] = (),
 ) -> bytes:
     """Return modelDescription.xml of an FMU: for co-simulation, or with states for model exchange.
 
+    The placeholder stands for what the content hash will give. There is no generation date: equal content
+    gives equal bytes.
+
     Parameters
     ----------
-    identifier : str
-        Model identifier: the stem of the binary.
-    guid : str
-        Globally unique identifier or instantiation token, here a hash of the content.
-    table : sequence of FmuVariable
-        The variables, in order of their value reference. Local ones are states, and then as many derivatives.
-    description, version, generation_tool : str
-        Attributes of the root element. There is no generation date: equal content gives equal bytes.
+    declared : Declaration
+        The model.
+    generation_tool : str
+        Attribute of the root element.
     source_files : sequence of str
         C sources in the folder `sources`; an FMU with none needs Python to run.
-    model_name : str
-        Attribute of the root element.
-    units, enumerations
-        Units and enumerations that the table uses.
-    dependencies : mapping of str to sequence of str, optional
-        For each output, the inputs that it depends on directly; an output that is missing depends on all.
     fmi : {2, 3}
         Version of FMI.
     arrays : sequence of ArrayVariable
@@ -125,27 +148,26 @@ def model_description(
         UTF-8 XML.
     """
     inner = {row.reference for array in arrays for row in array.rows[1:]}
-    rows = [row for row in table if row.reference not in inner]
+    rows = [row for row in declared.table if row.reference not in inner]
     root = Element(
         "fmiModelDescription",
         {
             "fmiVersion": f"{fmi}.0",
-            "modelName": model_name,
-            "guid" if fmi == 2 else "instantiationToken": guid,
-            "description": description,
-            "version": version,
+            "modelName": declared.name,
+            "guid" if fmi == 2 else "instantiationToken": PLACEHOLDER,
+            "description": declared.description,
+            "version": version("uav-twin"),
             "generationTool": generation_tool,
             "variableNamingConvention": "structured",
         },
     )
     if fmi == 2:
         root.set("numberOfEventIndicators", "0")
-    _add_interface(
-        root, identifier, source_files, fmi, exchange=any(row.causality == "local" for row in rows)
-    )
-    _add_units(root, units)
+    exchange = any(row.causality == "local" for row in rows)
+    _add_interface(root, declared.identifier, source_files, fmi, exchange=exchange)
+    _add_units(root, declared.units)
     types = SubElement(root, "TypeDefinitions")
-    for enumeration in enumerations:
+    for enumeration in declared.enumerations:
         said = {"name": enumeration.name, "description": enumeration.description}
         if fmi == 2:
             items = SubElement(SubElement(types, "SimpleType", said), "Enumeration")
@@ -158,33 +180,36 @@ def model_description(
         SubElement(categories, "Category", name=name, description=text.replace("fmi2", f"fmi{fmi}"))
     SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="50.0", stepSize="1.0")
     _add_variables(root, rows, {array.rows[0].reference: array for array in arrays}, fmi)
-    _add_structure(root, rows, dependencies or {}, fmi)
+    _add_structure(root, rows, declared.dependencies, fmi)
     return xml_bytes(root)
+
+
+_ABILITIES_2 = ("canNotUseMemoryManagementFunctions", "canGetAndSetFMUstate", "canSerializeFMUstate")
+_ABILITIES_3 = (
+    "canGetAndSetFMUState",
+    "canSerializeFMUState",
+    "providesDirectionalDerivatives",
+    "providesAdjointDerivatives",
+)
+_NO_NOTICE = {"completedIntegratorStepNotNeeded": "true"}
 
 
 def _add_interface(
     root: Element, identifier: str, source_files: Sequence[str], fmi: int, *, exchange: bool
 ) -> None:
-    state = "FMUstate" if fmi == 2 else "FMUState"
+    source, steps = "true" if source_files else "false", {"canHandleVariableCommunicationStepSize": "true"}
     said = {
         "modelIdentifier": identifier,
         "needsExecutionTool": "false" if source_files else "true",
         "canBeInstantiatedOnlyOncePerProcess": "false",
-        f"canGetAndSet{state}": "true",
-        f"canSerialize{state}": "true",
     }
-    if not exchange:
-        said["canHandleVariableCommunicationStepSize"] = "true"
-    if source_files:
-        said["providesDirectionalDerivative" if fmi == 2 else "providesDirectionalDerivatives"] = "true"
-    if fmi == 3:
-        said["providesAdjointDerivatives"] = "true"
+    if fmi == 2:
+        said |= dict.fromkeys(_ABILITIES_2, "true")
+        said |= _NO_NOTICE if exchange else {**steps, "canInterpolateInputs": source}
+        if source_files:
+            said["providesDirectionalDerivative"] = "true"
     else:
-        said["canNotUseMemoryManagementFunctions"] = "true"
-        if exchange:
-            said["completedIntegratorStepNotNeeded"] = "true"
-        else:
-            said["canInterpolateInputs"] = "true" if source_files else "false"
+        said |= dict.fromkeys(_ABILITIES_3, "true") | ({} if exchange else steps)
     interface = SubElement(root, "ModelExchange" if exchange else "CoSimulation", said)
     if fmi == 2 and source_files:
         listed = SubElement(interface, "SourceFiles")
@@ -282,18 +307,11 @@ _WRITERS: Mapping[str, Callable[[float], str]] = {
 
 
 def documentation_page(
-    table: Sequence[FmuVariable],
-    description: str,
-    *,
-    model_name: str = "uav_wing",
-    enumerations: Sequence[EnumerationType] = ENUMERATIONS,
-    host: str = "It runs in a Python host that has NumPy.",
-    fmi: int = 2,
-    interface: str = "co-simulation",
+    declared: Declaration, host: str, *, fmi: int = 2, interface: str = "co-simulation"
 ) -> bytes:
     """Return documentation/index.html: what the FMU is and its variables, as UTF-8 without any request."""
     rows = []
-    for row in table:
+    for row in declared.table:
         start = "" if row.start is None else f"{row.start:g}"
         limits = "".join(
             f"{sign} {value:g} "
@@ -304,15 +322,15 @@ def documentation_page(
         rows.append("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>")
     statuses = "".join(
         f"<li>{enumeration.name} {value} ({name}): {escape(text)}</li>"
-        for enumeration in enumerations
+        for enumeration in declared.enumerations
         for name, value, text in enumeration.items
     )
     body = "\n".join(rows)
     page = f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{model_name}</title>
+<html lang="en"><head><meta charset="utf-8"><title>{declared.name}</title>
 <style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
 td,th{{text-align:left;padding:.2em .8em .2em 0;border-bottom:1px solid #ddd}}</style></head><body>
-<h1>{model_name}</h1><p>{escape(description)}</p>
+<h1>{declared.name}</h1><p>{escape(declared.description)}</p>
 <p>FMI {fmi}.0 {interface}. {escape(host)} A call that is refused logs why, sets
 <code>status</code> and leaves state and outputs as they were; a refused step returns fmi{fmi}Discard.</p>
 <table><tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>meaning</th></tr>

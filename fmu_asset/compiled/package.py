@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from importlib.metadata import distribution, version
+from importlib.metadata import distribution
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -10,11 +10,17 @@ from xml.etree.ElementTree import Element, SubElement
 
 from fe.runtime.reduced_arrays import ReducedArrays
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
-from fmu_asset.description import arrays_of, documentation_page, model_description, xml_bytes
+from fmu_asset.description import (
+    Declaration,
+    arrays_of,
+    documentation_page,
+    model_description,
+    xml_bytes,
+)
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.table import Roles
-from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
+from fmu_asset.slaves.variables import FmuVariable
 
 from .compiler import PLATFORM, Platform, compile_library
 from .data_file import data_file_bytes
@@ -54,34 +60,22 @@ HOST = "It is compiled C and needs nothing but the C library; its sources are in
 
 def compiled_members(
     model: ReducedArrays,
-    table: Sequence[FmuVariable],
+    declared: Declaration,
     roles: Roles,
     *,
-    units: Sequence[Unit] = UNITS,
-    model_name: str,
-    placeholder: str,
-    description: str,
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
 ) -> dict[str, bytes]:
-    """Return the files of a compiled FMU, all but its binary.
+    """Return the files of a compiled FMU, all but its binary; a placeholder stands for the content hash.
 
     Parameters
     ----------
     model : ReducedArrays
         The reduced structure.
-    table : sequence of FmuVariable
-        The variables, in order of their value reference.
+    declared : Declaration
+        What it declares for co-simulation.
     roles : Roles
-        Which of them is what.
-    units : sequence of Unit
-        Units of the table.
-    model_name : str
-        Model name, with which the model identifier begins.
-    placeholder : str
-        Stands for the GUID, the end of the identifier and the mark of saved states.
-    description : str
-        One sentence for people.
+        Which of its variables is what.
     fmi : {2, 3}
         Version of FMI: the same sources but for its functions. In 3 numbered variables, and inputs and
         outputs such as `health.z1`, pass as arrays.
@@ -98,36 +92,23 @@ def compiled_members(
     FmuBuildError
         If fmpy's headers are missing.
     """
-    sources, identifier = _sources(fmi), f"{model_name}_{placeholder}"
+    sources, table = _sources(fmi), declared.table
     if interface == "model-exchange":
         table = exchange_table(table, model.mode_count, arrays=fmi == 3)
     if fmi == 3:
         table = (*table, replace(_TIME, reference=len(table)))
+    declared = replace(declared, table=table)
     arrays = arrays_of(table) if fmi == 3 else ()
-    made = variable_sources(table, roles, guid=placeholder, content_tag=placeholder, arrays=arrays)
-    sources |= {name: text.encode() for name, text in made.items()}
+    sources |= variable_sources(table, roles, arrays)
     listed = sorted(name for name in sources if name.endswith(".c"))
-    sources["CMakeLists.txt"] = _cmake_lists(identifier, listed, fmi)
+    sources["CMakeLists.txt"] = _cmake_lists(declared.identifier, listed, fmi)
     if fmi == 3:
-        sources["buildDescription.xml"] = _build_description(identifier, listed)
-    described = model_description(
-        model_name=model_name,
-        identifier=identifier,
-        guid=placeholder,
-        table=table,
-        units=units,
-        description=description,
-        version=version("uav-twin"),
-        generation_tool="uav-twin",
-        source_files=listed,
-        fmi=fmi,
-        arrays=arrays,
-    )
+        sources["buildDescription.xml"] = _build_description(declared.identifier, listed)
     return {
-        "modelDescription.xml": described,
-        "documentation/index.html": documentation_page(
-            table, description, host=HOST, fmi=fmi, interface=interface
+        "modelDescription.xml": model_description(
+            declared, generation_tool="uav-twin", source_files=listed, fmi=fmi, arrays=arrays
         ),
+        "documentation/index.html": documentation_page(declared, HOST, fmi=fmi, interface=interface),
         DATA_FILE: data_file_bytes(model),
         f"resources/{DESIGN_RECORD}": design_record(model.design_hash),
         **{f"sources/{name}": content for name, content in sources.items()},

@@ -21,11 +21,11 @@ from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 from fmu_asset.archive.declared import BASE_UNITS
-from fmu_asset.description import number, xml_bytes
+from fmu_asset.description import PLACEHOLDER, number, xml_bytes
 from fmu_asset.errors import FmuBuildError
 
 from .contents import (
-    PLACEHOLDER,
+    BASE_CLASS_FILES,
     FmuInfo,
     checked_target,
     pythonfmu_members,
@@ -111,7 +111,9 @@ def _members(file: Path, source: bytes) -> dict[str, bytes]:
         f"{runtime}/__init__.py": _RUNTIME.encode(),
         f"{runtime}/model.py": source,
     }
-    return members | pythonfmu_members(module, "resources/pythonfmu", ["__init__.py"])
+    return members | pythonfmu_members(
+        module, "resources/pythonfmu", ("__init__.py", "builder.py", "osutil.py", *BASE_CLASS_FILES)
+    )
 
 
 def _model_class(file: Path) -> type[Any]:
