@@ -161,15 +161,13 @@ def conversion(
         for name, factor, offset in own.displays:
             if name == unit and factor:  # display = factor * value + offset
                 return Conversion(1.0 / factor, -offset / factor)
-    target = meaning(variable.unit, definitions)
-    source = meaning(unit, definitions)
-    if source is None or target is None or source[0] != target[0]:
+    found = between(unit, definitions, variable.unit, definitions)
+    if found is None:
         raise BindingError(
             f"{where} is in {unit!r}, but the FMU has {variable.name!r} in {variable.unit!r}, and there is "
             f"no conversion between the two; state the value in {variable.unit!r}."
         )
-    # SI = factor * value + offset, for both
-    return Conversion(source[1] / target[1], (source[2] - target[2]) / target[1])
+    return found
 
 
 def contradictions(definitions: Sequence[UnitInfo]) -> list[str]:
