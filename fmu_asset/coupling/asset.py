@@ -160,20 +160,21 @@ class CoupledAsset(SteppedAsset):
         self._place(inputs)
         self._phase = "broken"
         known: set[str] = set()
-        try:
-            for name in self.schedule.order:
-                part, asset = self._parts[name], self._assets[name]
-                fed = {
-                    variable: port.of(self._now, self._now)
-                    for variable, port in part.fed.items()
-                    if port.end.component in known
-                }
-                asset.reset(self._settings(part), load=(self._held[name] | fed) or None)
-                self._now.update(zip(part.ends, asset.observe().values.tolist(), strict=True))
-                known.add(name)
-        except FmuError as error:
-            self.close()
-            raise _named(error, name) from error
+        for name in self.schedule.order:
+            part, asset = self._parts[name], self._assets[name]
+            fed = {
+                variable: port.of(self._now, self._now)
+                for variable, port in part.fed.items()
+                if port.end.component in known
+            }
+            try:
+                with _naming(name):
+                    asset.reset(self._settings(part), load=(self._held[name] | fed) or None)
+                    self._now.update(zip(part.ends, asset.observe().values.tolist(), strict=True))
+            except FmuError:
+                self.close()
+                raise
+            known.add(name)
         self._before = dict(self._now)
         self._index = 0
         self._phase = "ready"
@@ -289,10 +290,8 @@ class CoupledAsset(SteppedAsset):
         self._phase = "broken"
         self._take_parameters(saved.parameters)
         for (name, asset), state in zip(self._assets.items(), components, strict=True):
-            try:
+            with _naming(name):
                 asset.restore_state(state)
-            except FmuError as error:
-                raise _named(error, name) from error
         self._held = saved.held
         self._now = dict(zip(self._now, saved.outputs, strict=True))
         self._before = dict(zip(self._now, saved.before, strict=True))
@@ -305,15 +304,13 @@ class CoupledAsset(SteppedAsset):
         for name in group:
             part, asset, held = self._parts[name], self._assets[name], self._held[name]
             fed = {variable: port.of(source, self._before) for variable, port in part.fed.items()}
-            try:
+            with _naming(name):
                 if part.linear:
                     asset.hold(load=self._draw(part, fed, source))
                 held.update(fed)
                 seen = asset.step(load=held)
                 for _ in range(part.substeps - 1):
                     seen = asset.step()
-            except FmuError as error:
-                raise _named(error, name) from error
             self._now.update(zip(part.ends, seen.values.tolist(), strict=True))
             if source is self._now:
                 self._stepped.add(name)
@@ -344,10 +341,8 @@ class CoupledAsset(SteppedAsset):
             last = dict(self._now)
             if iteration:
                 for name, state in states.items():
-                    try:
+                    with _naming(name):
                         self._assets[name].restore_state(state)
-                    except FmuError as error:
-                        raise _named(error, name) from error
             self._pass(group, last if self._jacobi else self._now)
             change = {end: abs(self._now[end] - last[end]) for end in watched}
             if iteration and all(
@@ -399,7 +394,7 @@ class CoupledAsset(SteppedAsset):
             self.reset()
 
     def _open(self, part: Part, *, isolated: bool, step_timeout: float | None) -> FmiAsset:
-        try:
+        with _naming(part.name):
             return FmiAsset(
                 self._wiring.structure.component(part.name).fmu,
                 part.binding,
@@ -407,8 +402,6 @@ class CoupledAsset(SteppedAsset):
                 step_timeout=step_timeout,
                 parameters=self._settings(part),
             )
-        except FmuError as error:
-            raise _named(error, part.name) from error
 
     def _take_parameters(self, given: Mapping[str, Any]) -> None:
         self._tuned = parameter_values(self._binding, self._roles, given)
@@ -441,5 +434,15 @@ class CoupledAsset(SteppedAsset):
         }
 
 
-def _named(error: FmuError, component: str) -> FmuError:
-    return type(error)(f"component {component}: {error.sentence}", error.messages, error.time)
+class _naming:  # noqa: N801 - a block, and cheaper than one made of a generator
+    """Name the component in an error of its FMU."""
+
+    def __init__(self, component: str) -> None:
+        self._component = component
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, FmuError):
+            sentence = f"component {self._component}: {error.sentence}"
+            raise type(error)(sentence, error.messages, error.time) from error
