@@ -32,6 +32,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
+from fmu_asset.worker.client import WorkerLimits
 from reporting.section import Section, checked
 from reporting.toml_file import read_toml
 
@@ -197,31 +198,6 @@ class Record(Section):
     """The table `[record]`: further variables to be recorded, in the FMU's own units."""
 
     variables: _Names = ()
-
-
-class WorkerLimits(Section):
-    """The table `[limits]`: what the FMU's worker may take; what is not said is the default.
-
-    Attributes
-    ----------
-    step_time, load_time : float or None
-        Wall clock for one step, and for loading and initialisation [s].
-    memory : float or None
-        Resident memory [MiB].
-    sandbox : bool
-        Whether the system keeps the FMU from the user's files, from programs and from the network.
-    read, write, ports, programs
-        What it may touch all the same; see `Grants` of the worker.
-    """
-
-    step_time: _Positive | None = None
-    load_time: _Positive | None = None
-    memory: _Positive | None = None
-    sandbox: bool = True
-    read: _Texts = ()
-    write: _Texts = ()
-    ports: Annotated[tuple[Annotated[int, Field(ge=1, le=65535)], ...], Field(strict=False)] = ()
-    programs: bool = False
 
 
 class Header(Section):

@@ -18,7 +18,7 @@ from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance, forget_modules
 from fmu_asset.instances.plan import Plan
-from fmu_asset.worker.client import Limits, WorkerInstance
+from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 
 from .binding import Binding
@@ -51,7 +51,7 @@ class Housing:
         The FMU.
     plan : Plan
         What is exchanged; its folder is still empty.
-    limits : Limits
+    limits : WorkerLimits
         What a worker may take.
     isolated : bool
         Whether there is a worker.
@@ -64,7 +64,9 @@ class Housing:
         Whether the FMU's reset works.
     """
 
-    def __init__(self, description: FmuDescription, plan: Plan, limits: Limits, *, isolated: bool) -> None:
+    def __init__(
+        self, description: FmuDescription, plan: Plan, limits: WorkerLimits, *, isolated: bool
+    ) -> None:
         self._description, self._plan, self._limits, self._isolated = description, plan, limits, isolated
         self._extraction: Extraction | None = None
         self._release: Callable[[], object] = lambda: None
@@ -194,7 +196,7 @@ class Housing:
     def _open(self, plan: Plan) -> Instance:
         if not self._isolated:
             return open_instance(plan)
-        grants = self._limits.sandbox
+        grants = self._limits.grants
         if grants is not None and (missing := missing_path(grants, plan.folder)):
             raise FmuInputError(
                 f"The table [limits] of the binding grants {missing!r}, which does not exist; correct it."
@@ -237,7 +239,7 @@ def say_sandbox(path: Path, grants: Grants | None) -> None:
 
 def limits_of(
     binding: Binding, step_timeout: float | None, load_timeout: float | None, memory_limit: float | None
-) -> Limits:
+) -> WorkerLimits:
     """Return what the caller says, else what the binding says, else the defaults.
 
     Raises
@@ -246,14 +248,11 @@ def limits_of(
         If one is not positive.
     """
     given = {"step_timeout": step_timeout, "load_timeout": load_timeout, "memory_limit": memory_limit}
-    for name, value in given.items():
+    changed = {}
+    for (name, value), key in zip(given.items(), ("step_time", "load_time", "memory"), strict=True):
         if value is not None and not (math.isfinite(value) and value > 0.0):
             unit = "MiB" if name == "memory_limit" else "seconds"
             raise FmuInputError(f"{name} must be a positive number of {unit}, but is {value!r}.")
-    own, default = binding.limits, Limits()
-    return Limits(
-        step_time=step_timeout or own.step_time or default.step_time,
-        load_time=load_timeout or own.load_time or default.load_time,
-        memory=memory_limit or own.memory or default.memory,
-        sandbox=Grants(own.read, own.write, own.ports, own.programs) if own.sandbox else None,
-    )
+        if value is not None:
+            changed[key] = value
+    return binding.limits.model_copy(update=changed)

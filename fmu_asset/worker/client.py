@@ -7,14 +7,17 @@ import os
 import select
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from fmu_asset import errors
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.folders import remove_folder
 from fmu_asset.instances.plan import Plan, Settings
 from fmu_asset.instances.series import REPORT_PERIOD, Series
+from reporting.section import Section
 
 from .process import CLOSE_LIMIT, WorkerProcess
 from .protocol import (
@@ -45,9 +48,12 @@ _ERRORS: Mapping[str, type[FmuError]] = {
 }
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What a worker may take.
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_Paths = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(strict=False)]
+
+
+class WorkerLimits(Section):
+    """The table `[limits]` of a binding: what the FMU's worker may take.
 
     Attributes
     ----------
@@ -57,14 +63,25 @@ class Limits:
         Wall clock for loading, instantiation, initialisation and reset [s].
     memory : float
         Resident memory [MiB].
-    sandbox : Grants or None
-        What it may touch beyond what every FMU may; None for all that its user may.
+    sandbox : bool
+        Whether the system keeps the FMU from the user's files, from programs and from the network.
+    read, write, ports, programs
+        What it may touch all the same; see `Grants`.
     """
 
-    step_time: float = 60.0
-    load_time: float = 60.0
-    memory: float = 4096.0
-    sandbox: Grants | None = field(default_factory=Grants)
+    step_time: _Positive = 60.0
+    load_time: _Positive = 60.0
+    memory: _Positive = 4096.0
+    sandbox: bool = True
+    read: _Paths = ()
+    write: _Paths = ()
+    ports: Annotated[tuple[Annotated[int, Field(ge=1, le=65535)], ...], Field(strict=False)] = ()
+    programs: bool = False
+
+    @property
+    def grants(self) -> Grants | None:
+        """What it may touch beyond what every FMU may; None for all that its user may."""
+        return Grants(self.read, self.write, self.ports, self.programs) if self.sandbox else None
 
 
 class WorkerInstance:
@@ -76,7 +93,7 @@ class WorkerInstance:
         What is exchanged.
     scratch : Path
         Folder of the worker alone; it is removed when the worker ends.
-    limits : Limits
+    limits : WorkerLimits
         What it may take.
 
     Attributes
@@ -92,7 +109,7 @@ class WorkerInstance:
         If the FMU cannot be instantiated.
     """
 
-    def __init__(self, plan: Plan, scratch: Path, *, limits: Limits) -> None:
+    def __init__(self, plan: Plan, scratch: Path, *, limits: WorkerLimits) -> None:
         self.request = (ctypes.c_double * (2 + plan.input_count))()
         self.reply = (ctypes.c_double * max(plan.output_count, 1))()
         self._request = memoryview(self.request).cast("B")
@@ -106,7 +123,7 @@ class WorkerInstance:
         self._lost = False
         # An exception between question and answer, such as an interruption, leaves the two out of step.
         self._busy = False
-        self._process = WorkerProcess(scratch, plan.folder, limits.sandbox)
+        self._process = WorkerProcess(scratch, plan.folder, limits.grants)
         self._out, self._in = self._process.outgoing, self._process.incoming
         # The worker may leave it at half an answer.
         os.set_blocking(self._in, False)
