@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from fmu_asset.errors import FmuInputError, visible
+from fmu_asset.errors import FmuInputError, FmuUnsupportedError, visible
 from fmu_asset.instances.plan import Interface
 
 NUMERIC_KINDS = frozenset(
@@ -236,7 +236,7 @@ class FmuDescription:
 
 
 def read_declared(
-    declared: Any, root: Element, file: Path, archive: Mapping[str, Any], interface: Interface
+    declared: Any, root: Element, archive: Mapping[str, Any], wanted: Interface | None
 ) -> FmuDescription:
     """Return the description of an FMU from what fmpy has read.
 
@@ -246,16 +246,32 @@ def read_declared(
         As fmpy reads it.
     root : Element
         The XML itself, for what fmpy leaves out.
-    file : Path
-        The FMU.
     archive : mapping
-        `sha256`, `file_size` and `platforms`.
-    interface : {"co-simulation", "model-exchange"}
-        How it is to be run; it offers that.
+        `path`, `sha256`, `file_size` and `platforms`.
+    wanted : {"co-simulation", "model-exchange"} or None
+        How it is to be run; co-simulation if it has that.
+
+    Raises
+    ------
+    FmuUnsupportedError
+        If it does not offer that.
     """
-    chosen = declared.coSimulation if interface == "co-simulation" else declared.modelExchange
-    experiment = declared.defaultExperiment
-    offered = {"co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange}
+    offered: dict[Interface, Any] = {
+        "co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange
+    }  # fmt: skip
+    there: list[Interface] = [name for name, given in offered.items() if given is not None]
+    if not there:
+        raise FmuUnsupportedError(
+            f"{archive['path']} offers neither co-simulation nor model exchange (scheduled execution is not "
+            "supported); export it for co-simulation."
+        )
+    if wanted is not None and wanted not in there:
+        raise FmuUnsupportedError(
+            f"{archive['path']} offers {there[0]} only, but the binding asks for {wanted}; change "
+            "`interface` there, or export the FMU anew."
+        )
+    interface = wanted or there[0]
+    chosen, experiment = offered[interface], declared.defaultExperiment
     # fmpy does not read the capabilities of FMI 1.
     capabilities = root.find("Implementation//Capabilities")
     vary = getattr(chosen, "canHandleVariableCommunicationStepSize", True)
@@ -265,10 +281,6 @@ def read_declared(
         lines = lines or capabilities.get("canInterpolateInputs") in ("true", "1")
     # FMI 1 always wants it.
     completed = bool(getattr(chosen, "needsCompletedIntegratorStep", False)) or declared.fmiVersion == "1.0"
-
-    def of_experiment(attribute: str) -> float | None:
-        value = getattr(experiment, attribute, None)
-        return None if value is None else float(value)
 
     # fmpy 0.3.32 passes over the range of unsigned integers.
     unsigned = {e.get("name"): e for e in root.iterfind("ModelVariables/*") if e.tag.startswith("UInt")}
@@ -280,18 +292,14 @@ def read_declared(
         for unknown in declared.outputs
         if unknown.variable is not None and unknown.dependencies is not None
     }
-    fixed = getattr(chosen, "fixedInternalStepSize", None)
     return FmuDescription(
-        path=file,
-        sha256=archive["sha256"],
-        file_size=archive["file_size"],
+        **archive,
         fmi_version=str(declared.fmiVersion),
         model_name=str(declared.modelName),
         model_identifier=str(chosen.modelIdentifier),
         guid=str(declared.guid),
         description=str(declared.description or ""),
         generation_tool=str(declared.generationTool or ""),
-        platforms=archive["platforms"],
         can_get_and_set_state=bool(chosen.canGetAndSetFMUstate),
         can_serialise_state=bool(chosen.canSerializeFMUstate),
         can_vary_step=bool(vary),
@@ -301,15 +309,15 @@ def read_declared(
         ),
         units=tuple(_unit(unit) for unit in declared.unitDefinitions),
         interface=interface,
-        interfaces=tuple(name for name, given in offered.items() if given is not None),
+        interfaces=tuple(there),
         needs_tool=bool(chosen.needsExecutionTool)
         or root.find("Implementation/CoSimulation_Tool") is not None,
         once_per_process=bool(getattr(chosen, "canBeInstantiatedOnlyOncePerProcess", False)),
-        start_time=of_experiment("startTime"),
-        stop_time=of_experiment("stopTime"),
-        step_size=of_experiment("stepSize"),
-        tolerance=of_experiment("tolerance"),
-        fixed_step=None if fixed is None else float(fixed),
+        start_time=_number(experiment, "startTime"),
+        stop_time=_number(experiment, "stopTime"),
+        step_size=_number(experiment, "stepSize"),
+        tolerance=_number(experiment, "tolerance"),
+        fixed_step=_number(chosen, "fixedInternalStepSize"),
         states=int(declared.numberOfContinuousStates),
         event_indicators=int(declared.numberOfEventIndicators),
         completed_step=completed,
@@ -324,14 +332,17 @@ def _checked(name: str, shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(shape)
 
 
+def _number(owner: Any, attribute: str) -> float | None:
+    value = getattr(owner, attribute, None)
+    return None if value is None else float(value)
+
+
 def _variable(declared: Any, dependencies: tuple[str, ...] | None) -> VariableInfo:
     declared_type = declared.declaredType
 
-    def of(attribute: str) -> Any:
-        value = getattr(declared, attribute)
-        return (
-            getattr(declared_type, attribute, None) if value is None and declared_type is not None else value
-        )
+    def owner(attribute: str) -> Any:
+        """Return who says something: the variable, or else its type."""
+        return declared_type if getattr(declared, attribute) is None else declared
 
     return VariableInfo(
         name=str(declared.name),
@@ -340,10 +351,10 @@ def _variable(declared: Any, dependencies: tuple[str, ...] | None) -> VariableIn
         causality=str(declared.causality or "local"),
         variability=str(declared.variability or "continuous"),
         description=str(declared.description or ""),
-        unit=of("unit"),
-        display_unit=of("displayUnit"),
-        minimum=None if of("min") is None else float(of("min")),
-        maximum=None if of("max") is None else float(of("max")),
+        unit=getattr(owner("unit"), "unit", None),
+        display_unit=getattr(owner("displayUnit"), "displayUnit", None),
+        minimum=_number(owner("min"), "min"),
+        maximum=_number(owner("max"), "max"),
         start=None if declared.start is None else str(declared.start),
         shape=_checked(declared.name, declared.shape or ()),
         dimensions=tuple(d.variable and str(d.variable.name) for d in declared.dimensions or ()),

@@ -10,7 +10,6 @@ import stat
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
-from typing import Any
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 from fmpy import platform as fmi_platform
@@ -94,12 +93,11 @@ def inspect_fmu(
         )
     try:
         declared = read_model_description(str(file), validate=False)
-        offered = _offered(file, declared, interface)
         platforms = tuple(
             sorted({PurePosixPath(name).parts[1] for name in names if re.match(r"binaries/[^/]+/.+", name)})
         )
-        archive = {"sha256": sha256, "file_size": size, "platforms": platforms}
-        description = read_declared(declared, root, file, archive, offered)
+        archive = {"path": file, "sha256": sha256, "file_size": size, "platforms": platforms}
+        description = read_declared(declared, root, archive, interface)
     except FmuUnsupportedError:
         raise
     except Exception as error:
@@ -118,25 +116,6 @@ def inspect_fmu(
         f"{file} has no binary for this platform ({binary} is not in it; binaries there: {there}); "
         f"export it for {here}."
     )
-
-
-def _offered(file: Path, declared: Any, wanted: Interface | None) -> Interface:
-    """Return the interface to use."""
-    offered: dict[Interface, Any] = {
-        "co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange
-    }  # fmt: skip
-    there: list[Interface] = [name for name, given in offered.items() if given is not None]
-    if not there:
-        raise FmuUnsupportedError(
-            f"{file} offers neither co-simulation nor model exchange (scheduled execution is not supported); "
-            "export it for co-simulation."
-        )
-    if wanted is not None and wanted not in there:
-        raise FmuUnsupportedError(
-            f"{file} offers {there[0]} only, but the binding asks for {wanted}; change `interface` there, or "
-            "export the FMU anew."
-        )
-    return wanted or there[0]
 
 
 def extract_fmu(description: FmuDescription) -> Path:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
+import numpy as np
+
 from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError, FmuFileError
 from fmu_asset.instances.plan import Group
@@ -102,10 +104,7 @@ def _element(description: FmuDescription, name: str, label: str) -> tuple[Variab
             f"{label} names {name!r}, but {variable.name!r} has {' x '.join(map(str, variable.shape))} "
             "elements, counted from 1."
         )
-    flat = 0
-    for i, length in zip(index, variable.shape, strict=True):
-        flat = flat * length + i - 1
-    return variable, flat
+    return variable, int(np.ravel_multi_index([i - 1 for i in index], variable.shape))
 
 
 class BlockLayout:
