@@ -1,12 +1,17 @@
 """What goes into the compiled FMU: description, sources, FMI headers, data file."""
 
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.metadata import distribution
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+import numpy.typing as npt
 
 from fe.runtime.reduced_arrays import ReducedArrays
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
@@ -20,12 +25,121 @@ from fmu_asset.description import (
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.table import Roles
-from fmu_asset.slaves.variables import FmuVariable
+from fmu_asset.slaves.variables import TRANSIENT, FmuVariable
 
 from .compiler import PLATFORM, Platform, compile_library
-from .data_file import data_file_bytes
-from .exchange import exchange_table
 from .variable_header import variable_sources
+
+FloatArray = npt.NDArray[np.float64]
+
+MAGIC = b"UAVTWIN\0"
+VERSION = 2
+NAME_BYTES = 32
+_COUNT = struct.Struct("<II")
+
+
+_UNUSED = ("nominal", "damping", "validity_box", "followed_shapes")
+"""What the sources take from the variables, or do not need."""
+
+
+def data_file_bytes(model: ReducedArrays) -> bytes:
+    """Return the content of the data file of a model; equal models give equal bytes.
+
+    Parameters
+    ----------
+    model : ReducedArrays
+        The reduced structure. Its arrays are written under their names, scalars as arrays without dimension,
+        and how many of each kind can be chosen in the place of names; arrays without values are left out.
+
+    Returns
+    -------
+    bytes
+        Magic, version, arrays, CRC-32.
+    """
+    values: dict[str, Any] = {item.name: getattr(model, item.name) for item in fields(ReducedArrays)}
+    values["chosen_counts"] = tuple(
+        len(names) for names in (model.parameters, model.regions, model.masses, model.controls)
+    )
+    values["gauge_count"] = len(model.gauges)
+    arrays = {
+        name: np.asarray(value, dtype=np.float64)
+        for name, value in values.items()
+        if name not in _UNUSED and not isinstance(value, str) and np.size(value)
+    }
+    return pack_arrays(arrays)
+
+
+def pack_arrays(arrays: Mapping[str, FloatArray]) -> bytes:
+    """Return arrays as the bytes of a data file.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        The arrays by name, at most 31 ASCII letters; float64.
+
+    Returns
+    -------
+    bytes
+        The file.
+    """
+    parts = [MAGIC, _COUNT.pack(VERSION, len(arrays))]
+    for name in sorted(arrays):
+        array = arrays[name]
+        parts.append(name.encode("ascii")[: NAME_BYTES - 1].ljust(NAME_BYTES, b"\0"))
+        parts.append(_COUNT.pack(array.ndim, 0))
+        parts.append(struct.pack(f"<{array.ndim}Q", *array.shape))
+        parts.append(np.ascontiguousarray(array, dtype="<f8").tobytes())
+    content = b"".join(parts)
+    return content + struct.pack("<I", zlib.crc32(content))
+
+
+STATES = ("modal_displacement", "modal_velocity")
+
+
+def exchange_table(
+    table: Sequence[FmuVariable], mode_count: int, *, arrays: bool = False
+) -> tuple[FmuVariable, ...]:
+    """Return the table for model exchange.
+
+    Parameters
+    ----------
+    table : sequence of FmuVariable
+        That of co-simulation.
+    mode_count : int
+        Number M of modes.
+    arrays : bool
+        Whether the rows are to become arrays, whose derivative is an array too.
+
+    Returns
+    -------
+    tuple of FmuVariable
+        The same with discrete health and the transient response, then 2 M states (coordinates of the modes
+        and their rates, mass-normalised) and as many derivatives of them.
+    """
+    rows = []
+    for row in table:
+        if row.causality == "input" and row.name.startswith("health."):
+            row = replace(row, variability="discrete")
+        elif row.name == "response":
+            row = replace(row, start=float(TRANSIENT))
+        rows.append(row)
+    states = [f"{name}[{mode}]" for name in STATES for mode in range(1, mode_count + 1)]
+    rates = [f"der({name})[{mode}]" for name in STATES for mode in range(1, mode_count + 1)]
+    for name in (*states, *(rates if arrays else (f"der({state})" for state in states))):
+        what = "Coordinate" if "displacement" in name else "Rate of the coordinate"
+        text = f"{what} of mode {name.partition('[')[2].partition(']')[0]}, mass-normalised"
+        rows.append(
+            FmuVariable(
+                name=name,
+                reference=len(rows),
+                kind="Real",
+                causality="local",
+                variability="continuous",
+                description=f"Derivative of: {text}" if name.startswith("der(") else text,
+            )
+        )
+    return tuple(rows)
+
 
 DATA_FILE = "resources/reduced_model.bin"
 

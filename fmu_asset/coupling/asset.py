@@ -10,8 +10,7 @@ from fmu_asset.door.binding import Binding
 from fmu_asset.door.exchange import Inputs, Values
 from fmu_asset.door.reading import Observation
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.simulation import ObservationHistory
-from fmu_asset.door.stepped import SteppedAsset
+from fmu_asset.door.simulation import ObservationHistory, SteppedAsset
 from fmu_asset.errors import (
     AlgebraicLoopError,
     BindingError,

@@ -12,9 +12,19 @@ from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
 from .binding import INPUT_ROLES, Binding, Input
-from .layout import BlockLayout, Place, element_names, find, start_values
+from .layout import (
+    BlockLayout,
+    Place,
+    Slot,
+    configured,
+    element_names,
+    find,
+    in_unit,
+    put,
+    start_values,
+    value_range,
+)
 from .reading import OutputTable, Selection
-from .slots import Slot, configured, in_unit, put, value_range
 from .units import IDENTITY, conversion
 
 _LARGEST = sys.float_info.max

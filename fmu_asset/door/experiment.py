@@ -15,8 +15,7 @@ from .draft import trial_binding
 from .history_file import InputHistories
 from .reading import Observation
 from .session import FmiAsset
-from .simulation import ObservationHistory
-from .stepped import SteppedAsset
+from .simulation import ObservationHistory, SteppedAsset
 
 _STEPS = 500
 _MOST_STEPS = 10_000_000

@@ -23,11 +23,10 @@ from fmu_asset.worker.client import WorkerInstance
 
 from .binding import Binding, load_binding
 from .exchange import Exchange, Inputs, Values, plain_values
-from .placement import Housing, limits_of
+from .placement import Housing, Instance, ResetTrial, Start, limits_of
 from .reading import Observation, Reader
-from .restart import Instance, ResetTrial, Start
 from .saved_state import StateMethod
-from .stepped import SteppedAsset
+from .simulation import SteppedAsset
 
 _LOG_LENGTH = 200
 

@@ -10,8 +10,8 @@ from reporting.progress import Progress, SilentProgress, Stage
 
 from .exchange import Values, plain_values
 from .life import OpenedFmu
+from .placement import Instance
 from .reading import Observation
-from .restart import Instance
 from .saved_state import SavedState
 from .simulation import Histories, ObservationHistory, blocks, request_rows
 

@@ -19,10 +19,9 @@ from fmu_asset.coupling.structure import (
 )
 from reporting.files import atomic_write_bytes
 
-from .flatten import flat_connections, flat_settings
 from .package import FMU_TYPE, INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
 from .parameters import VALUE_TYPES, flag, read_bindings, read_transformation, read_units
-from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree
+from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree, flat_connections, flat_settings
 
 
 @dataclass(frozen=True)
