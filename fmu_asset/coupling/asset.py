@@ -23,11 +23,11 @@ from fmu_asset.errors import (
 )
 from reporting.progress import Progress, SilentProgress
 
-from .layout import Part, parts_of
+from .layout import FloatArray, Part, Taps, parts_of
 from .roles import parameter_values, resolve_roles
 from .saved import CoupledState, wiring_hash
 from .schedule import Schedule, loop_sentence
-from .structure import Endpoint, SystemStructure, listed
+from .structure import SystemStructure, listed
 from .wiring import Wiring
 
 Algorithm = Literal["gauss_seidel", "jacobi"]
@@ -104,8 +104,16 @@ class CoupledAsset(SteppedAsset):
         self._parts = parts_of(self._wiring, binding, self._roles)
         self._take_parameters(parameters or {})
         self._held = {name: dict(part.constants) for name, part in self._parts.items()}
-        self._now = {end: 0.0 for part in self._parts.values() for end in part.ends}
-        self._before = self._earlier = dict(self._now)
+        self._ends = [end for part in self._parts.values() for end in part.ends]
+        place = {end: index for index, end in enumerate(self._ends)}
+        self._spans = {
+            name: slice(place[part.ends[0]], place[part.ends[-1]] + 1) for name, part in self._parts.items()
+        }
+        self._taps = {name: Taps(part.fed.values(), place) for name, part in self._parts.items()}
+        self._observed = Taps(self._roles.observations, place)
+        self._monitored = Taps(self._roles.monitors.values(), place)
+        self._now = np.zeros(len(self._ends))
+        self._before = self._earlier = self._now.copy()
         self._stepped: set[str] = set()
         self._assets = {
             name: self._open(part, isolated=isolated, step_timeout=step_timeout)
@@ -161,20 +169,17 @@ class CoupledAsset(SteppedAsset):
         known: set[str] = set()
         for name in self.schedule.order:
             part, asset = self._parts[name], self._assets[name]
-            fed = {
-                variable: port.of(self._now, self._now)
-                for variable, port in part.fed.items()
-                if port.end.component in known
-            }
+            values = self._fed(part, self._now, self._now)
+            fed = {key: values[key] for key, port in part.fed.items() if port.end.component in known}
             try:
                 with _naming(name):
                     asset.reset(self._settings(part), load=(self._held[name] | fed) or None)
-                    self._now.update(zip(part.ends, asset.observe().values.tolist(), strict=True))
+                    self._now[self._spans[name]] = asset.observe().values
             except FmuError:
                 self.close()
                 raise
             known.add(name)
-        self._before = dict(self._now)
+        self._before = self._now.copy()
         self._index = 0
         self._phase = "ready"
 
@@ -198,7 +203,7 @@ class CoupledAsset(SteppedAsset):
         """
         self._opened()
         self._place({"control": control, "health": health, "load": load})
-        self._earlier, self._before = self._before, dict(self._now)
+        self._earlier, self._before = self._before, self._now.copy()
         self._stepped.clear()
         self._phase = "broken"
         for group, circular in zip(self.schedule.groups, self.schedule.circular, strict=True):
@@ -265,9 +270,9 @@ class CoupledAsset(SteppedAsset):
             system=self._digest,
             index=self._index,
             parameters=self._parameters,
-            held=self._held,
-            outputs=[*self._now.values()],
-            before=[*self._before.values()],
+            held={name: dict(sorted(held.items())) for name, held in self._held.items()},
+            outputs=self._now.tolist(),
+            before=self._before.tolist(),
             sizes=[len(state) for state in states],
             body=b"".join(states),
         ).to_bytes()
@@ -292,17 +297,16 @@ class CoupledAsset(SteppedAsset):
             with _naming(name):
                 asset.restore_state(state)
         self._held = saved.held
-        self._now = dict(zip(self._now, saved.outputs, strict=True))
-        self._before = dict(zip(self._now, saved.before, strict=True))
+        self._now, self._before = np.array(saved.outputs), np.array(saved.before)
         self._index = saved.index
         self._phase = "ready"
 
     # ------------------------------------------------------------------ stepping
 
-    def _pass(self, group: Sequence[str], source: dict[Endpoint, float]) -> None:
+    def _pass(self, group: Sequence[str], source: FloatArray) -> None:
         for name in group:
             part, asset, held = self._parts[name], self._assets[name], self._held[name]
-            fed = {variable: port.of(source, self._before) for variable, port in part.fed.items()}
+            fed = self._fed(part, source, self._before)
             with _naming(name):
                 if part.linear:
                     asset.hold(load=self._draw(part, fed, source))
@@ -310,24 +314,30 @@ class CoupledAsset(SteppedAsset):
                 seen = asset.step(load=held)
                 for _ in range(part.substeps - 1):
                     seen = asset.step()
-            self._now.update(zip(part.ends, seen.values.tolist(), strict=True))
+            self._now[self._spans[name]] = seen.values
             if source is self._now:
                 self._stepped.add(name)
         self._stepped.update(group)
 
-    def _draw(self, part: Part, fed: dict[str, float], source: dict[Endpoint, float]) -> dict[str, float]:
+    def _fed(self, part: Part, now: FloatArray, before: FloatArray) -> dict[str, float]:
+        """Return what the inputs of a component are fed, by their names."""
+        if not part.fed:
+            return {}
+        return dict(zip(part.fed, self._taps[part.name].of(now, before).tolist(), strict=True))
+
+    def _draw(self, part: Part, fed: dict[str, float], source: FloatArray) -> dict[str, float]:
         """Return where the lines of the inputs that others feed begin; `fed` becomes where they end.
 
         Where the source is not there yet, its last line goes on, within the range of the input.
         """
-        begins = {}
+        begins = self._fed(part, self._before, self._before)
+        earlier = self._fed(part, self._earlier, self._earlier)
         for variable, port in part.fed.items():
-            begin = begins[variable] = port.of(self._before, self._before)
             if variable not in part.moving:
                 begins[variable] = fed[variable]
             elif port.delayed or source is self._before or port.end.component not in self._stepped:
                 low, high = self._assets[part.name].input_range("load", variable)
-                end = 2.0 * begin - port.of(self._earlier, self._earlier)
+                end = 2.0 * begins[variable] - earlier[variable]
                 fed[variable] = min(max(end, low), high)
         return begins
 
@@ -335,24 +345,23 @@ class CoupledAsset(SteppedAsset):
         """Repeat the step of a circle of components until what they exchange has settled."""
         states = {name: self._assets[name].save_state() for name in group}
         exchanged = {port.end for name in group for port in self._parts[name].fed.values()}
-        watched = [end for end in self._now if end in exchanged and end.component in group]
+        watched = [i for i, end in enumerate(self._ends) if end in exchanged and end.component in group]
         for iteration in range(self._iterations):
-            last = dict(self._now)
+            last = self._now.copy()
             if iteration:
                 for name, state in states.items():
                     with _naming(name):
                         self._assets[name].restore_state(state)
             self._pass(group, last if self._jacobi else self._now)
-            change = {end: abs(self._now[end] - last[end]) for end in watched}
-            if iteration and all(
-                size <= self._tolerance * max(1.0, abs(last[end])) for end, size in change.items()
-            ):
+            change = np.abs(self._now - last)[watched]
+            if iteration and (change <= self._tolerance * np.maximum(1.0, np.abs(last[watched]))).all():
                 return
-        worst = max(watched, key=change.__getitem__)
+        worst = int(np.argmax(change))
         raise IterationError(
             f"The components {listed(group)} did not settle in {self._iterations} iterations of the step "
-            f"from t = {self.time:g} s ({worst} still changes by {change[worst]:.3g}); allow more iterations "
-            "or a larger tolerance, make the step smaller, or delay one of their connections."
+            f"from t = {self.time:g} s ({self._ends[watched[worst]]} still changes by {change[worst]:.3g}); "
+            "allow more iterations or a larger tolerance, make the step smaller, or delay one of their "
+            "connections."
         )
 
     def _place(self, inputs: Mapping[str, Any]) -> None:
@@ -376,10 +385,11 @@ class CoupledAsset(SteppedAsset):
                     self._held[port.end.component][port.end.variable] = number
 
     def _observation(self) -> Observation:
-        now, before = self._now, self._before
-        values = np.array([port.of(now, before) for port in self._roles.observations])
-        extra = {name: port.of(now, before) for name, port in self._roles.monitors.items()}
-        return Observation(values, self.time, extra)
+        extra = {}
+        if self._roles.monitors:
+            monitored = self._monitored.of(self._now, self._before).tolist()
+            extra = dict(zip(self._roles.monitors, monitored, strict=True))
+        return Observation(self._observed.of(self._now, self._before), self.time, extra)
 
     def _opened(self) -> None:
         if self._phase == "broken":
@@ -404,7 +414,7 @@ class CoupledAsset(SteppedAsset):
 
     def _take_parameters(self, given: Mapping[str, Any]) -> None:
         self._tuned = parameter_values(self._binding, self._roles, given)
-        self._parameters = {name: float(value) for name, value in given.items()}
+        self._parameters = {name: float(value) for name, value in sorted(given.items())}
 
     def _settings(self, part: Part) -> dict[str, float]:
         return part.settings | self._tuned.get(part.name, {})

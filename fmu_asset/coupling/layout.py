@@ -1,13 +1,20 @@
 """A system and a binding as its components see them: what each is fed, and its own binding."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
+from fmu_asset.door.units import IDENTITY
 from fmu_asset.errors import BindingError, CouplingError
 
 from .roles import Roles
 from .structure import Component, Endpoint
 from .wiring import ConnectedVariable, Wiring
+
+FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,34 @@ class Part:
     settings: dict[str, float]
     constants: dict[str, float]
     binding: Binding
+
+
+class Taps:
+    """Outputs that are wanted together, in the units of who wants them.
+
+    Parameters
+    ----------
+    ports : iterable of ConnectedVariable
+        The outputs, in order.
+    place : mapping of Endpoint to int
+        Where each output stands among all that are read.
+    """
+
+    def __init__(self, ports: Iterable[ConnectedVariable], place: Mapping[Endpoint, int]) -> None:
+        wanted = list(ports)
+        self._index = np.array([place[port.end] for port in wanted], dtype=np.intp)
+        self._delayed = np.flatnonzero([port.delayed for port in wanted])
+        scales = np.array([port.conversion for port in wanted]).reshape(-1, 2)
+        self._scale = None if (scales == IDENTITY).all() else (scales[:, 0], scales[:, 1])
+
+    def of(self, now: FloatArray, before: FloatArray) -> FloatArray:
+        """Return the values, from all outputs of this moment and of the beginning of the step."""
+        values = now[self._index]
+        if self._delayed.size:
+            values[self._delayed] = before[self._index[self._delayed]]
+        if self._scale is not None:
+            values = self._scale[0] * values + self._scale[1]
+        return values
 
 
 def parts_of(wiring: Wiring, binding: Binding, roles: Roles) -> dict[str, Part]:

@@ -2,7 +2,6 @@
 
 import difflib
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -33,10 +32,6 @@ class ConnectedVariable(NamedTuple):
     end: Endpoint
     conversion: Conversion
     delayed: bool
-
-    def of(self, now: Mapping[Endpoint, float], before: Mapping[Endpoint, float]) -> float:
-        """Return the value of an output, from those of this moment and of the beginning of the step."""
-        return self.conversion.to_fmu((before if self.delayed else now)[self.end])
 
 
 class Wiring:

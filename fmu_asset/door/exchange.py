@@ -43,8 +43,8 @@ class Inputs(TypedDict, total=False):
 
 
 def plain_values(values: Values) -> dict[str, float | list[float]]:
-    """Return values as floats and lists of floats, which can be compared and kept as JSON."""
-    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+    """Return values as floats and lists of floats in the order of their names, to be kept as JSON."""
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in sorted(values.items())}
     return {
         name: array.item() if array.ndim == 0 else array.ravel().tolist() for name, array in arrays.items()
     }

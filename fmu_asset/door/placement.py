@@ -1,4 +1,4 @@
-"""Where the instance of an asset lives, and how it gets back to its start: by the FMU's own reset if that works.
+"""Where the instance of an asset lives, and how it gets back to its start: by its own reset if that is good.
 
 Some FMUs return OK from their reset and go on from where they were, or keep a clock that shows later only.
 The first step of the first instance is therefore kept. At every later start that step is made again, and

@@ -1,6 +1,5 @@
 """The state of an asset as bytes: what a mission's checkpoint keeps of an FMU, or of several."""
 
-import json
 import struct
 from collections.abc import Callable
 from typing import ClassVar, Literal, Self
@@ -37,7 +36,7 @@ class PackedState(BaseModel):
 
     def to_bytes(self) -> bytes:
         """Return the state as bytes; equal states give equal bytes."""
-        text = json.dumps(self.model_dump(mode="json"), sort_keys=True).encode()
+        text = self.model_dump_json().encode()
         return _HEADER.pack(self.magic, len(text)) + text + self.body
 
     @classmethod
