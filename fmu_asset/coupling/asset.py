@@ -23,7 +23,7 @@ from fmu_asset.errors import (
 )
 from reporting.progress import Progress, SilentProgress
 
-from .layout import FloatArray, Part, Taps, parts_of
+from .layout import FloatArray, Part, Taps, naming, parts_of
 from .roles import parameter_values, resolve_roles
 from .saved import CoupledState, wiring_hash
 from .schedule import Schedule, loop_sentence
@@ -172,7 +172,7 @@ class CoupledAsset(SteppedAsset):
             values = self._fed(part, self._now, self._now)
             fed = {key: values[key] for key, port in part.fed.items() if port.end.component in known}
             try:
-                with _naming(name):
+                with naming(name):
                     asset.reset(self._settings(part), load=(self._held[name] | fed) or None)
                     self._now[self._spans[name]] = asset.observe().values
             except FmuError:
@@ -294,7 +294,7 @@ class CoupledAsset(SteppedAsset):
         self._phase = "broken"
         self._take_parameters(saved.parameters)
         for (name, asset), state in zip(self._assets.items(), components, strict=True):
-            with _naming(name):
+            with naming(name):
                 asset.restore_state(state)
         self._held = saved.held
         self._now, self._before = np.array(saved.outputs), np.array(saved.before)
@@ -307,7 +307,7 @@ class CoupledAsset(SteppedAsset):
         for name in group:
             part, asset, held = self._parts[name], self._assets[name], self._held[name]
             fed = self._fed(part, source, self._before)
-            with _naming(name):
+            with naming(name):
                 if part.linear:
                     asset.hold(load=self._draw(part, fed, source))
                 held.update(fed)
@@ -350,7 +350,7 @@ class CoupledAsset(SteppedAsset):
             last = self._now.copy()
             if iteration:
                 for name, state in states.items():
-                    with _naming(name):
+                    with naming(name):
                         self._assets[name].restore_state(state)
             self._pass(group, last if self._jacobi else self._now)
             change = np.abs(self._now - last)[watched]
@@ -403,7 +403,7 @@ class CoupledAsset(SteppedAsset):
             self.reset()
 
     def _open(self, part: Part, *, isolated: bool, step_timeout: float | None) -> FmiAsset:
-        with _naming(part.name):
+        with naming(part.name):
             return FmiAsset(
                 self._wiring.structure.component(part.name).fmu,
                 part.binding,
@@ -441,17 +441,3 @@ class CoupledAsset(SteppedAsset):
             "binding": self._binding.name,
             "step_size": self._interval,
         }
-
-
-class _naming:  # noqa: N801 - a block, and cheaper than one made of a generator
-    """Name the component in an error of its FMU."""
-
-    def __init__(self, component: str) -> None:
-        self._component = component
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, FmuError):
-            sentence = f"component {self._component}: {error.sentence}"
-            raise type(error)(sentence, error.messages, error.time) from error

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
 from fmu_asset.door.units import IDENTITY
-from fmu_asset.errors import BindingError, CouplingError
+from fmu_asset.errors import BindingError, CouplingError, FmuError
 
 from .roles import Roles
 from .structure import Component, Endpoint
@@ -165,3 +165,17 @@ def _any_output(wiring: Wiring, name: str) -> Endpoint:
     raise CouplingError(
         f"The component {name!r} has no output of a single number, so it takes no part; leave it out."
     )
+
+
+class naming:  # noqa: N801 - cheaper than one made of a generator
+    """A block in which an error of an FMU gets the name of its component."""
+
+    def __init__(self, component: str) -> None:
+        self._component = component
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, FmuError):
+            sentence = f"component {self._component}: {error.sentence}"
+            raise type(error)(sentence, error.messages, error.time) from error
