@@ -74,9 +74,7 @@ def build(
             )
         build_structure(design, out, kind, fmi, None, None, replace, None)
         return
-    from fmu_asset.packing.contents import checked_target
-
-    out = checked_target(out or Path("uav_wing.fmu"), replace=replace)
+    out = out or Path("uav_wing.fmu")
     if calibration is not None and design is not None:
         raise typer.BadParameter("the calibration holds its design: give either it or --design.")
     if activate and patch is None:
@@ -90,6 +88,11 @@ def build(
             "--design, --calibration, --patch, --kind, --fmi, --interface and --windows are for the wing.",
             param_hint="--script",
         )
+    _build_script(script, out, replace=replace)
+
+
+def _build_script(script: str, out: Path, *, replace: bool) -> None:
+    """Pack a model script, shipped or a file."""
     from fmu_asset.packing.script import build_script_fmu
     from scenarios import asset_scripts
 
@@ -110,11 +113,13 @@ def _build_wing(
     """Pack a wing, tailored where it was calibrated."""
     from fe.wing.design import load_design
     from fmu_asset.compiled.compiler import find_compiler, find_cross_compiler
+    from fmu_asset.packing.contents import checked_target
     from fmu_asset.packing.patch_file import load_patch
     from fmu_asset.packing.structure_fmu import check_kind, check_version
     from fmu_asset.packing.wing_packing import pack_wing
 
     kind, fmi, interface, windows = form
+    out = checked_target(out, replace=replace)
     check_version(kind, fmi, interface)
     effects = None if patch is None else load_patch(patch)
     if effects is not None:

@@ -1,5 +1,6 @@
 """`uav-twin ssp ...`."""
 
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -100,8 +101,6 @@ def simulate(
     replace: Replace = False,
 ) -> None:
     """Simulate the system of an SSP file from its start; all outputs of the system and its components."""
-    import tempfile
-
     from fmu_asset.coupling.asset import CoupledAsset
     from fmu_asset.coupling.experiment import system_experiment
     from fmu_asset.door.experiment import fly

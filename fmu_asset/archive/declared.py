@@ -256,22 +256,10 @@ def read_declared(
     FmuUnsupportedError
         If it does not offer that.
     """
-    offered: dict[Interface, Any] = {
-        "co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange
-    }  # fmt: skip
-    there: list[Interface] = [name for name, given in offered.items() if given is not None]
-    if not there:
-        raise FmuUnsupportedError(
-            f"{archive['path']} offers neither co-simulation nor model exchange (scheduled execution is not "
-            "supported); export it for co-simulation."
-        )
-    if wanted is not None and wanted not in there:
-        raise FmuUnsupportedError(
-            f"{archive['path']} offers {there[0]} only, but the binding asks for {wanted}; change "
-            "`interface` there, or export the FMU anew."
-        )
+    there = _offered(declared, archive["path"], wanted)
     interface = wanted or there[0]
-    chosen, experiment = offered[interface], declared.defaultExperiment
+    chosen = declared.coSimulation if interface == "co-simulation" else declared.modelExchange
+    experiment = declared.defaultExperiment
     # fmpy does not read the capabilities of FMI 1.
     capabilities = root.find("Implementation//Capabilities")
     vary = getattr(chosen, "canHandleVariableCommunicationStepSize", True)
@@ -330,6 +318,25 @@ def _checked(name: str, shape: Sequence[int]) -> tuple[int, ...]:
             f"{name!r} is an array of {' x '.join(map(str, shape))} elements; {_LARGEST_ARRAY} are the most."
         )
     return tuple(shape)
+
+
+def _offered(declared: Any, file: Path, wanted: Interface | None) -> list[Interface]:
+    """Return the interfaces that an FMU offers, the one that is wanted among them."""
+    offered: dict[Interface, Any] = {
+        "co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange
+    }  # fmt: skip
+    there: list[Interface] = [name for name, given in offered.items() if given is not None]
+    if not there:
+        raise FmuUnsupportedError(
+            f"{file} offers neither co-simulation nor model exchange (scheduled execution is not supported); "
+            "export it for co-simulation."
+        )
+    if wanted is not None and wanted not in there:
+        raise FmuUnsupportedError(
+            f"{file} offers {there[0]} only, but the binding asks for {wanted}; change `interface` "
+            "there, or export the FMU anew."
+        )
+    return there
 
 
 def _number(owner: Any, attribute: str) -> float | None:
