@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fmu_asset.coupling.declared import read_declared
 from rich.console import Console
 from rich.table import Table
 
@@ -45,7 +46,6 @@ from discrepancy.models.lumped import LumpedModel
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import load_design
-from fmu_asset.coupling.declared import read_declared
 from fmu_asset.door.binding import load_binding
 from fmu_asset.door.history_file import read_histories
 from fmu_asset.packing.patch_file import load_patch

@@ -28,7 +28,7 @@ from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
-from fmu_asset.archive.design_record import packed_design_hash
+from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
 from reporting.toml_file import read_toml

@@ -75,14 +75,29 @@ def build(
         build_structure(design, out, kind, fmi, None, None, replace, None)
         return
     out = out or Path("uav_wing.fmu")
-    _refuse_contradictions(out, design, calibration, patch, activate=activate, replace=replace)
-    if script is not None:
-        plain = (kind, fmi, interface, windows) == ("python", 2, "co-simulation", False)
-        for_the_wing = design is not None or calibration is not None or patch is not None or not plain
-        _build_script(script, out, replace=replace, other=for_the_wing)
+    if calibration is not None and design is not None:
+        raise typer.BadParameter("the calibration holds its design: give either it or --design.")
+    if activate and patch is None:
+        raise typer.BadParameter("there is no --patch whose effects could be switched on.")
+    if script is None:
+        form: _Form = (kind, 3 if fmi == 3 else 2, interface, windows)
+        _build_wing(out, design, form, calibration, patch, activate=activate, replace=replace)
         return
-    form: _Form = (kind, 3 if fmi == 3 else 2, interface, windows)
-    _build_wing(out, design, form, calibration, patch, activate=activate, replace=replace)
+    if any((design, calibration, patch, windows)) or (kind, fmi, interface) != ("python", 2, "co-simulation"):
+        raise typer.BadParameter(
+            "--design, --calibration, --patch, --kind, --fmi, --interface and --windows are for the wing.",
+            param_hint="--script",
+        )
+    _build_script(script, out, replace=replace)
+
+
+def _build_script(script: str, out: Path, *, replace: bool) -> None:
+    """Pack a model script, shipped or a file."""
+    from fmu_asset.packing.script import build_script_fmu
+    from scenarios import asset_scripts
+
+    built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
+    terminal.say(f"{built.path}: {built.size / 1024:.0f} KiB, GUID {built.guid}")
 
 
 def _build_wing(
@@ -98,11 +113,13 @@ def _build_wing(
     """Pack a wing, tailored where it was calibrated."""
     from fe.wing.design import load_design
     from fmu_asset.compiled.compiler import find_compiler, find_cross_compiler
+    from fmu_asset.packing.contents import checked_target
     from fmu_asset.packing.patch_file import load_patch
     from fmu_asset.packing.structure_fmu import check_kind, check_version
     from fmu_asset.packing.wing_packing import pack_wing
 
     kind, fmi, interface, windows = form
+    out = checked_target(out, replace=replace)
     check_version(kind, fmi, interface)
     effects = None if patch is None else load_patch(patch)
     if effects is not None:
@@ -140,40 +157,6 @@ def _build_wing(
     terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
 
 
-def _refuse_contradictions(
-    out: Path,
-    design: Path | None,
-    calibration: Path | None,
-    patch: Path | None,
-    *,
-    activate: bool,
-    replace: bool,
-) -> None:
-    """Refuse options that cannot be kept together, before anything is built."""
-    from fmu_asset.errors import FmuBuildError
-
-    if calibration is not None and design is not None:
-        raise typer.BadParameter("the calibration holds its design: give either it or --design.")
-    if out.exists() and not replace:
-        raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
-    if activate and patch is None:
-        raise typer.BadParameter("there is no --patch whose effects could be switched on.")
-
-
-def _build_script(script: str, out: Path, *, replace: bool, other: bool) -> None:
-    """Pack a model script, shipped or a file."""
-    from fmu_asset.packing.script import build_script_fmu
-    from scenarios import asset_scripts
-
-    if other:
-        raise typer.BadParameter(
-            "--design, --calibration, --patch, --kind, --fmi, --interface and --windows are for the wing.",
-            param_hint="--script",
-        )
-    built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
-    terminal.say(f"{built.path}: {built.size / 1024:.0f} KiB, GUID {built.guid}")
-
-
 @fmu_app.command("info")
 def info(
     file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
@@ -181,7 +164,8 @@ def info(
     json: terminal.Json = False,
 ) -> None:
     """Say what an FMU is: version, capabilities, variables with units and ranges."""
-    from fmu_asset.archive.fmu_file import describe_fmu, inspect_fmu
+    from fmu_asset.archive.declared import describe_fmu
+    from fmu_asset.archive.fmu_file import inspect_fmu
     from uav_twin.console_table import console_table
 
     description, obstacle = inspect_fmu(file)

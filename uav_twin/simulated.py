@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from fmu_asset.door.binding import Binding, Interpolation
-    from fmu_asset.door.simulation import ObservationHistory
-    from fmu_asset.door.stepped import SteppedAsset
+    from fmu_asset.door.simulation import ObservationHistory, SteppedAsset
 
 OutFile = Annotated[Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")]
 PlotFile = Annotated[Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")]

@@ -1,5 +1,6 @@
 """`uav-twin ssp ...`."""
 
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -40,13 +41,11 @@ def export(
 ) -> None:
     """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
     from fmu_asset.errors import SspError
+    from fmu_asset.packing.contents import checked_target
     from twin_master.assets.system_export import export_design, export_scenario
     from twin_master.scenario.reading import load_scenario
 
-    if out.suffix != ".ssp":
-        raise SspError(f"An SSP file must have the suffix .ssp, but {out} was given.")
-    if out.exists() and not replace:
-        raise SspError(f"{out} exists: choose another --out or give --replace.")
+    checked_target(out, replace=replace, what="An SSP file", suffix=".ssp", error=SspError)
     progress = terminal.progress()
     if _is_design(what):
         design = None if what == "uav_wing" else Path(what)
@@ -102,10 +101,9 @@ def simulate(
     replace: Replace = False,
 ) -> None:
     """Simulate the system of an SSP file from its start; all outputs of the system and its components."""
-    import tempfile
-
     from fmu_asset.coupling.asset import CoupledAsset
-    from fmu_asset.coupling.experiment import fly_system, system_experiment
+    from fmu_asset.coupling.experiment import system_experiment
+    from fmu_asset.door.experiment import fly
     from fmu_asset.door.history_file import write_history
     from fmu_asset.ssp.check import join_ssp, left_out_sentence
     from fmu_asset.ssp.reader import read_ssp
@@ -127,7 +125,7 @@ def simulate(
             isolated=not in_process,
             parameters=planned.parameters,
         ) as asset:
-            history = fly_system(asset, planned, terminal.progress())
+            history = fly(asset, planned, terminal.progress())
             if out is not None:
                 write_history(out, asset, (file.name, hash_file(file)), history)
             if plot is not None:

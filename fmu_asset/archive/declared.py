@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from fmu_asset.errors import FmuInputError, visible
+from fmu_asset.errors import FmuInputError, FmuUnsupportedError, visible
 from fmu_asset.instances.plan import Interface
 
 NUMERIC_KINDS = frozenset(
@@ -17,6 +17,10 @@ NUMERIC_KINDS = frozenset(
 )
 _LARGEST_ARRAY = 10_000_000
 FLOAT_KINDS = frozenset({"Real", "Float32", "Float64"})
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+"""In the order of `UnitInfo.exponents`."""
+READABLE = ("output", "local", "calculatedParameter")
+"""Causalities of what can be the source of a connection."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,10 @@ class VariableInfo:
         For each number of the shape the name of the structural parameter that it is, if it is one.
     clocked : bool
         Whether it changes with a clock of FMI 3 only.
+    items : dict of str to int
+        Of an enumeration.
+    dependencies : tuple of str or None
+        Names of the variables that an output depends on directly; None if that is not declared.
     """
 
     name: str
@@ -61,6 +69,8 @@ class VariableInfo:
     shape: tuple[int, ...] = ()
     dimensions: tuple[str | None, ...] = ()
     clocked: bool = False
+    items: dict[str, int] = field(default_factory=dict, hash=False)
+    dependencies: tuple[str, ...] | None = None
 
     @property
     def size(self) -> int:
@@ -205,6 +215,19 @@ class FmuDescription:
         """Return the variable of that name, or None."""
         return self._by_name.get(name)
 
+    @cached_property
+    def feedthrough(self) -> dict[str, frozenset[str]]:
+        """For each variable that can be read, the inputs that it depends on directly.
+
+        An output without declared dependencies depends on all inputs, as FMI says.
+        """
+        inputs = frozenset(v.name for v in self.variables if v.causality == "input")
+        return {
+            v.name: inputs if v.dependencies is None else inputs & {*v.dependencies}
+            for v in self.variables
+            if v.causality in READABLE
+        }
+
     def exchange_kind(self, variable: VariableInfo) -> str:
         """Return the base type in which a variable is set and read: enumerations are integers."""
         if variable.kind != "Enumeration":
@@ -213,7 +236,7 @@ class FmuDescription:
 
 
 def read_declared(
-    declared: Any, root: Element, file: Path, archive: Mapping[str, Any], interface: Interface
+    declared: Any, root: Element, archive: Mapping[str, Any], wanted: Interface | None
 ) -> FmuDescription:
     """Return the description of an FMU from what fmpy has read.
 
@@ -223,16 +246,20 @@ def read_declared(
         As fmpy reads it.
     root : Element
         The XML itself, for what fmpy leaves out.
-    file : Path
-        The FMU.
     archive : mapping
-        `sha256`, `file_size` and `platforms`.
-    interface : {"co-simulation", "model-exchange"}
-        How it is to be run; it offers that.
+        `path`, `sha256`, `file_size` and `platforms`.
+    wanted : {"co-simulation", "model-exchange"} or None
+        How it is to be run; co-simulation if it has that.
+
+    Raises
+    ------
+    FmuUnsupportedError
+        If it does not offer that.
     """
+    there = _offered(declared, archive["path"], wanted)
+    interface = wanted or there[0]
     chosen = declared.coSimulation if interface == "co-simulation" else declared.modelExchange
     experiment = declared.defaultExperiment
-    offered = {"co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange}
     # fmpy does not read the capabilities of FMI 1.
     capabilities = root.find("Implementation//Capabilities")
     vary = getattr(chosen, "canHandleVariableCommunicationStepSize", True)
@@ -243,43 +270,42 @@ def read_declared(
     # FMI 1 always wants it.
     completed = bool(getattr(chosen, "needsCompletedIntegratorStep", False)) or declared.fmiVersion == "1.0"
 
-    def of_experiment(attribute: str) -> float | None:
-        value = getattr(experiment, attribute, None)
-        return None if value is None else float(value)
-
     # fmpy 0.3.32 passes over the range of unsigned integers.
     unsigned = {e.get("name"): e for e in root.iterfind("ModelVariables/*") if e.tag.startswith("UInt")}
     for variable in declared.modelVariables:
         if (element := unsigned.get(variable.name)) is not None:
             variable.min, variable.max = element.get("min"), element.get("max")
-    fixed = getattr(chosen, "fixedInternalStepSize", None)
+    known = {
+        unknown.variable.name: tuple(str(variable.name) for variable in unknown.dependencies)
+        for unknown in declared.outputs
+        if unknown.variable is not None and unknown.dependencies is not None
+    }
     return FmuDescription(
-        path=file,
-        sha256=archive["sha256"],
-        file_size=archive["file_size"],
+        **archive,
         fmi_version=str(declared.fmiVersion),
         model_name=str(declared.modelName),
         model_identifier=str(chosen.modelIdentifier),
         guid=str(declared.guid),
         description=str(declared.description or ""),
         generation_tool=str(declared.generationTool or ""),
-        platforms=archive["platforms"],
         can_get_and_set_state=bool(chosen.canGetAndSetFMUstate),
         can_serialise_state=bool(chosen.canSerializeFMUstate),
         can_vary_step=bool(vary),
         can_interpolate_inputs=bool(lines),
-        variables=tuple(_variable(variable) for variable in declared.modelVariables),
+        variables=tuple(
+            _variable(variable, known.get(variable.name)) for variable in declared.modelVariables
+        ),
         units=tuple(_unit(unit) for unit in declared.unitDefinitions),
         interface=interface,
-        interfaces=tuple(name for name, given in offered.items() if given is not None),
+        interfaces=tuple(there),
         needs_tool=bool(chosen.needsExecutionTool)
         or root.find("Implementation/CoSimulation_Tool") is not None,
         once_per_process=bool(getattr(chosen, "canBeInstantiatedOnlyOncePerProcess", False)),
-        start_time=of_experiment("startTime"),
-        stop_time=of_experiment("stopTime"),
-        step_size=of_experiment("stepSize"),
-        tolerance=of_experiment("tolerance"),
-        fixed_step=None if fixed is None else float(fixed),
+        start_time=_number(experiment, "startTime"),
+        stop_time=_number(experiment, "stopTime"),
+        step_size=_number(experiment, "stepSize"),
+        tolerance=_number(experiment, "tolerance"),
+        fixed_step=_number(chosen, "fixedInternalStepSize"),
         states=int(declared.numberOfContinuousStates),
         event_indicators=int(declared.numberOfEventIndicators),
         completed_step=completed,
@@ -294,14 +320,36 @@ def _checked(name: str, shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(shape)
 
 
-def _variable(declared: Any) -> VariableInfo:
+def _offered(declared: Any, file: Path, wanted: Interface | None) -> list[Interface]:
+    """Return the interfaces that an FMU offers, the one that is wanted among them."""
+    offered: dict[Interface, Any] = {
+        "co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange
+    }  # fmt: skip
+    there: list[Interface] = [name for name, given in offered.items() if given is not None]
+    if not there:
+        raise FmuUnsupportedError(
+            f"{file} offers neither co-simulation nor model exchange (scheduled execution is not supported); "
+            "export it for co-simulation."
+        )
+    if wanted is not None and wanted not in there:
+        raise FmuUnsupportedError(
+            f"{file} offers {there[0]} only, but the binding asks for {wanted}; change `interface` "
+            "there, or export the FMU anew."
+        )
+    return there
+
+
+def _number(owner: Any, attribute: str) -> float | None:
+    value = getattr(owner, attribute, None)
+    return None if value is None else float(value)
+
+
+def _variable(declared: Any, dependencies: tuple[str, ...] | None) -> VariableInfo:
     declared_type = declared.declaredType
 
-    def of(attribute: str) -> Any:
-        value = getattr(declared, attribute)
-        return (
-            getattr(declared_type, attribute, None) if value is None and declared_type is not None else value
-        )
+    def owner(attribute: str) -> Any:
+        """Return who says something: the variable, or else its type."""
+        return declared_type if getattr(declared, attribute) is None else declared
 
     return VariableInfo(
         name=str(declared.name),
@@ -310,24 +358,22 @@ def _variable(declared: Any) -> VariableInfo:
         causality=str(declared.causality or "local"),
         variability=str(declared.variability or "continuous"),
         description=str(declared.description or ""),
-        unit=of("unit"),
-        display_unit=of("displayUnit"),
-        minimum=None if of("min") is None else float(of("min")),
-        maximum=None if of("max") is None else float(of("max")),
+        unit=getattr(owner("unit"), "unit", None),
+        display_unit=getattr(owner("displayUnit"), "displayUnit", None),
+        minimum=_number(owner("min"), "min"),
+        maximum=_number(owner("max"), "max"),
         start=None if declared.start is None else str(declared.start),
         shape=_checked(declared.name, declared.shape or ()),
         dimensions=tuple(d.variable and str(d.variable.name) for d in declared.dimensions or ()),
         clocked=bool(declared.clocks),
+        items={str(item.name): int(item.value) for item in getattr(declared_type, "items", None) or ()},
+        dependencies=dependencies,
     )
 
 
 def _unit(declared: Any) -> UnitInfo:
     base = declared.baseUnit
-    exponents = (
-        None
-        if base is None
-        else tuple(int(getattr(base, symbol)) for symbol in ("kg", "m", "s", "A", "K", "mol", "cd", "rad"))
-    )
+    exponents = None if base is None else tuple(int(getattr(base, symbol)) for symbol in BASE_UNITS)
     return UnitInfo(
         name=str(declared.name),
         exponents=exponents,
@@ -341,28 +387,9 @@ def _visible(record: dict[str, Any]) -> dict[str, Any]:
     return {name: visible(value) if isinstance(value, str) else value for name, value in record.items()}
 
 
-def describe_fmu(description: FmuDescription, roles: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return an FMU's description as plain records, with the role of each variable if known.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        As `read_fmu` returns it.
-    roles : mapping of str to str, optional
-        Role by variable name.
-
-    Returns
-    -------
-    dict
-        Plain values, JSON-serialisable.
-    """
+def describe_fmu(description: FmuDescription) -> dict[str, Any]:
+    """Return an FMU's description as plain records, JSON-serialisable."""
     record: dict[str, Any] = _visible(asdict(description))
     record["path"] = str(description.path)
-    record["platforms"] = list(description.platforms)
-    record["interfaces"] = list(description.interfaces)
-    record["units"] = [asdict(unit) for unit in description.units]
-    record["variables"] = [
-        _visible(asdict(variable)) | {"role": (roles or {}).get(variable.name, "")}
-        for variable in description.variables
-    ]
+    record["variables"] = [_visible(variable) for variable in record["variables"]]
     return record

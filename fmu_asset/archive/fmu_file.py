@@ -1,6 +1,7 @@
 """An FMU file from outside: sound, safe to extract, of a kind that can be flown, and what it declares."""
 
 import hashlib
+import json
 import lzma
 import os
 import re
@@ -9,7 +10,6 @@ import stat
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
-from typing import Any
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 from fmpy import platform as fmi_platform
@@ -20,18 +20,7 @@ from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.plan import Interface
 from reporting.words import one_line
 
-from .declared import FmuDescription, UnitInfo, VariableInfo, describe_fmu, read_declared
-
-__all__ = [
-    "FmuDescription",
-    "UnitInfo",
-    "VariableInfo",
-    "describe_fmu",
-    "extract_fmu",
-    "inspect_fmu",
-    "plain_folder",
-    "read_fmu",
-]
+from .declared import FmuDescription, read_declared
 
 # A model FMU of hundreds of megabytes exists; one that unpacks to more than this is a mistake or an attack.
 LARGEST_EXTRACTED_BYTES = 4 * 1024**3
@@ -39,6 +28,9 @@ _LARGEST_RATIO = 200
 _SMALL_ENOUGH = 256 * 1024**2
 _MOST_ENTRIES = 100_000
 _DEEPEST = 100
+DESIGN_RECORD = "design.json"
+"""Name of the file in the folder `resources` that says of which design an FMU of ours was made."""
+_LONGEST_RECORD = 10_000
 _LARGEST_DESCRIPTION = 256 * 1024**2
 _UNREADABLE = (OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
@@ -101,12 +93,11 @@ def inspect_fmu(
         )
     try:
         declared = read_model_description(str(file), validate=False)
-        offered = _offered(file, declared, interface)
         platforms = tuple(
             sorted({PurePosixPath(name).parts[1] for name in names if re.match(r"binaries/[^/]+/.+", name)})
         )
-        archive = {"sha256": sha256, "file_size": size, "platforms": platforms}
-        description = read_declared(declared, root, file, archive, offered)
+        archive = {"path": file, "sha256": sha256, "file_size": size, "platforms": platforms}
+        description = read_declared(declared, root, archive, interface)
     except FmuUnsupportedError:
         raise
     except Exception as error:
@@ -125,25 +116,6 @@ def inspect_fmu(
         f"{file} has no binary for this platform ({binary} is not in it; binaries there: {there}); "
         f"export it for {here}."
     )
-
-
-def _offered(file: Path, declared: Any, wanted: Interface | None) -> Interface:
-    """Return the interface to use."""
-    offered: dict[Interface, Any] = {
-        "co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange
-    }  # fmt: skip
-    there: list[Interface] = [name for name, given in offered.items() if given is not None]
-    if not there:
-        raise FmuUnsupportedError(
-            f"{file} offers neither co-simulation nor model exchange (scheduled execution is not supported); "
-            "export it for co-simulation."
-        )
-    if wanted is not None and wanted not in there:
-        raise FmuUnsupportedError(
-            f"{file} offers {there[0]} only, but the binding asks for {wanted}; change `interface` there, or "
-            "export the FMU anew."
-        )
-    return wanted or there[0]
 
 
 def extract_fmu(description: FmuDescription) -> Path:
@@ -306,3 +278,18 @@ def _model_description(file: Path) -> Element:
     if root.tag != "fmiModelDescription":
         raise FmuFileError(f"The model description of {file} begins with <{root.tag}>; it is damaged.")
     return root
+
+
+def design_record(design_hash: str) -> bytes:
+    """Return the content of the file."""
+    return (json.dumps({"design_hash": design_hash}) + "\n").encode()
+
+
+def packed_design_hash(path: str | os.PathLike[str]) -> str:
+    """Return the hash of the design that an FMU was made of; empty where it does not tell."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open(f"resources/{DESIGN_RECORD}") as file:
+            found = json.loads(file.read(_LONGEST_RECORD))["design_hash"]
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError, zipfile.BadZipFile):
+        return ""
+    return found if isinstance(found, str) else ""

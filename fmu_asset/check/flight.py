@@ -1,9 +1,9 @@
 """What an FMU does when it is flown: the same twice, finite, resumable, at other steps, again and again."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,6 @@ from fmu_asset.door.units import conversion
 from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
 from reporting.progress import Progress
 
-from .result import Finding, Verdict
-
 _STEPS = 6
 _SAME = 1e-9
 _CLOSE = 0.02
@@ -27,6 +25,9 @@ _KIBIBYTE = 1024
 _SMALL_GROWTH, _LARGE_GROWTH = 1.0, 16.0
 _NOISE = 1024 * _KIBIBYTE
 
+Verdict = Literal["ok", "warning", "problem", "skipped"]
+Told = tuple[Verdict, str]
+"""What a check says: a verdict, and one sentence."""
 Inputs = dict[str, dict[str, Any]]
 Series = npt.NDArray[np.float64]
 
@@ -40,18 +41,25 @@ class Flights:
         The FMU.
     binding : Binding
         The binding.
-    limits : mapping of str to float
-        `step_timeout`, `load_timeout` and `memory_limit` of `FmiAsset`, where they are given.
+    step_timeout, memory_limit : float or None
+        As in `FmiAsset`.
     """
 
-    def __init__(self, description: FmuDescription, binding: Binding, limits: Mapping[str, float]) -> None:
-        self._description, self._binding, self._limits = description, binding, dict(limits)
+    def __init__(
+        self,
+        description: FmuDescription,
+        binding: Binding,
+        step_timeout: float | None,
+        memory_limit: float | None,
+    ) -> None:
+        self._description, self._binding = description, binding
+        self._step_timeout, self._memory_limit = step_timeout, memory_limit
         # Whether it fits is found here, before anything is started.
         self._description = self._asset().description
         self._base = self._base_inputs()
 
-    def checks(self, cycles: int, progress: Progress) -> Iterator[Finding]:
-        """Yield all findings; without a first flight the others are skipped.
+    def checks(self, cycles: int, progress: Progress) -> Iterator[tuple[str, *Told]]:
+        """Yield all findings, each with the name of its check; without a first flight the others are skipped.
 
         Parameters
         ----------
@@ -70,37 +78,31 @@ class Flights:
         try:
             self._series = self._fly()
         except FmuError as error:
-            yield Finding("first flight", "problem", _sentence(error))
+            yield "first flight", "problem", _sentence(error)
             for name in [*others, "instances"]:
-                yield Finding(name, "skipped", "It does not fly.")
+                yield name, "skipped", "It does not fly."
             return
         step = self._binding.step_size
-        yield Finding(
-            "first flight",
-            "ok",
-            f"{_STEPS} steps of {step:g} s, {self._series.shape[1]} finite outputs.",
-        )
+        yield "first flight", "ok", f"{_STEPS} steps of {step:g} s, {self._series.shape[1]} finite outputs."
         for name, check in others.items():
             with progress.stage(f"Checking {name}"):
                 try:
-                    yield from check()
+                    yield name, *check()
                 except FmuError as error:
-                    yield Finding(name, "problem", _sentence(error))
+                    yield name, "problem", _sentence(error)
         if cycles:
-            yield self._instances(cycles, progress)
+            yield "instances", *self._instances(cycles, progress)
 
     # ------------------------------------------------------------------ flying
 
     def _asset(self, **header: Any) -> FmiAsset:
-        changed = self._binding.model_copy(
-            update={"binding": self._binding.binding.model_copy(update=header)} if header else {}
-        )
+        changed = self._binding.binding.model_copy(update=header)
+        binding = self._binding.model_copy(update={"binding": changed})
         return FmiAsset(
             self._description.path,
-            changed,
-            step_timeout=self._limits.get("step_timeout"),
-            load_timeout=self._limits.get("load_timeout"),
-            memory_limit=self._limits.get("memory_limit"),
+            binding,
+            step_timeout=self._step_timeout,
+            memory_limit=self._memory_limit,
         )
 
     def _base_inputs(self) -> Inputs:
@@ -108,7 +110,7 @@ class Flights:
         resized = bool(self._binding.binding.structural_parameters)
         base: Inputs = {role: {} for role in INPUT_ROLES}
         for role in INPUT_ROLES:
-            for name, item in getattr(self._binding, role).items():
+            for name, item in self._binding.inputs(role).items():
                 place = find(self._description, item.variable, f"{role}.{name}", "input")
                 scale = conversion(item.unit, place.variable, self._description.units, where=f"{role}.{name}")
                 count = len((place.variable.start or "0").split())
@@ -119,32 +121,26 @@ class Flights:
                 base[role][name] = given if place.variable.shape and place.element is None else given[0]
         return base
 
-    def _fly(self, asset: FmiAsset | None = None, steps: int = _STEPS) -> Series:
-        """Return the outputs (steps, n) of a flight at the start values, from the start."""
-        own = asset is None
-        asset = asset or self._asset()
-        try:
-            asset.reset(**self._base)
-            return np.array([_row(asset, self._base) for _ in range(steps)])
-        finally:
-            if own:
-                asset.close()
+    def _fly(self, asset: FmiAsset | None = None) -> Series:
+        """Return the outputs (N, n) of a flight at the start values, from the start."""
+        if asset is None:
+            with closing(self._asset()) as own:
+                return self._fly(own)
+        asset.reset(**self._base)
+        return np.array([_row(asset, self._base) for _ in range(_STEPS)])
 
     # ------------------------------------------------------------------ the checks
 
-    def _determinism(self) -> Iterator[Finding]:
+    def _determinism(self) -> Told:
         again = self._fly()
         if again.tobytes() == self._series.tobytes():
-            yield Finding("determinism", "ok", "Two flights in two processes are equal to the bit.")
-        else:
-            yield Finding(
-                "determinism",
-                "problem",
-                f"Two flights with the same inputs differ ({_difference(self._series, again)}): runs of it "
-                "are not reproducible, and a state cannot be replayed.",
-            )
+            return "ok", "Two flights in two processes are equal to the bit."
+        return "problem", (
+            f"Two flights with the same inputs differ ({_difference(self._series, again)}): runs of it "
+            "are not reproducible, and a state cannot be replayed."
+        )
 
-    def _state(self) -> Iterator[Finding]:
+    def _state(self) -> Told:
         with closing(self._asset()) as asset:
             asset.reset(**self._base)
             for _ in range(2):
@@ -152,127 +148,93 @@ class Flights:
             saved, method = asset.save_state(), asset.state_method
             expected = np.array([_row(asset, self._base) for _ in range(_STEPS - 2)])
         with closing(self._asset()) as other:
-            try:
-                other.restore_state(saved)
-                found = np.array([_row(other, self._base) for _ in range(_STEPS - 2)])
-            except FmuError as error:
-                yield Finding("state", "problem", _sentence(error))
-                return
+            other.restore_state(saved)
+            found = np.array([_row(other, self._base) for _ in range(_STEPS - 2)])
         if found.tobytes() != expected.tobytes():
-            hint = (
-                "it declares canGetAndSetFMUstate but keeps part of its state elsewhere; write "
-                '`state = "replay"` into the table [binding] of its binding'
-                if method == "serialised"
-                else "its outputs are not a function of its inputs"
-            )
-            yield Finding(
-                "state",
-                "problem",
+            hint = "its outputs are not a function of its inputs"
+            if method == "serialised":
+                hint = (
+                    "it declares canGetAndSetFMUstate but keeps part of its state elsewhere; write "
+                    '`state = "replay"` into the table [binding] of its binding'
+                )
+            return "problem", (
                 "A flight that goes on from a saved state in a new process differs from the one that was "
-                f"not interrupted ({_difference(expected, found)}): {hint}.",
+                f"not interrupted ({_difference(expected, found)}): {hint}."
             )
-        elif method == "serialised":
-            yield Finding(
-                "state", "ok", f"Saved ({len(saved)} bytes), restored in a new process, equal to the bit."
-            )
-        else:
-            yield Finding(
-                "state",
-                "warning",
-                "Its state cannot be serialised; a mission is resumed by replaying the inputs, which is "
-                "equal to the bit here.",
-            )
+        if method == "serialised":
+            return "ok", f"Saved ({len(saved)} bytes), restored in a new process, equal to the bit."
+        return "warning", (
+            "Its state cannot be serialised; a mission is resumed by replaying the inputs, which is equal to "
+            "the bit here."
+        )
 
-    def _step_size(self) -> Iterator[Finding]:
+    def _step_size(self) -> Told:
         header = self._binding.binding
-        asset = self._asset(step_size=header.step_size / 2.0, decimation=2 * header.decimation)
-        with closing(asset):
+        half = header.step_size / 2.0
+        with closing(self._asset(step_size=half, decimation=2 * header.decimation)) as asset:
             try:
                 halved = self._fly(asset)
             except FmuCallError as error:
                 if self._description.can_vary_step:
-                    yield Finding(
-                        "step size",
-                        "problem",
-                        f"It declares that it takes any step size, but not {header.step_size / 2.0:g} s: "
-                        f"{_sentence(error)}",
-                    )
-                else:
-                    yield Finding(
-                        "step size",
-                        "warning",
-                        f"It takes {header.step_size:g} s only; `decimation` observes every n-th step.",
-                    )
-                return
+                    text = f"It declares that it takes any step size, but not {half:g} s: {_sentence(error)}"
+                    return "problem", text
+                return (
+                    "warning",
+                    f"It takes {header.step_size:g} s only; `decimation` observes every n-th step.",
+                )
         scale = max(float(np.abs(self._series).max(initial=0.0)), 1e-300)
         error_size = float(np.abs(halved - self._series).max(initial=0.0)) / scale
         if error_size <= _SAME:
-            yield Finding("step size", "ok", "Half the step size gives the same outputs.")
-        else:
-            verdict: Verdict = "ok" if error_size <= _CLOSE else "warning"
-            advice = "" if verdict == "ok" else "; choose a smaller one"
-            if error_size > _MUCH:
-                advice = "; it counts steps rather than time, or the step is far too large"
-            yield Finding(
-                "step size",
-                verdict,
-                f"Half the step size changes the outputs by {100.0 * error_size:.2g} % of the "
-                f"largest{advice}.",
-            )
+            return "ok", "Half the step size gives the same outputs."
+        advice = "" if error_size <= _CLOSE else "; choose a smaller one"
+        if error_size > _MUCH:
+            advice = "; it counts steps rather than time, or the step is far too large"
+        text = f"Half the step size changes the outputs by {100.0 * error_size:.2g} % of the largest{advice}."
+        return "warning" if advice else "ok", text
 
-    def _edges(self) -> Iterator[Finding]:
+    def _edges(self) -> Told:
         """Fly one step at the ends of each range."""
         tried, refused = 0, []
         with closing(self._asset()) as asset:
             for role in INPUT_ROLES:
-                for name, item in getattr(self._binding, role).items():
+                for name, item in self._binding.inputs(role).items():
                     for value in self._ends(asset, role, name):
                         tried += 1
-                        inputs = {kind: dict(values) for kind, values in self._base.items()}
-                        inputs[role][name] = value
+                        inputs = self._base | {role: self._base[role] | {name: value}}
                         try:
                             asset.reset(**self._base)
                             asset.step(**inputs)
                         except FmuError as error:
                             refused.append(f"{item.variable} = {value:g} {item.unit}: {_sentence(error)}")
         if refused:
-            yield Finding(
-                "range edges",
-                "warning",
-                f"{len(refused)} of {tried} ends of ranges fail, such as {refused[0]}",
-            )
-        elif tried:
-            yield Finding("range edges", "ok", f"{tried} ends of ranges give finite outputs.")
-        else:
-            yield Finding("range edges", "skipped", "No input has a range.")
+            return "warning", f"{len(refused)} of {tried} ends of ranges fail, such as {refused[0]}"
+        if tried:
+            return "ok", f"{tried} ends of ranges give finite outputs."
+        return "skipped", "No input has a range."
 
     def _ends(self, asset: FmiAsset, role: str, name: str) -> list[float]:
-        low, high = asset.input_range(role, name)
         if isinstance(self._base[role][name], list):
             return []
-        return [end for end in (low, high) if math.isfinite(end) and abs(end) < 1e9]
+        ends = asset.input_range(role, name)
+        return [end for end in ends if math.isfinite(end) and abs(end) < 1e9]
 
-    def _reset(self) -> Iterator[Finding]:
+    def _reset(self) -> Told:
         with closing(self._asset()) as asset:
             first, second = self._fly(asset), self._fly(asset)
             trial = asset.reset_trial
         if not np.array_equal(first, second):
-            yield Finding(
-                "reset", "problem", f"Started again it is not as new ({_difference(first, second)})."
-            )
-        elif trial.works is False:
-            yield Finding("reset", "problem" if trial.lies else "warning", trial.fault)
-        else:
-            yield Finding("reset", "ok", "After a reset it is as new.")
+            return "problem", f"Started again it is not as new ({_difference(first, second)})."
+        if trial.works is False:
+            return "problem" if trial.lies else "warning", trial.fault
+        return "ok", "After a reset it is as new."
 
-    def _instances(self, cycles: int, progress: Progress) -> Finding:
+    def _instances(self, cycles: int, progress: Progress) -> Told:
         """Make, step and free instances in one process, and look at its memory."""
-        done = 0
+        done = half = 0
         try:
             asset = self._asset()
             with closing(asset), progress.stage("Making instances", cycles, "instances") as stage:
                 asset.reset(**self._base)
-                half = 0
                 for done in range(cycles):
                     if done == cycles // 2:
                         half = asset.worker_memory or 0
@@ -281,18 +243,14 @@ class Flights:
                     stage.advance()
                 end = asset.worker_memory or 0
         except FmuError as error:
-            return Finding(
-                "instances", "problem", f"Instance {done + 1} of {cycles} in one process: {_sentence(error)}"
-            )
+            return "problem", f"Instance {done + 1} of {cycles} in one process: {_sentence(error)}"
         growth = (end - half) / _KIBIBYTE / max(cycles - cycles // 2, 1)
         text = f"{cycles} made and freed in one process; it grows by {max(growth, 0.0):.2g} KiB with each"
-        if end - half < _NOISE:
-            return Finding("instances", "ok", f"{text}.")
+        if end - half < _NOISE or growth <= _SMALL_GROWTH:
+            return "ok", f"{text}."
         if growth > _LARGE_GROWTH:
-            return Finding("instances", "problem", f"{text}: it leaks.")
-        if growth > _SMALL_GROWTH:
-            return Finding("instances", "warning", f"{text}: it leaks a little.")
-        return Finding("instances", "ok", f"{text}.")
+            return "problem", f"{text}: it leaks."
+        return "warning", f"{text}: it leaks a little."
 
 
 def _row(asset: FmiAsset, inputs: Inputs) -> list[float]:

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
+from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.contents import (
-    PLACEHOLDER,
     FmuInfo,
     check_start,
     checked_target,
@@ -103,16 +103,14 @@ def _members(companion: Any, table: tuple[FmuVariable, ...], setting: Mapping[st
     """Return the files of the archive, with the placeholder wherever the content hash will stand."""
     own = files("fmu_asset.companions")
     folder = f"resources/{companion.NAME}_{PLACEHOLDER}_runtime/companions"
+    declared = Declaration(
+        companion.NAME, companion.DESCRIPTION, table, _UNITS, _STATUS, companion.dependencies(setting)
+    )
     members = python_members(
-        companion.NAME,
+        declared,
         "Companion",
         imports=_IMPORTS.format(name=companion.NAME),
-        table=table,
-        description=companion.DESCRIPTION,
         resources={"setting.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode()},
-        units=_UNITS,
-        enumerations=_STATUS,
-        dependencies=companion.dependencies(setting),
         host="It runs in any Python host; the standard library is enough.",
     )
     members[f"{folder}/__init__.py"] = b'"""What the FMU does."""\n'

@@ -37,40 +37,37 @@ _DECIMALS = 12
 def variable_table(setting: Mapping[str, Any]) -> tuple[FmuVariable, ...]:
     """Return the table of variables; `setting` holds `start`, start values by name."""
     table = Table(setting.get("start", {}))
-    table.add("load_factor", "input", "Load factor that is held over the step", unit="1", box=(-10.0, 10.0),
-              default=1.0)  # fmt: skip
-    for region in REGIONS:
-        table.add(f"initial.{region}", "parameter", f"Loss of region {region[1]} at the start",
-                  unit="1", display="%", box=(0.0, 1.0))  # fmt: skip
-    table.add("ceiling", "parameter", "Largest loss", unit="1", display="%", box=(0.0, 1.0), default=0.8)
-    table.add(
-        "period", "parameter", "Time from one mark to the next", unit="s", box=(1e-6, None), default=1.0
-    )
-    table.add("reference_load_factor", "parameter", "Load factor n_ref at which rates and probabilities hold",
-              unit="1", box=(1e-3, 10.0), default=3.0)  # fmt: skip
-    table.add("exponent", "parameter", "Exponent of the load factor in rates and probabilities", unit="1",
-              box=(0.0, 20.0))  # fmt: skip
-    for region in REGIONS:
-        table.add(f"rate.{region}", "parameter", f"Growth of region {region[1]} at the reference load factor",
-                  unit="1/s", box=(0.0, None))  # fmt: skip
-    table.add("level", "parameter", "By how much chance worsens a region", unit="1", display="%",
-              box=(0.0, 1.0), default=0.2)  # fmt: skip
-    for region in REGIONS:
-        table.add(f"probability.{region}", "parameter",
-                  f"Probability that region {region[1]} worsens at a mark, at the reference load factor",
-                  unit="1", display="%", box=(0.0, 1.0))  # fmt: skip
+    loss: dict[str, Any] = {"unit": "1", "display": "%", "box": (0.0, 1.0)}
+    per_region = [(region, f"region {region[1]}") for region in REGIONS]
+    text = "Load factor that is held over the step"
+    table.add("load_factor", "input", text, unit="1", box=(-10.0, 10.0), default=1.0)
+    for region, name in per_region:
+        table.add(f"initial.{region}", "parameter", f"Loss of {name} at the start", **loss)
+    table.add("ceiling", "parameter", "Largest loss", default=0.8, **loss)
+    text = "Time from one mark to the next"
+    table.add("period", "parameter", text, unit="s", box=(1e-6, None), default=1.0)
+    text = "Load factor n_ref at which rates and probabilities hold"
+    table.add("reference_load_factor", "parameter", text, unit="1", box=(1e-3, 10.0), default=3.0)
+    text = "Exponent of the load factor in rates and probabilities"
+    table.add("exponent", "parameter", text, unit="1", box=(0.0, 20.0))
+    for region, name in per_region:
+        text = f"Growth of {name} at the reference load factor"
+        table.add(f"rate.{region}", "parameter", text, unit="1/s", box=(0.0, None))
+    table.add("level", "parameter", "By how much chance worsens a region", default=0.2, **loss)
+    for region, name in per_region:
+        text = f"Probability that {name} worsens at a mark, at the reference load factor"
+        table.add(f"probability.{region}", "parameter", text, **loss)
     table.add("seed", "parameter", "Seed of chance", kind="Integer", box=(0, LARGEST_SEED))
     for entry in range(1, SCRIPT_LENGTH + 1):
         table.add(f"script[{entry}].first", "parameter", f"First mark of entry {entry}", unit="s")
         table.add(f"script[{entry}].last", "parameter", f"Last mark of entry {entry}", unit="s")
-        for region in REGIONS:
-            table.add(f"script[{entry}].{region}", "parameter",
-                      f"What region {region[1]} loses at each mark of entry {entry}",
-                      unit="1", display="%", box=(-1.0, 1.0))  # fmt: skip
-    for region in REGIONS:
-        table.add(region, "output", f"Stiffness that region {region[1]} has lost, as a fraction",
-                  unit="1", display="%")  # fmt: skip
-    table.add("status", "output", "What became of the last call", kind="Enumeration", enumeration="Status")
+        for region, name in per_region:
+            text = f"What {name} loses at each mark of entry {entry}"
+            table.add(f"script[{entry}].{region}", "parameter", text, **(loss | {"box": (-1.0, 1.0)}))
+    for region, name in per_region:
+        text = f"Stiffness that {name} has lost, as a fraction"
+        table.add(region, "output", text, unit="1", display="%")
+    table.add_status()
     return table.rows()
 
 
@@ -92,19 +89,18 @@ class DamageGrowth:
         self._begin = 0.0
         self._mark = 0
         self._last_load = 0.0
-        self._take({})
 
     def _take(self, parameters: Mapping[str, float]) -> None:
         """Keep the parameters in the form in which a step needs them."""
-        self._ceiling = parameters.get("ceiling", 1.0)
-        self._period = parameters.get("period", 1.0)
-        self._reference = parameters.get("reference_load_factor", 1.0)
-        self._exponent = parameters.get("exponent", 0.0)
-        self._level, self._seed = parameters.get("level", 0.0), int(parameters.get("seed", 0))
-        self._rate = [parameters.get(f"rate.{region}", 0.0) for region in REGIONS]
-        self._chance = [parameters.get(f"probability.{region}", 0.0) for region in REGIONS]
+        self._ceiling = parameters["ceiling"]
+        self._period = parameters["period"]
+        self._reference = parameters["reference_load_factor"]
+        self._exponent = parameters["exponent"]
+        self._level, self._seed = parameters["level"], int(parameters["seed"])
+        self._rate = [parameters[f"rate.{region}"] for region in REGIONS]
+        self._chance = [parameters[f"probability.{region}"] for region in REGIONS]
         entries = [
-            [parameters.get(f"script[{entry}].{key}", 0.0) for key in ("first", "last", *REGIONS)]
+            [parameters[f"script[{entry}].{key}"] for key in ("first", "last", *REGIONS)]
             for entry in range(1, SCRIPT_LENGTH + 1)
         ]
         self._script = [entry for entry in entries if any(entry[2:])]

@@ -35,35 +35,34 @@ def variable_table(setting: Mapping[str, Any]) -> tuple[FmuVariable, ...]:
     """Return the table of variables; `setting` holds `gauge_count` and `start`, start values by name."""
     table = Table(setting.get("start", {}))
     gauges = range(1, gauge_count(setting) + 1)
+    strain: dict[str, Any] = {"unit": "1", "display": "microstrain"}
+    limited = strain | {"box": (-LARGEST_STRAIN, LARGEST_STRAIN)}
     for gauge in gauges:
-        table.add(f"strain[{gauge}]", "input", f"True strain at gauge {gauge}", unit="1",
-                  display="microstrain", box=(-LARGEST_STRAIN, LARGEST_STRAIN))  # fmt: skip
-    table.add("noise", "parameter", "Standard deviation of the noise of every gauge", unit="1",
-              display="microstrain", box=(0.0, LARGEST_STRAIN))  # fmt: skip
+        table.add(f"strain[{gauge}]", "input", f"True strain at gauge {gauge}", **limited)
+    text = "Standard deviation of the noise of every gauge"
+    table.add("noise", "parameter", text, box=(0.0, LARGEST_STRAIN), **strain)
     table.add("seed", "parameter", "Seed of noise and chance", kind="Integer", box=(0, LARGEST_SEED))
-    table.add("dropout_probability", "parameter", "Probability that a reading of a gauge is lost", unit="1",
-              display="%", box=(0.0, 1.0))  # fmt: skip
+    text = "Probability that a reading of a gauge is lost"
+    table.add("dropout_probability", "parameter", text, unit="1", display="%", box=(0.0, 1.0))
     table.add("blackout.start", "parameter", "All gauges are lost after this time", unit="s")
     table.add("blackout.end", "parameter", "All gauges are back after this time", unit="s")
     for gauge in gauges:
-        table.add(
-            f"gain[{gauge}]", "parameter", f"Gain of gauge {gauge}", unit="1", box=(-10.0, 10.0), default=1.0
-        )
-        table.add(f"offset[{gauge}]", "parameter", f"Offset of gauge {gauge}", unit="1",
-                  display="microstrain", box=(-LARGEST_STRAIN, LARGEST_STRAIN))  # fmt: skip
-        table.add(f"drift_rate[{gauge}]", "parameter", f"Drift of gauge {gauge}", unit="1/s",
-                  display="microstrain/s")  # fmt: skip
-        table.add(
-            f"drift_start[{gauge}]", "parameter", f"Time at which gauge {gauge} begins to drift", unit="s"
-        )
-        table.add(f"dropout_start[{gauge}]", "parameter", f"Gauge {gauge} is lost after this time", unit="s")
-        table.add(f"dropout_end[{gauge}]", "parameter", f"Gauge {gauge} is back after this time", unit="s")
+        text = f"Gain of gauge {gauge}"
+        table.add(f"gain[{gauge}]", "parameter", text, unit="1", box=(-10.0, 10.0), default=1.0)
+        table.add(f"offset[{gauge}]", "parameter", f"Offset of gauge {gauge}", **limited)
+        text = f"Drift of gauge {gauge}"
+        table.add(f"drift_rate[{gauge}]", "parameter", text, unit="1/s", display="microstrain/s")
+        for name, text in (
+            ("drift_start", f"Time at which gauge {gauge} begins to drift"),
+            ("dropout_start", f"Gauge {gauge} is lost after this time"),
+            ("dropout_end", f"Gauge {gauge} is back after this time"),
+        ):
+            table.add(f"{name}[{gauge}]", "parameter", text, unit="s")
     for gauge in gauges:
-        table.add(f"reading[{gauge}]", "output", f"What gauge {gauge} says; 0 where it is lost", unit="1",
-                  display="microstrain")  # fmt: skip
+        table.add(f"reading[{gauge}]", "output", f"What gauge {gauge} says; 0 where it is lost", **strain)
     for gauge in gauges:
         table.add(f"received[{gauge}]", "output", f"Whether gauge {gauge} is received", kind="Boolean")
-    table.add("status", "output", "What became of the last call", kind="Enumeration", enumeration="Status")
+    table.add_status()
     return table.rows()
 
 
@@ -94,26 +93,25 @@ class StrainGauges:
     def __init__(self, count: int) -> None:
         self._count = count
         self._samples = 0
-        self._take({})
 
     def _take(self, parameters: Mapping[str, float]) -> None:
         """Keep the parameters in the form in which a reading needs them."""
         gauges = range(1, self._count + 1)
 
-        def each(name: str, default: float) -> list[float]:
-            return [parameters.get(f"{name}[{gauge}]", default) for gauge in gauges]
+        def each(name: str) -> list[float]:
+            return [parameters[f"{name}[{gauge}]"] for gauge in gauges]
 
-        self._gain, self._offset = each("gain", 1.0), each("offset", 0.0)
+        self._gain, self._offset = each("gain"), each("offset")
         self._drift = [
             (index, rate, parameters[f"drift_start[{index + 1}]"])
-            for index, rate in enumerate(each("drift_rate", 0.0))
+            for index, rate in enumerate(each("drift_rate"))
             if rate
         ]
-        windows = zip(each("dropout_start", 0.0), each("dropout_end", 0.0), strict=True)
+        windows = zip(each("dropout_start"), each("dropout_end"), strict=True)
         self._windows = [(index, *window) for index, window in enumerate(windows) if window[1] > window[0]]
-        self._blackout = (parameters.get("blackout.start", 0.0), parameters.get("blackout.end", 0.0))
-        self._noise, self._seed = parameters.get("noise", 0.0), int(parameters.get("seed", 0))
-        self._chance = parameters.get("dropout_probability", 0.0)
+        self._blackout = (parameters["blackout.start"], parameters["blackout.end"])
+        self._noise, self._seed = parameters["noise"], int(parameters["seed"])
+        self._chance = parameters["dropout_probability"]
 
     def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> list[float]:
         """Give the first readings."""

@@ -1,26 +1,145 @@
 """What goes into the compiled FMU: description, sources, FMI headers, data file."""
 
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from importlib.metadata import distribution, version
+from dataclasses import fields, replace
+from importlib.metadata import distribution
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+import numpy.typing as npt
 
 from fe.runtime.reduced_arrays import ReducedArrays
-from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
-from fmu_asset.description import documentation_page, model_description
+from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
+from fmu_asset.description import (
+    Declaration,
+    arrays_of,
+    documentation_page,
+    model_description,
+    xml_bytes,
+)
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.table import Roles
-from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
+from fmu_asset.slaves.variables import TRANSIENT, FmuVariable
 
-from .arrays import arrays_of
 from .compiler import PLATFORM, Platform, compile_library
-from .data_file import data_file_bytes
-from .description3 import build_description, model_description3
-from .exchange import exchange_table
 from .variable_header import variable_sources
+
+FloatArray = npt.NDArray[np.float64]
+
+MAGIC = b"UAVTWIN\0"
+VERSION = 2
+NAME_BYTES = 32
+_COUNT = struct.Struct("<II")
+
+
+_UNUSED = ("nominal", "damping", "validity_box", "followed_shapes")
+"""What the sources take from the variables, or do not need."""
+
+
+def data_file_bytes(model: ReducedArrays) -> bytes:
+    """Return the content of the data file of a model; equal models give equal bytes.
+
+    Parameters
+    ----------
+    model : ReducedArrays
+        The reduced structure. Its arrays are written under their names, scalars as arrays without dimension,
+        and how many of each kind can be chosen in the place of names; arrays without values are left out.
+
+    Returns
+    -------
+    bytes
+        Magic, version, arrays, CRC-32.
+    """
+    values: dict[str, Any] = {item.name: getattr(model, item.name) for item in fields(ReducedArrays)}
+    values["chosen_counts"] = tuple(
+        len(names) for names in (model.parameters, model.regions, model.masses, model.controls)
+    )
+    values["gauge_count"] = len(model.gauges)
+    arrays = {
+        name: np.asarray(value, dtype=np.float64)
+        for name, value in values.items()
+        if name not in _UNUSED and not isinstance(value, str) and np.size(value)
+    }
+    return pack_arrays(arrays)
+
+
+def pack_arrays(arrays: Mapping[str, FloatArray]) -> bytes:
+    """Return arrays as the bytes of a data file.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        The arrays by name, at most 31 ASCII letters; float64.
+
+    Returns
+    -------
+    bytes
+        The file.
+    """
+    parts = [MAGIC, _COUNT.pack(VERSION, len(arrays))]
+    for name in sorted(arrays):
+        array = arrays[name]
+        parts.append(name.encode("ascii")[: NAME_BYTES - 1].ljust(NAME_BYTES, b"\0"))
+        parts.append(_COUNT.pack(array.ndim, 0))
+        parts.append(struct.pack(f"<{array.ndim}Q", *array.shape))
+        parts.append(np.ascontiguousarray(array, dtype="<f8").tobytes())
+    content = b"".join(parts)
+    return content + struct.pack("<I", zlib.crc32(content))
+
+
+STATES = ("modal_displacement", "modal_velocity")
+
+
+def exchange_table(
+    table: Sequence[FmuVariable], mode_count: int, *, arrays: bool = False
+) -> tuple[FmuVariable, ...]:
+    """Return the table for model exchange.
+
+    Parameters
+    ----------
+    table : sequence of FmuVariable
+        That of co-simulation.
+    mode_count : int
+        Number M of modes.
+    arrays : bool
+        Whether the rows are to become arrays, whose derivative is an array too.
+
+    Returns
+    -------
+    tuple of FmuVariable
+        The same with discrete health and the transient response, then 2 M states (coordinates of the modes
+        and their rates, mass-normalised) and as many derivatives of them.
+    """
+    rows = []
+    for row in table:
+        if row.causality == "input" and row.name.startswith("health."):
+            row = replace(row, variability="discrete")
+        elif row.name == "response":
+            row = replace(row, start=float(TRANSIENT))
+        rows.append(row)
+    states = [f"{name}[{mode}]" for name in STATES for mode in range(1, mode_count + 1)]
+    rates = [f"der({name})[{mode}]" for name in STATES for mode in range(1, mode_count + 1)]
+    for name in (*states, *(rates if arrays else (f"der({state})" for state in states))):
+        what = "Coordinate" if "displacement" in name else "Rate of the coordinate"
+        text = f"{what} of mode {name.partition('[')[2].partition(']')[0]}, mass-normalised"
+        rows.append(
+            FmuVariable(
+                name=name,
+                reference=len(rows),
+                kind="Real",
+                causality="local",
+                variability="continuous",
+                description=f"Derivative of: {text}" if name.startswith("der(") else text,
+            )
+        )
+    return tuple(rows)
+
 
 DATA_FILE = "resources/reduced_model.bin"
 
@@ -55,34 +174,22 @@ HOST = "It is compiled C and needs nothing but the C library; its sources are in
 
 def compiled_members(
     model: ReducedArrays,
-    table: Sequence[FmuVariable],
+    declared: Declaration,
     roles: Roles,
     *,
-    units: Sequence[Unit] = UNITS,
-    model_name: str,
-    placeholder: str,
-    description: str,
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
 ) -> dict[str, bytes]:
-    """Return the files of a compiled FMU, all but its binary.
+    """Return the files of a compiled FMU, all but its binary; a placeholder stands for the content hash.
 
     Parameters
     ----------
     model : ReducedArrays
         The reduced structure.
-    table : sequence of FmuVariable
-        The variables, in order of their value reference.
+    declared : Declaration
+        What it declares for co-simulation.
     roles : Roles
-        Which of them is what.
-    units : sequence of Unit
-        Units of the table.
-    model_name : str
-        Model name, with which the model identifier begins.
-    placeholder : str
-        Stands for the GUID, the end of the identifier and the mark of saved states.
-    description : str
-        One sentence for people.
+        Which of its variables is what.
     fmi : {2, 3}
         Version of FMI: the same sources but for its functions. In 3 numbered variables, and inputs and
         outputs such as `health.z1`, pass as arrays.
@@ -99,50 +206,38 @@ def compiled_members(
     FmuBuildError
         If fmpy's headers are missing.
     """
-    sources, identifier = _sources(fmi), f"{model_name}_{placeholder}"
+    sources, table = _sources(fmi), declared.table
     if interface == "model-exchange":
         table = exchange_table(table, model.mode_count, arrays=fmi == 3)
     if fmi == 3:
         table = (*table, replace(_TIME, reference=len(table)))
+    declared = replace(declared, table=table)
     arrays = arrays_of(table) if fmi == 3 else ()
-    made = variable_sources(table, roles, guid=placeholder, content_tag=placeholder, arrays=arrays)
-    sources |= {name: text.encode() for name, text in made.items()}
+    sources |= variable_sources(table, roles, arrays)
     listed = sorted(name for name in sources if name.endswith(".c"))
-    sources["CMakeLists.txt"] = _cmake_lists(identifier, listed, fmi)
+    sources["CMakeLists.txt"] = _cmake_lists(declared.identifier, listed, fmi)
     if fmi == 3:
-        sources["buildDescription.xml"] = build_description(identifier, listed)
-        model_description_text = model_description3(
-            model_name=model_name,
-            identifier=identifier,
-            guid=placeholder,
-            table=table,
-            arrays=arrays,
-            units=units,
-            description=description,
-            version=version("uav-twin"),
-        )
-    else:
-        model_description_text = model_description(
-            model_name=model_name,
-            identifier=identifier,
-            guid=placeholder,
-            table=table,
-            units=units,
-            description=description,
-            version=version("uav-twin"),
-            generation_tool="uav-twin",
-            source_files=listed,
-        )
+        sources["buildDescription.xml"] = _build_description(declared.identifier, listed)
     return {
-        "modelDescription.xml": model_description_text,
-        "documentation/index.html": documentation_page(
-            table, description, host=HOST, fmi=fmi, interface=interface
+        "modelDescription.xml": model_description(
+            declared, generation_tool="uav-twin", source_files=listed, fmi=fmi, arrays=arrays
         ),
+        "documentation/index.html": documentation_page(declared, HOST, fmi=fmi, interface=interface),
         DATA_FILE: data_file_bytes(model),
         f"resources/{DESIGN_RECORD}": design_record(model.design_hash),
         **{f"sources/{name}": content for name, content in sources.items()},
         **{f"sources/{name}": content for name, content in fmi_headers(fmi).items()},
     }
+
+
+def _build_description(identifier: str, source_files: Sequence[str]) -> bytes:
+    """Return sources/buildDescription.xml: which sources the binary of that identifier is made of."""
+    root = Element("fmiBuildDescription", fmiVersion="3.0")
+    configuration = SubElement(root, "BuildConfiguration", modelIdentifier=identifier)
+    listed = SubElement(configuration, "SourceFileSet", language="C11")
+    for name in source_files:
+        SubElement(listed, "SourceFile", name=name)
+    return xml_bytes(root)
 
 
 def _cmake_lists(identifier: str, names: Sequence[str], fmi: FmiVersion) -> bytes:

@@ -1,16 +1,22 @@
 """The variables of a structure as C: value references, ranges and start values, from the one table."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from fmu_asset.description import LOG_CATEGORIES
+from fmu_asset.description import LOG_CATEGORIES, PLACEHOLDER, ArrayVariable
 from fmu_asset.slaves.table import Roles
 from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable
 
-from .arrays import ArrayVariable
-
 _NOTE = "/* Made by the build of the FMU from its table of variables; a change here is lost. */\n"
 
+_PLACES = {
+    "DAMPING_ALPHA": "damping.alpha",
+    "DAMPING_BETA": "damping.beta",
+    "RESPONSE": "response",
+    "STRAIN_BOUND": "strain_error_bound",
+    "FIRST_FREQUENCY": "frequency[1]",
+    "STATUS": "status",
+}
 _DECLARATIONS = """#if defined(__GNUC__) && !defined(_WIN32)
 #pragma GCC visibility push(hidden)
 #endif
@@ -46,14 +52,9 @@ extern const unsigned int structure_time_place;
 
 
 def variable_sources(
-    table: Sequence[FmuVariable],
-    roles: Roles,
-    *,
-    guid: str,
-    content_tag: str,
-    arrays: Sequence[ArrayVariable] = (),
-) -> dict[str, str]:
-    """Return the C sources that say what the variables are.
+    table: Sequence[FmuVariable], roles: Roles, arrays: Sequence[ArrayVariable] = ()
+) -> dict[str, bytes]:
+    """Return the C sources that say what the variables are; placeholders stand for GUID and content tag.
 
     Parameters
     ----------
@@ -61,28 +62,24 @@ def variable_sources(
         The variables, in order of their value reference.
     roles : Roles
         Which of them is what.
-    guid : str
-        The GUID that `fmi2Instantiate` asks for.
-    content_tag : str
-        What marks a saved state as one of this FMU, at most 16 letters.
     arrays : sequence of ArrayVariable
         Which rows of the table pass together, in FMI 3.
 
     Returns
     -------
-    dict of str to str
+    dict of str to bytes
         File name to content: `structure_variables.h` and `structure_variables.c`.
     """
+    place = {row.name: row.reference for row in table}
     return {
-        "structure_variables.h": _header(table, roles, guid, content_tag),
-        "structure_variables.c": _source(table, roles, arrays),
+        "structure_variables.h": _header(table, roles, place).encode(),
+        "structure_variables.c": _source(table, roles, place, arrays).encode(),
     }
 
 
-def _header(table: Sequence[FmuVariable], roles: Roles, guid: str, content_tag: str) -> str:
+def _header(table: Sequence[FmuVariable], roles: Roles, place: Mapping[str, int]) -> str:
     """Return `structure_variables.h`: every constant, and the type of a row of the table."""
     outputs = [row for row in table if row.causality == "output"]
-    place = _places(table)
     counts = {
         "VARIABLE_COUNT": len(table),
         "INPUT_COUNT": sum(row.causality == "input" for row in table),
@@ -97,16 +94,7 @@ def _header(table: Sequence[FmuVariable], roles: Roles, guid: str, content_tag: 
         "STATE_COUNT": sum(row.causality == "local" for row in table) // 2,
     }
     defines = _defines(counts.items())
-    references = _defines(
-        (
-            ("DAMPING_ALPHA", place["damping.alpha"]),
-            ("DAMPING_BETA", place["damping.beta"]),
-            ("RESPONSE", place["response"]),
-            ("STRAIN_BOUND", place["strain_error_bound"]),
-            ("FIRST_FREQUENCY", place["frequency[1]"]),
-            ("STATUS", place["status"]),
-        )
-    )
+    references = _defines((name, place[variable]) for name, variable in _PLACES.items())
     values = "".join(
         _defines((f"{e.name}_{name}".upper(), value) for name, value, _ in e.items) for e in ENUMERATIONS
     )
@@ -120,8 +108,8 @@ def _header(table: Sequence[FmuVariable], roles: Roles, guid: str, content_tag: 
 #include <stdbool.h>
 #include <stddef.h>
 
-#define STRUCTURE_GUID "{guid}"
-#define STRUCTURE_CONTENT_TAG "{content_tag}"
+#define STRUCTURE_GUID "{PLACEHOLDER}"
+#define STRUCTURE_CONTENT_TAG "{PLACEHOLDER}"
 
 {defines}
 /* Value references of what every structure has; they are also the indices of the table. */
@@ -133,9 +121,10 @@ def _header(table: Sequence[FmuVariable], roles: Roles, guid: str, content_tag: 
 {_DECLARATIONS}"""
 
 
-def _source(table: Sequence[FmuVariable], roles: Roles, arrays: Sequence[ArrayVariable]) -> str:
+def _source(
+    table: Sequence[FmuVariable], roles: Roles, place: Mapping[str, int], arrays: Sequence[ArrayVariable]
+) -> str:
     """Return `structure_variables.c`: the table, and which of it is what."""
-    place = _places(table)
     chosen = "".join(f"    {place[name]},\n" for name in roles.chosen)
     others = "".join(
         f"const unsigned int structure_{what}_place = {len(table) if name is None else place[name]};\n"
@@ -193,10 +182,6 @@ def _number(value: float) -> str:
     if math.isinf(value):
         return "HUGE_VAL" if value > 0.0 else "-HUGE_VAL"
     return repr(float(value))
-
-
-def _places(table: Sequence[FmuVariable]) -> dict[str, int]:
-    return {row.name: row.reference for row in table}
 
 
 def _defines(items: Iterable[tuple[str, int]]) -> str:

@@ -2,26 +2,29 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import numpy as np
 
-from fmu_asset.door.binding import INPUT_ROLES, Binding
-from fmu_asset.door.observation import Observation
+from fmu_asset.door.binding import Binding
+from fmu_asset.door.exchange import Inputs, Values
+from fmu_asset.door.reading import Observation
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.stepped import SteppedAsset
+from fmu_asset.door.simulation import ObservationHistory, SteppedAsset
 from fmu_asset.errors import (
     AlgebraicLoopError,
     BindingError,
     CouplingError,
+    FmuEndedError,
     FmuError,
     FmuInputError,
     FmuStateError,
     IterationError,
 )
+from reporting.progress import Progress, SilentProgress
 
-from .layout import Layout
-from .roles import Roles, resolve_roles
+from .layout import FloatArray, Part, Taps, naming, parts_of
+from .roles import parameter_values, resolve_roles
 from .saved import CoupledState, wiring_hash
 from .schedule import Schedule, loop_sentence
 from .structure import SystemStructure, listed
@@ -82,7 +85,7 @@ class CoupledAsset(SteppedAsset):
         tolerance: float = 1e-9,
         isolated: bool = True,
         step_timeout: float | None = None,
-        parameters: Mapping[str, float] | None = None,
+        parameters: Values | None = None,
     ) -> None:
         if algorithm not in ALGORITHMS:
             raise CouplingError(f"The algorithm must be one of {listed(ALGORITHMS)}, and {algorithm!r} came.")
@@ -97,23 +100,25 @@ class CoupledAsset(SteppedAsset):
         loops = self._wiring.schedule.loops
         if loops and iterations == 1 and not self._jacobi:  # Jacobi delays every connection
             raise AlgebraicLoopError(loop_sentence(loops))
-        self._roles: Roles = resolve_roles(self._wiring, binding)
-        self._ranges = {
-            (role, name): (
-                -math.inf if item.minimum is None else item.minimum,
-                math.inf if item.maximum is None else item.maximum,
-            )
-            for role in INPUT_ROLES
-            for name, item in binding.inputs(role).items()
+        self._roles = resolve_roles(self._wiring, binding)
+        self._parts = parts_of(self._wiring, binding, self._roles)
+        self._take_parameters(parameters or {})
+        self._held = {name: dict(part.constants) for name, part in self._parts.items()}
+        self._ends = [end for part in self._parts.values() for end in part.ends]
+        place = {end: index for index, end in enumerate(self._ends)}
+        self._spans = {
+            name: slice(place[part.ends[0]], place[part.ends[-1]] + 1) for name, part in self._parts.items()
         }
-        self._layout = Layout(self._wiring, binding, self._roles)
-        self._parameters = {name: float(value) for name, value in (parameters or {}).items()}
-        self._parameter_values = self._layout.parameters(self._parameters)
-        self._held: list[dict[str, float]] = [dict(constants) for constants in self._layout.constants]
-        self._now = [0.0] * self._layout.output_count
-        self._before = self._earlier = list(self._now)
-        self._stepped: set[int] = set()
-        self._assets = self._open(isolated, step_timeout)
+        self._taps = {name: Taps(part.fed.values(), place) for name, part in self._parts.items()}
+        self._observed = Taps(self._roles.observations, place)
+        self._monitored = Taps(self._roles.monitors.values(), place)
+        self._now = np.zeros(len(self._ends))
+        self._before = self._earlier = self._now.copy()
+        self._stepped: set[str] = set()
+        self._assets = {
+            name: self._open(part, isolated=isolated, step_timeout=step_timeout)
+            for name, part in self._parts.items()
+        }
         if iterations > 1:
             self._check_restorable()
         self._digest = wiring_hash(self._wiring, binding, algorithm, iterations, tolerance)
@@ -139,9 +144,7 @@ class CoupledAsset(SteppedAsset):
     def log(self) -> tuple[tuple[str, str], ...]:
         """The last messages of the FMUs: status, and component with text."""
         return tuple(
-            (status, f"{name}: {text}")
-            for name, asset in zip(self._layout.names, self._assets, strict=True)
-            for status, text in asset.log
+            (status, f"{name}: {text}") for name, asset in self._assets.items() for status, text in asset.log
         )
 
     # ------------------------------------------------------------------ life
@@ -149,43 +152,34 @@ class CoupledAsset(SteppedAsset):
     def close(self) -> None:
         """End all workers; the asset can be opened again by `reset`."""
         self._phase = "closed"
-        for asset in self._assets:
+        for asset in self._assets.values():
             asset.close()
 
-    def reset(
-        self,
-        parameters: Mapping[str, float] | None = None,
-        *,
-        control: Mapping[str, float] | None = None,
-        health: Mapping[str, float] | None = None,
-        load: Mapping[str, float] | None = None,
-    ) -> None:
+    def reset(self, parameters: Values | None = None, **inputs: Unpack[Inputs]) -> None:
         """Go back to the start; arguments and errors are those of `FmiAsset.reset`.
 
         The components are initialised in the order of `schedule`; each takes the initial outputs of those
         before it. An input whose source comes later starts at the FMU's own start value.
         """
         if parameters is not None:
-            self._parameter_values = self._layout.parameters(parameters)
-            self._parameters = {name: float(value) for name, value in parameters.items()}
-        self._held[:] = [dict(constants) for constants in self._layout.constants]
-        self._place(control, health, load)
+            self._take_parameters(parameters)
+        self._held = {name: dict(part.constants) for name, part in self._parts.items()}
+        self._place(inputs)
         self._phase = "broken"
-        known: set[int] = set()
-        try:
-            for index in self._layout.order:
-                start = dict(self._held[index])
-                names, pick = self._layout.fed[index]
-                fed = zip(names, pick.places, pick.of(self._now, self._now), strict=True)
-                start.update({name: value for name, place, value in fed if place in known})
-                self._assets[index].reset(self._settings(index), load=start or None)
-                span = self._layout.spans[index]
-                self._now[span] = self._assets[index].observe().values.tolist()
-                known.update(range(span.start, span.stop))
-        except FmuError as error:
-            self.close()
-            raise self._named(error, index) from error
-        self._before = list(self._now)
+        known: set[str] = set()
+        for name in self.schedule.order:
+            part, asset = self._parts[name], self._assets[name]
+            values = self._fed(part, self._now, self._now)
+            fed = {key: values[key] for key, port in part.fed.items() if port.end.component in known}
+            try:
+                with naming(name):
+                    asset.reset(self._settings(part), load=(self._held[name] | fed) or None)
+                    self._now[self._spans[name]] = asset.observe().values
+            except FmuError:
+                self.close()
+                raise
+            known.add(name)
+        self._before = self._now.copy()
         self._index = 0
         self._phase = "ready"
 
@@ -208,11 +202,11 @@ class CoupledAsset(SteppedAsset):
             If a circle of components does not settle.
         """
         self._opened()
-        self._place(control, health, load)
-        self._earlier, self._before = self._before, list(self._now)
+        self._place({"control": control, "health": health, "load": load})
+        self._earlier, self._before = self._before, self._now.copy()
         self._stepped.clear()
         self._phase = "broken"
-        for group, circular in self._layout.groups:
+        for group, circular in zip(self.schedule.groups, self.schedule.circular, strict=True):
             if circular and self._iterations > 1:
                 self._iterate(group)
             else:
@@ -226,6 +220,39 @@ class CoupledAsset(SteppedAsset):
         self._opened()
         return self._observation()
 
+    def simulate(self, *, steps: int | None = None, progress: Progress | None = None) -> ObservationHistory:
+        """Make many steps of the system from where it is, its inputs held.
+
+        Where an FMU ends its simulation, the result ends with the step before and says so in `ended`.
+
+        Parameters
+        ----------
+        steps : int, optional
+            Number of steps N; one if absent.
+        progress : Progress, optional
+            Where progress is shown.
+
+        Raises
+        ------
+        FmuError
+            As `step`.
+        """
+        count, seen, ended = steps or 1, [], ""
+        with (progress or SilentProgress()).stage("Simulating", total=count, unit="steps") as stage:
+            for _ in range(count):
+                try:
+                    seen.append(self.step())
+                except FmuEndedError as error:
+                    ended = error.sentence
+                    break
+                stage.advance()
+        return ObservationHistory(
+            np.array([item.time for item in seen]),
+            np.array([item.values for item in seen]).reshape(len(seen), len(self._roles.observations)),
+            {name: np.array([item.extra[name] for item in seen]) for name in self._roles.monitors},
+            ended,
+        )
+
     # ------------------------------------------------------------------ state
 
     def save_state(self) -> bytes:
@@ -238,14 +265,16 @@ class CoupledAsset(SteppedAsset):
         """
         if self._phase != "ready":
             raise FmuStateError("There is no state to save before the first reset or step.")
+        states = [asset.save_state() for asset in self._assets.values()]
         return CoupledState(
             system=self._digest,
             index=self._index,
             parameters=self._parameters,
-            held=self._held,
-            outputs=self._now,
-            before=self._before,
-            components=[asset.save_state() for asset in self._assets],
+            held={name: dict(sorted(held.items())) for name, held in self._held.items()},
+            outputs=self._now.tolist(),
+            before=self._before.tolist(),
+            sizes=[len(state) for state in states],
+            body=b"".join(states),
         ).to_bytes()
 
     def restore_state(self, content: bytes) -> None:
@@ -261,118 +290,106 @@ class CoupledAsset(SteppedAsset):
             raise FmuStateError(
                 "The state was saved with another system of FMUs, binding or algorithm; use that one."
             )
+        components = saved.components
         self._phase = "broken"
-        self._parameter_values = self._layout.parameters(saved.parameters)
-        self._parameters = dict(saved.parameters)
-        for index, (asset, state) in enumerate(zip(self._assets, saved.components, strict=True)):
-            try:
+        self._take_parameters(saved.parameters)
+        for (name, asset), state in zip(self._assets.items(), components, strict=True):
+            with naming(name):
                 asset.restore_state(state)
-            except FmuError as error:
-                raise self._named(error, index) from error
-        self._held = [dict(held) for held in saved.held]
-        self._now, self._before = list(saved.outputs), list(saved.before)
+        self._held = saved.held
+        self._now, self._before = np.array(saved.outputs), np.array(saved.before)
         self._index = saved.index
         self._phase = "ready"
 
     # ------------------------------------------------------------------ stepping
 
-    def _pass(self, group: Sequence[int], source: list[float]) -> None:
-        for index in group:
-            held = self._held[index]
-            names, pick = self._layout.fed[index]
-            values = pick.of(source, self._before)
-            asset = self._assets[index]
-            try:
-                if self._layout.linear[index]:
-                    asset.hold(load=dict(zip(names, self._draw(index, values, source), strict=True)))
-                held.update(zip(names, values, strict=True))
+    def _pass(self, group: Sequence[str], source: FloatArray) -> None:
+        for name in group:
+            part, asset, held = self._parts[name], self._assets[name], self._held[name]
+            fed = self._fed(part, source, self._before)
+            with naming(name):
+                if part.linear:
+                    asset.hold(load=self._draw(part, fed, source))
+                held.update(fed)
                 seen = asset.step(load=held)
-                for _ in range(self._layout.substeps[index] - 1):
+                for _ in range(part.substeps - 1):
                     seen = asset.step()
-            except FmuError as error:
-                raise self._named(error, index) from error
-            self._now[self._layout.spans[index]] = seen.values.tolist()
+            self._now[self._spans[name]] = seen.values
             if source is self._now:
-                self._stepped.add(index)
+                self._stepped.add(name)
         self._stepped.update(group)
 
-    def _draw(self, index: int, values: list[float], source: list[float]) -> list[float]:
-        """Return where the lines of the inputs that others feed begin; `values` becomes where they end.
+    def _fed(self, part: Part, now: FloatArray, before: FloatArray) -> dict[str, float]:
+        """Return what the inputs of a component are fed, by their names."""
+        if not part.fed:
+            return {}
+        return dict(zip(part.fed, self._taps[part.name].of(now, before).tolist(), strict=True))
+
+    def _draw(self, part: Part, fed: dict[str, float], source: FloatArray) -> dict[str, float]:
+        """Return where the lines of the inputs that others feed begin; `fed` becomes where they end.
 
         Where the source is not there yet, its last line goes on, within the range of the input.
         """
-        names, pick = self._layout.fed[index]
-        begins = pick.of(self._before, self._before)
-        earlier = pick.of(self._earlier, self._earlier)
-        for position, tap in enumerate(pick.taps):
-            if not self._layout.moving[index][position]:
-                begins[position] = values[position]
-            elif tap.delayed or source is self._before or self._layout.owner[tap.place] not in self._stepped:
-                low, high = self._assets[index].input_range("load", names[position])
-                values[position] = min(max(2.0 * begins[position] - earlier[position], low), high)
+        begins = self._fed(part, self._before, self._before)
+        earlier = self._fed(part, self._earlier, self._earlier)
+        for variable, port in part.fed.items():
+            if variable not in part.moving:
+                begins[variable] = fed[variable]
+            elif port.delayed or source is self._before or port.end.component not in self._stepped:
+                low, high = self._assets[part.name].input_range("load", variable)
+                end = 2.0 * begins[variable] - earlier[variable]
+                fed[variable] = min(max(end, low), high)
         return begins
 
-    def _iterate(self, group: Sequence[int]) -> None:
+    def _iterate(self, group: Sequence[str]) -> None:
         """Repeat the step of a circle of components until what they exchange has settled."""
-        states = {index: self._assets[index].save_state() for index in group}
-        spans = [self._layout.spans[index] for index in group]
-        own = {place for span in spans for place in range(span.start, span.stop)}
-        watched = sorted(own & {place for index in group for place in self._layout.fed[index][1].places})
+        states = {name: self._assets[name].save_state() for name in group}
+        exchanged = {port.end for name in group for port in self._parts[name].fed.values()}
+        watched = [i for i, end in enumerate(self._ends) if end in exchanged and end.component in group]
         for iteration in range(self._iterations):
-            last = list(self._now)
+            last = self._now.copy()
             if iteration:
-                for index, state in states.items():
-                    try:
-                        self._assets[index].restore_state(state)
-                    except FmuError as error:
-                        raise self._named(error, index) from error
+                for name, state in states.items():
+                    with naming(name):
+                        self._assets[name].restore_state(state)
             self._pass(group, last if self._jacobi else self._now)
-            change = {place: abs(self._now[place] - last[place]) for place in watched}
-            if iteration and all(
-                size <= self._tolerance * max(1.0, abs(last[place])) for place, size in change.items()
-            ):
+            change = np.abs(self._now - last)[watched]
+            if iteration and (change <= self._tolerance * np.maximum(1.0, np.abs(last[watched]))).all():
                 return
-        worst = max(watched, key=change.__getitem__)
-        names = listed(self._layout.names[index] for index in group)
-        last_change = f"{self._layout.output_name(worst)} still changes by {change[worst]:.3g}"
+        worst = int(np.argmax(change))
         raise IterationError(
-            f"The components {names} did not settle in {self._iterations} iterations of the step from "
-            f"t = {self.time:g} s ({last_change}); allow more iterations or a larger tolerance, make the "
-            "step smaller, or delay one of their connections."
+            f"The components {listed(group)} did not settle in {self._iterations} iterations of the step "
+            f"from t = {self.time:g} s ({self._ends[watched[worst]]} still changes by {change[worst]:.3g}); "
+            "allow more iterations or a larger tolerance, make the step smaller, or delay one of their "
+            "connections."
         )
 
-    def _place(
-        self,
-        control: Mapping[str, float] | None,
-        health: Mapping[str, float] | None,
-        load: Mapping[str, float] | None,
-    ) -> None:
-        for role, values in zip(INPUT_ROLES, (control, health, load), strict=True):
-            if not values:
-                continue
-            slots = self._layout.entries[role]
-            for name, value in values.items():
-                entries = slots.get(name)
-                if entries is None:
+    def _place(self, inputs: Mapping[str, Any]) -> None:
+        for role, values in inputs.items():
+            slots = self._roles.inputs.get(role, {})
+            for name, value in (values or {}).items():
+                if name not in slots:
                     raise BindingError(
                         f"The binding {self._binding.name} has no {role} {name!r}; it has {listed(slots)}."
                     )
                 if not isinstance(value, int | float):
                     raise FmuInputError(f"{role}.{name} must be a number, but is {value!r}.")
-                low, high = self._ranges[role, name]
+                low, high = self._binding.inputs(role)[name].ends
                 if value < low or value > high:
                     raise FmuInputError(
                         f"{role}.{name} = {value:g} lies outside {low:g} to {high:g}, its range in the "
                         f"binding {self._binding.name}."
                     )
-                for index, variable, conversion in entries:
-                    self._held[index][variable] = float(conversion.to_fmu(value))
+                for port in slots[name]:
+                    number = float(port.conversion.to_fmu(value))
+                    self._held[port.end.component][port.end.variable] = number
 
     def _observation(self) -> Observation:
-        now, before = self._now, self._before
-        names, monitors = self._layout.monitored
-        extra = dict(zip(names, monitors.of(now, before), strict=True))
-        return Observation(np.array(self._layout.observed.of(now, before)), self.time, extra)
+        extra = {}
+        if self._roles.monitors:
+            monitored = self._monitored.of(self._now, self._before).tolist()
+            extra = dict(zip(self._roles.monitors, monitored, strict=True))
+        return Observation(self._observed.of(self._now, self._before), self.time, extra)
 
     def _opened(self) -> None:
         if self._phase == "broken":
@@ -385,48 +402,40 @@ class CoupledAsset(SteppedAsset):
         if self._phase == "new":
             self.reset()
 
-    def _named(self, error: FmuError, index: int) -> FmuError:
-        sentence = f"component {self._layout.names[index]}: {error.sentence}"
-        return type(error)(sentence, error.messages, error.time)
+    def _open(self, part: Part, *, isolated: bool, step_timeout: float | None) -> FmiAsset:
+        with naming(part.name):
+            return FmiAsset(
+                self._wiring.structure.component(part.name).fmu,
+                part.binding,
+                isolated=isolated,
+                step_timeout=step_timeout,
+                parameters=self._settings(part),
+            )
 
-    def _open(self, isolated: bool, step_timeout: float | None) -> list[FmiAsset]:
-        assets = []
-        for index, component in enumerate(self._wiring.structure.components):
-            try:
-                asset = FmiAsset(
-                    component.fmu,
-                    self._layout.component_binding(index),
-                    isolated=isolated,
-                    step_timeout=step_timeout,
-                    parameters=self._settings(index),
-                )
-            except FmuError as error:
-                raise self._named(error, index) from error
-            assets.append(asset)
-        return assets
+    def _take_parameters(self, given: Mapping[str, Any]) -> None:
+        self._tuned = parameter_values(self._binding, self._roles, given)
+        self._parameters = {name: float(value) for name, value in sorted(given.items())}
 
-    def _settings(self, index: int) -> dict[str, float]:
-        return {**self._layout.settings[index], **self._parameter_values[index]}
+    def _settings(self, part: Part) -> dict[str, float]:
+        return part.settings | self._tuned.get(part.name, {})
 
     def _check_restorable(self) -> None:
-        for index in {i for group, circular in self._layout.groups if circular for i in group}:
-            if self._assets[index].state_method != "serialised":
-                raise CouplingError(
-                    f"The component {self._layout.names[index]!r} cannot save and restore its state, which "
-                    "iterations need; allow one iteration only, or delay a connection."
-                )
+        for group, circular in zip(self.schedule.groups, self.schedule.circular, strict=True):
+            for name in group if circular else ():
+                if self._assets[name].state_method != "serialised":
+                    raise CouplingError(
+                        f"The component {name!r} cannot save and restore its state, which iterations need; "
+                        "allow one iteration only, or delay a connection."
+                    )
 
     def describe(self) -> dict[str, Any]:
         """Return the system as plain records for a listing."""
         plan = self.schedule
         return {
             "system": self._wiring.structure.name,
-            "components": {
-                name: str(asset.description.path)
-                for name, asset in zip(self._layout.names, self._assets, strict=True)
-            },
+            "components": {name: str(asset.description.path) for name, asset in self._assets.items()},
             "order": list(plan.order),
-            "linear": [name for name, on in zip(self._layout.names, self._layout.linear, strict=True) if on],
+            "linear": [name for name, part in self._parts.items() if part.linear],
             "held": [f"{link.source} -> {link.target}" for link in plan.held],
             "loops": [" -> ".join(str(end) for end in loop) for loop in plan.loops],
             "binding": self._binding.name,

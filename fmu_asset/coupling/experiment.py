@@ -1,38 +1,13 @@
 """A system of FMUs flown without a binding: all outputs, and values set by the names of its ends."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
-
-import numpy as np
 
 from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
-from fmu_asset.door.experiment import steps_to
-from fmu_asset.door.simulation import ObservationHistory
-from fmu_asset.errors import BindingError, FmuEndedError
-from reporting.progress import Progress
+from fmu_asset.door.experiment import Experiment, steps_to
+from fmu_asset.errors import BindingError
 
-from .asset import CoupledAsset
 from .structure import Endpoint, listed
 from .wiring import Wiring
-
-
-class SystemExperiment(NamedTuple):
-    """What is simulated.
-
-    Attributes
-    ----------
-    binding : Binding
-        All outputs of the system, and those of its components that the system does not show, in their units.
-    steps : int
-        Number of communication steps.
-    parameters, inputs : dict of str to float
-        By the names of their ends; inputs are held from the start to the end.
-    """
-
-    binding: Binding
-    steps: int
-    parameters: dict[str, float]
-    inputs: dict[str, float]
 
 
 def system_experiment(
@@ -41,7 +16,7 @@ def system_experiment(
     span: tuple[float | None, float | None] = (None, None),
     step_size: float | None = None,
     values: Mapping[str, float] | None = None,
-) -> SystemExperiment:
+) -> Experiment:
     """Return the simulation of a system from its start, with everything that it gives.
 
     Parameters
@@ -64,9 +39,14 @@ def system_experiment(
     CouplingError
         If a value is of no component.
     """
-    described = [declared.description for declared in wiring.declared.values()]
     declared_step = min(
-        (size for d in described for size in (d.fixed_step or d.step_size,) if size is not None), default=None
+        (
+            size
+            for d in wiring.declared.values()
+            for size in (d.fixed_step or d.step_size,)
+            if size is not None
+        ),
+        default=None,
     )
     start, steps, size = steps_to(span[0] or 0.0, span[1], step_size or declared_step)
     observed = every_output(wiring)
@@ -85,10 +65,9 @@ def system_experiment(
         parameter=parameters,
         load=inputs,
     )
-    given = dict(values or {})
-    return SystemExperiment(
-        binding, steps, {name: given[name] for name in parameters}, {name: given[name] for name in inputs}
-    )
+    given = values or {}
+    held = {name: given[name] for name in inputs}
+    return Experiment(binding, steps, {name: given[name] for name in parameters}, {"load": held})
 
 
 def every_output(wiring: Wiring) -> dict[str, str]:
@@ -96,7 +75,7 @@ def every_output(wiring: Wiring) -> dict[str, str]:
     observed = {name: wiring.units[name] or "1" for name in wiring.outward}
     shown = {port.end for port in wiring.outward.values()}
     for component, item in wiring.declared.items():
-        for variable in item.variables.values():
+        for variable in item.variables:
             own = Endpoint(component, variable.name) not in shown
             if own and variable.causality == "output" and variable.single:
                 observed[f"{component}.{variable.name}"] = variable.unit or "1"
@@ -116,32 +95,3 @@ def _settable(wiring: Wiring, name: str) -> tuple[str, str]:
         )
     variable = wiring.variable(end)
     return variable.causality, variable.unit or "1"
-
-
-def fly_system(asset: CoupledAsset, experiment: SystemExperiment, progress: Progress) -> ObservationHistory:
-    """Start a system, and return its start and what came out of the steps after it.
-
-    Returns
-    -------
-    ObservationHistory
-        N + 1 moments; fewer if an FMU ends the simulation by itself.
-
-    Raises
-    ------
-    FmuError
-        As `CoupledAsset.step`.
-    """
-    asset.reset(experiment.parameters, load=experiment.inputs)
-    first = asset.observe()
-    time, values, ended = [first.time], [first.values], ""
-    with progress.stage("Simulating", total=experiment.steps, unit="steps") as stage:
-        for _ in range(experiment.steps):
-            try:
-                seen = asset.step()
-            except FmuEndedError as error:
-                ended = error.sentence
-                break
-            time.append(seen.time)
-            values.append(seen.values)
-            stage.advance()
-    return ObservationHistory(np.array(time), np.array(values), {}, ended)

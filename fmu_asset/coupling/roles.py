@@ -1,13 +1,13 @@
 """A binding resolved against a system of FMUs: which ends its roles stand for, and in which units."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
-from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.archive.declared import READABLE, UnitInfo
 from fmu_asset.door.binding import INPUT_ROLES, Binding
 from fmu_asset.door.units import Conversion, between
 from fmu_asset.errors import BindingError
 
-from .declared import READABLE
 from .structure import Endpoint, listed
 from .wiring import ConnectedVariable, Wiring, composed
 
@@ -79,6 +79,30 @@ def resolve_roles(wiring: Wiring, binding: Binding) -> Roles:
     )
 
 
+def parameter_values(
+    binding: Binding, roles: Roles, given: Mapping[str, float]
+) -> dict[str, dict[str, float]]:
+    """Return the parameters that binding and caller set, by component and variable, in the FMUs' units.
+
+    Raises
+    ------
+    BindingError
+        If the binding has no such parameter.
+    """
+    for name in given:
+        if name not in roles.parameters:
+            raise BindingError(
+                f"The binding {binding.name} has no parameter {name!r}; it has {listed(roles.parameters)}."
+            )
+    fixed = {key: item.value for key, item in binding.parameter.items() if item.value is not None}
+    values: dict[str, dict[str, float]] = {}
+    for key, value in {**fixed, **given}.items():
+        for port in roles.parameters[key]:
+            own = values.setdefault(port.end.component, {})
+            own[port.end.variable] = port.conversion.to_fmu(float(value))
+    return values
+
+
 def _targets(wiring: Wiring, name: str, unit: str, where: str, kind: str) -> tuple[ConnectedVariable, ...]:
     end = wiring.structure.locate(name)
     if not end.component:
@@ -102,7 +126,7 @@ def _targets(wiring: Wiring, name: str, unit: str, where: str, kind: str) -> tup
             f"{where} names {name!r}, which is declared as {variable.causality} of the type {variable.kind}; "
             f"a numeric {kind} is needed."
         )
-    if any(feed.target == end for feed in wiring.feeds):
+    if end in wiring.feeds:
         raise BindingError(f"{where} names {name!r}, which is fed by a connection already.")
     return (ConnectedVariable(end, _unit(unit, variable.unit, wiring, end, where, outward=False), False),)
 
@@ -132,7 +156,7 @@ def _unit(
 ) -> Conversion:
     """Return the conversion from the binding's unit to the system's, or the other way if `outward`."""
     known = (
-        wiring.declared[end.component].description.units
+        wiring.declared[end.component].units
         if end.component
         else (*wiring.structure.units, *_defined(wiring, end))
     )
@@ -148,4 +172,4 @@ def _unit(
 def _defined(wiring: Wiring, end: Endpoint) -> tuple[UnitInfo, ...]:
     """Return the unit definitions of the FMUs behind a connector, which may have lent it its unit."""
     ports = [*wiring.inward.get(end.variable, ()), *filter(None, [wiring.outward.get(end.variable)])]
-    return tuple(unit for port in ports for unit in wiring.declared[port.end.component].description.units)
+    return tuple(unit for port in ports for unit in wiring.declared[port.end.component].units)

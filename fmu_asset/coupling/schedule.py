@@ -6,10 +6,13 @@ of the same FMU; a circle in it is an algebraic loop. A circle of components alo
 stands a state, whose value at the beginning of the step can be used.
 """
 
-import heapq
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from .structure import Endpoint
 
@@ -110,72 +113,32 @@ def algebraic_loops(links: Iterable[Link], feedthrough: Feedthrough) -> tuple[tu
 def strong_components(graph: Mapping[Node, Collection[Node]]) -> list[tuple[Node, ...]]:
     """Return the strongly connected components of a graph in topological order.
 
-    Nodes that may stand in any order keep that of the mapping. Tarjan's algorithm, without recursion.
+    Nodes that may stand in any order keep that of the mapping.
 
     Parameters
     ----------
     graph : mapping
         Successors by node; every successor is a node of the mapping.
     """
-    position = {node: index for index, node in enumerate(graph)}
-    number: dict[Node, int] = {}
-    lowest: dict[Node, int] = {}
-    part_of: dict[Node, int] = {}
-    stack: list[Node] = []
-    parts: list[list[Node]] = []
-    for root in graph:
-        if root in number:
-            continue
-        number[root] = lowest[root] = len(number)
-        stack.append(root)
-        trail = [(root, iter(sorted(graph[root], key=position.__getitem__)))]
-        while trail:
-            node, successors = trail[-1]
-            for successor in successors:
-                if successor not in number:
-                    number[successor] = lowest[successor] = len(number)
-                    stack.append(successor)
-                    trail.append((successor, iter(sorted(graph[successor], key=position.__getitem__))))
-                    break
-                if successor not in part_of:
-                    lowest[node] = min(lowest[node], number[successor])
-            else:
-                trail.pop()
-                if trail:
-                    lowest[trail[-1][0]] = min(lowest[trail[-1][0]], lowest[node])
-                if lowest[node] == number[node]:
-                    part: list[Node] = []
-                    while not part or part[-1] != node:
-                        part.append(stack.pop())
-                        part_of[part[-1]] = len(parts)
-                    parts.append(sorted(part, key=position.__getitem__))
-    return [tuple(parts[index]) for index in _topological(graph, parts, part_of, position)]
-
-
-def _topological(
-    graph: Mapping[Node, Collection[Node]],
-    parts: Sequence[Sequence[Node]],
-    part_of: Mapping[Node, int],
-    position: Mapping[Node, int],
-) -> list[int]:
-    after: list[set[int]] = [set() for _ in parts]
-    for node, successors in graph.items():
-        after[part_of[node]] |= {part_of[s] for s in successors} - {part_of[node]}
-    waiting = [0] * len(parts)
-    for successors_of in after:
-        for index in successors_of:
-            waiting[index] += 1
-    ready = [(position[part[0]], index) for index, part in enumerate(parts) if not waiting[index]]
-    heapq.heapify(ready)
-    order = []
-    while ready:
-        _, index = heapq.heappop(ready)
-        order.append(index)
-        for other in after[index]:
-            waiting[other] -= 1
-            if not waiting[other]:
-                heapq.heappush(ready, (position[parts[other][0]], other))
-    return order
+    nodes = list(graph)
+    number = {node: index for index, node in enumerate(nodes)}
+    edges = [(number[node], number[successor]) for node in nodes for successor in graph[node]]
+    begins, ends = zip(*edges, strict=True) if edges else ((), ())
+    matrix = coo_array((np.ones(len(edges)), (begins, ends)), shape=(len(nodes), len(nodes)))
+    _, part_of = connected_components(matrix, connection="strong")
+    parts: dict[int, list[Node]] = {}
+    for node, part in zip(nodes, part_of, strict=True):
+        parts.setdefault(part, []).append(node)
+    before: dict[int, set[int]] = {part: set() for part in parts}
+    for begin, end in edges:
+        before[part_of[end]] |= {part_of[begin]} - {part_of[end]}
+    waiting, done = list(parts), dict[int, None]()
+    while waiting:
+        # the first one that follows nothing but what is there already
+        part = next(part for part in waiting if before[part] <= done.keys())
+        waiting.remove(part)
+        done[part] = None
+    return [tuple(parts[part]) for part in done]
 
 
 def shortest_circle(graph: Mapping[Node, Collection[Node]], part: Sequence[Node]) -> tuple[Node, ...]:

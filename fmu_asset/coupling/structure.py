@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
-from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.door.binding import expand
 from fmu_asset.errors import CouplingError
 from fmu_asset.instances.plan import Interface
@@ -14,8 +14,7 @@ ConnectorKind = Literal["input", "output", "parameter"]
 SettingValue = float | bool | str
 
 
-@dataclass(frozen=True, order=True)
-class Endpoint:
+class Endpoint(NamedTuple):
     """An end of a connection: a variable of a component, or (`component` empty) a connector of the system."""
 
     component: str

@@ -2,15 +2,14 @@
 
 import difflib
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
-from fmu_asset.archive.fmu_file import UnitInfo, VariableInfo
+from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, VariableInfo
+from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.units import IDENTITY, Conversion, between
 from fmu_asset.errors import CouplingError
 
-from .declared import READABLE, DeclaredFmu, read_declared
 from .schedule import Link, Schedule, schedule
 from .structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure, listed
 
@@ -23,19 +22,11 @@ _FITS = {
 """For each type of a source, the types of targets that can take it."""
 
 
-class Feed(NamedTuple):
-    """A connection between two components, its units resolved: target = factor * source + offset."""
-
-    source: Endpoint
-    target: Endpoint
-    conversion: Conversion
-    delayed: bool
-
-
 class ConnectedVariable(NamedTuple):
-    """A variable behind a connector of the system.
+    """A variable of a component as it is seen elsewhere, its units resolved.
 
-    variable = factor * connector + offset for inputs and parameters, and the other way round for outputs.
+    variable = factor * connector + offset for inputs and parameters, and the other way round for outputs and
+    what feeds other components.
     """
 
     end: Endpoint
@@ -59,9 +50,9 @@ class Wiring:
         As given, without what was left out.
     left_out : list of str
         The names of these settings.
-    declared : dict of str to DeclaredFmu
+    declared : dict of str to FmuDescription
         The FMUs by component.
-    feeds : tuple of Feed
+    feeds : dict of Endpoint to ConnectedVariable
         Connections between components.
     inward : dict of str to tuple of ConnectedVariable
         For each input and parameter of the system, where it goes.
@@ -92,8 +83,8 @@ class Wiring:
                     f"The system {structure.name} has two components named {name!r}; each needs a name of "
                     "its own."
                 )
-        self.declared: dict[str, DeclaredFmu] = {
-            c.name: read_declared(c.fmu, c.interface) for c in structure.components
+        self.declared: dict[str, FmuDescription] = {
+            c.name: read_fmu(c.fmu, c.interface) for c in structure.components
         }
         self.left_out: list[str] = []
         if leave_out_unknown:
@@ -102,7 +93,7 @@ class Wiring:
         self.settings = {c.name: self._settings(c) for c in structure.components}
         self._connectors = {connector.name: connector for connector in structure.connectors}
         self.units: dict[str, str | None] = {c.name: c.unit for c in structure.connectors}
-        self._joined: list[Feed] = []
+        self.feeds: dict[Endpoint, ConnectedVariable] = {}
         self.inward: dict[str, tuple[ConnectedVariable, ...]] = {
             c.name: () for c in structure.connectors if c.kind != "output"
         }
@@ -110,8 +101,7 @@ class Wiring:
         taken: dict[Endpoint, Endpoint] = {}
         for connection in structure.connections:
             self._connect(connection, taken)
-        self.feeds: tuple[Feed, ...] = tuple(self._joined)
-        links = [Link(feed.source, feed.target) for feed in self.feeds if not feed.delayed]
+        links = [Link(port.end, target) for target, port in self.feeds.items() if not port.delayed]
         self.schedule: Schedule = schedule(names, links, self._feedthrough())
 
     def _feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
@@ -121,7 +111,7 @@ class Wiring:
             name: {
                 output: inputs
                 for output, inputs in declared.feedthrough.items()
-                if declared.variables[output].causality == "output" or Endpoint(name, output) in used
+                if self.variable(end := Endpoint(name, output)).causality == "output" or end in used
             }
             for name, declared in self.declared.items()
         }
@@ -138,12 +128,12 @@ class Wiring:
         """
         self.structure.component(end.component)
         declared = self.declared[end.component]
-        variable = declared.variables.get(end.variable)
+        variable = declared.variable(end.variable)
         if variable is None:
-            near = difflib.get_close_matches(end.variable, list(declared.variables), 1, 0.6)
+            near = difflib.get_close_matches(end.variable, [v.name for v in declared.variables], 1, 0.6)
             hint = f"; did you mean {near[0]!r}?" if near else "."
             raise CouplingError(
-                f"The component {end.component!r} ({declared.description.path.name}) has no variable "
+                f"The component {end.component!r} ({declared.path.name}) has no variable "
                 f"{end.variable!r}{hint}"
             )
         return variable
@@ -187,7 +177,7 @@ class Wiring:
         source, target = self._readable(connection.source), self._writable(connection.target, ("input",))
         self._fit(connection, source, target)
         conversion = self._converted(connection, source.unit, target.unit)
-        self._joined.append(Feed(connection.source, connection.target, conversion, connection.delayed))
+        self.feeds[connection.target] = ConnectedVariable(connection.source, conversion, connection.delayed)
 
     def _enter(self, connection: Connection) -> None:
         connector = self._connector(connection.source, ("input", "parameter"), "the source")
@@ -255,13 +245,13 @@ class Wiring:
         return composed(unit, own)
 
     def _definitions(self, end: Endpoint) -> tuple[UnitInfo, ...]:
-        return self.declared[end.component].description.units if end.component else self.structure.units
+        return self.declared[end.component].units if end.component else self.structure.units
 
     # ------------------------------------------------------------------ parameters
 
     def _known(self, component: Component) -> Component:
-        variables = self.declared[component.name].variables
-        settings = {name: setting for name, setting in component.settings.items() if name in variables}
+        known = self.declared[component.name].variable
+        settings = {name: setting for name, setting in component.settings.items() if known(name)}
         self.left_out += [f"{component.name}.{name}" for name in component.settings if name not in settings]
         return replace(component, settings=settings)
 
@@ -292,14 +282,14 @@ class Wiring:
             raise CouplingError(f"{end} cannot be set: it {what}; only single numbers are set in a system.")
         value = setting.value
         if isinstance(value, str):
-            items: Mapping[str, int] = self.declared[end.component].items.get(end.variable, {})
+            items = variable.items
             if variable.kind == "Enumeration" and value in items:
                 return float(items[value])
             raise CouplingError(
                 f"{end} cannot be set to {value!r}: it is of the type {variable.kind}"
                 + (f" with the items {listed(items)}." if items else ", and a number is needed.")
             )
-        own = self.declared[end.component].description.units
+        own = self.declared[end.component].units
         units = (*setting.units, *self.structure.units, *own)
         conversion = between(setting.unit, units, variable.unit, own)
         if conversion is None:

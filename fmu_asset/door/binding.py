@@ -22,19 +22,21 @@ displacement and velocity where another FMU can be coupled). `[record]` names va
 FMU's own units, and `[limits]` says what the FMU's worker may take.
 """
 
+import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
+from fmu_asset.worker.client import WorkerLimits
 from reporting.section import Section, checked
 from reporting.toml_file import read_toml
 
-from .unit_symbols import same_dimension
+from .units import same_dimension
 
 INPUT_ROLES = ("control", "health", "load")
 """Roles whose variables are sent at every step, in the order in which they are sent; ports follow."""
@@ -52,6 +54,37 @@ _Text = Annotated[str, Field(min_length=1)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 _Texts = Annotated[tuple[_Text, ...], Field(strict=False)]
+
+
+def _expanded(given: object) -> object:
+    """Expand the patterns of a text or of a list of texts."""
+    if isinstance(given, str):
+        return expand(given)
+    if isinstance(given, list):
+        return tuple(name for item in given for name in (expand(item) if isinstance(item, str) else (item,)))
+    return given
+
+
+def expand(pattern: str) -> tuple[str, ...]:
+    """Return the names that a pattern stands for: `a[{1..3}]` is a[1], a[2], a[3].
+
+    Raises
+    ------
+    ValueError
+        If a range is empty or too long, or there is more than one.
+    """
+    ranges = _RANGE.findall(pattern)
+    if not ranges:
+        return (pattern,)
+    if len(ranges) > 1:
+        raise ValueError(f"the pattern {pattern!r} has more than one range")
+    first, last = int(ranges[0][0]), int(ranges[0][1])
+    if not first <= last or last - first >= _LARGEST_PATTERN:
+        raise ValueError(f"the range of {pattern!r} is empty or longer than {_LARGEST_PATTERN}")
+    return tuple(_RANGE.sub(str(number), pattern) for number in range(first, last + 1))
+
+
+_Names = Annotated[tuple[_Text, ...], BeforeValidator(_expanded)]
 
 
 class Scalar(Section):
@@ -77,6 +110,14 @@ class Input(Scalar):
             raise ValueError(f"minimum {self.minimum:g} is larger than maximum {self.maximum:g}")
         return self
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The range in `unit`, infinite where it has no end."""
+        return (
+            -math.inf if self.minimum is None else self.minimum,
+            math.inf if self.maximum is None else self.maximum,
+        )
+
 
 class Parameter(Input):
     """A parameter; `value`, in `unit`, is set at every reset unless the caller gives another."""
@@ -90,18 +131,20 @@ class Vector(Section):
     `unit` is one for all variables, or one for each.
     """
 
-    variables: tuple[_Text, ...]
-    unit: _Text | tuple[_Text, ...]
+    variables: Annotated[_Names, Field(min_length=1)]
+    unit: _Text | _Texts
 
     @property
     def units(self) -> tuple[str, ...]:
         """Unit of each variable."""
         return (self.unit,) * len(self.variables) if isinstance(self.unit, str) else self.unit
 
-    @field_validator("unit", mode="before")
-    @classmethod
-    def _listed(cls, given: object) -> object:
-        return tuple(given) if isinstance(given, list) else given
+    def by_element(self, elements: Callable[[str], Sequence[str]]) -> Self:
+        """Return the vector with its arrays as their elements."""
+        parts = zip(self.variables, self.units, strict=True)
+        pairs = [(element, unit) for name, unit in parts for element in elements(name)]
+        unit = self.unit if isinstance(self.unit, str) else tuple(unit for _, unit in pairs)
+        return self.model_copy(update={"variables": tuple(name for name, _ in pairs), "unit": unit})
 
     @model_validator(mode="after")
     def _one_or_each(self) -> Self:
@@ -111,18 +154,6 @@ class Vector(Section):
                 f"{len(self.units)} came"
             )
         return self
-
-    @field_validator("variables", mode="before")
-    @classmethod
-    def _expand(cls, given: object) -> object:
-        return _expanded(given)
-
-    @field_validator("variables")
-    @classmethod
-    def _not_empty(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if not names:
-            raise ValueError("at least one variable is needed")
-        return names
 
 
 class Port(Section):
@@ -157,41 +188,16 @@ class Port(Section):
         given = {name: getattr(self, name) for name in PORT_QUANTITIES}
         return {name: vector for name, vector in given.items() if vector is not None}
 
+    def by_element(self, elements: Callable[[str], Sequence[str]]) -> Self:
+        """Return the port with its arrays as their elements."""
+        changed = {name: vector.by_element(elements) for name, vector in self.quantities.items()}
+        return self.model_copy(update=changed)
+
 
 class Record(Section):
     """The table `[record]`: further variables to be recorded, in the FMU's own units."""
 
-    variables: tuple[_Text, ...] = ()
-
-    @field_validator("variables", mode="before")
-    @classmethod
-    def _expand(cls, given: object) -> object:
-        return _expanded(given)
-
-
-class WorkerLimits(Section):
-    """The table `[limits]`: what the FMU's worker may take; what is not said is the default.
-
-    Attributes
-    ----------
-    step_time, load_time : float or None
-        Wall clock for one step, and for loading and initialisation [s].
-    memory : float or None
-        Resident memory [MiB].
-    sandbox : bool
-        Whether the system keeps the FMU from the user's files, from programs and from the network.
-    read, write, ports, programs
-        What it may touch all the same; see `Grants` of the worker.
-    """
-
-    step_time: _Positive | None = None
-    load_time: _Positive | None = None
-    memory: _Positive | None = None
-    sandbox: bool = True
-    read: _Texts = ()
-    write: _Texts = ()
-    ports: Annotated[tuple[Annotated[int, Field(ge=1, le=65535)], ...], Field(strict=False)] = ()
-    programs: bool = False
+    variables: _Names = ()
 
 
 class Header(Section):
@@ -289,7 +295,7 @@ class Binding(Section):
 
     def inputs(self, role: str) -> Mapping[str, Input]:
         """Return the variables of one of `INPUT_ROLES` by the caller's names."""
-        table: Mapping[str, Input] = {"control": self.control, "health": self.health, "load": self.load}[role]
+        table: Mapping[str, Input] = getattr(self, role)
         return table
 
     @property
@@ -339,72 +345,20 @@ class Binding(Section):
         elements : callable
             Names of the elements of a variable; the name itself for a scalar.
         """
-
-        def of(names: Sequence[str]) -> tuple[str, ...]:
-            return tuple(element for name in names for element in elements(name))
-
-        observation = {
-            key: vector.model_copy(
-                update={
-                    "variables": of(vector.variables),
-                    "unit": vector.unit
-                    if isinstance(vector.unit, str)
-                    else tuple(
-                        unit
-                        for name, unit in zip(vector.variables, vector.unit, strict=True)
-                        for _ in elements(name)
-                    ),
-                }
-            )
-            for key, vector in self.observation.items()
-        }
         monitor = {}
         for key, scalar in self.monitor.items():
-            names = of([scalar.variable])
+            names = elements(scalar.variable)
             for number, name in enumerate(names, 1):
                 label = key if len(names) == 1 else f"{key}[{number}]"
                 monitor[label] = scalar.model_copy(update={"variable": name})
-        port = {
-            key: item.model_copy(
-                update={
-                    quantity: vector.model_copy(update={"variables": of(vector.variables)})
-                    for quantity, vector in item.quantities.items()
-                }
-            )
-            for key, item in self.port.items()
+        recorded = tuple(element for name in self.record.variables for element in elements(name))
+        changed = {
+            "observation": {key: vector.by_element(elements) for key, vector in self.observation.items()},
+            "monitor": monitor,
+            "port": {key: port.by_element(elements) for key, port in self.port.items()},
+            "record": self.record.model_copy(update={"variables": recorded}),
         }
-        record = self.record.model_copy(update={"variables": of(self.record.variables)})
-        return self.model_copy(
-            update={"observation": observation, "monitor": monitor, "port": port, "record": record}
-        )
-
-
-def _expanded(given: object) -> object:
-    """Expand the patterns of a text or of a list of texts."""
-    if isinstance(given, str):
-        return expand(given)
-    if isinstance(given, list):
-        return tuple(name for item in given for name in (expand(item) if isinstance(item, str) else (item,)))
-    return given
-
-
-def expand(pattern: str) -> tuple[str, ...]:
-    """Return the names that a pattern stands for: `a[{1..3}]` is a[1], a[2], a[3].
-
-    Raises
-    ------
-    ValueError
-        If a range is empty or too long, or there is more than one.
-    """
-    ranges = _RANGE.findall(pattern)
-    if not ranges:
-        return (pattern,)
-    if len(ranges) > 1:
-        raise ValueError(f"the pattern {pattern!r} has more than one range")
-    first, last = int(ranges[0][0]), int(ranges[0][1])
-    if not first <= last or last - first >= _LARGEST_PATTERN:
-        raise ValueError(f"the range of {pattern!r} is empty or longer than {_LARGEST_PATTERN}")
-    return tuple(_RANGE.sub(str(number), pattern) for number in range(first, last + 1))
+        return self.model_copy(update=changed)
 
 
 def load_binding(path: str | os.PathLike[str]) -> Binding:

@@ -12,7 +12,7 @@ from fmu_asset.errors import BindingError
 
 from .binding import PORT_QUANTITIES, Binding, parse_binding
 from .exchange import Exchange
-from .unit_symbols import same_dimension
+from .units import same_dimension
 
 _HEALTH = re.compile(r"health|damage|wear|foul|crack|degrad|fault|stiffness_?loss", re.IGNORECASE)
 _LOAD = re.compile(
@@ -92,7 +92,7 @@ class _Draft:
         if not observed:
             raise BindingError(f"{self._description.path} has no number that could be observed.")
         for group in _groups(observed):
-            lines += self._vector("observation", group)
+            lines += self._table("observation", *group, key="variables")
         names = {variable.name for variable in observed}
         recorded = [variable for variable in self._outputs if variable.name not in names]
         for variable in self._parameters:
@@ -133,21 +133,14 @@ class _Draft:
             return "load"
         return "control"
 
-    def _table(self, role: str, variable: VariableInfo) -> list[str]:
-        return [
-            f"[{role}.{self._key(role, variable.name)}]{_about(variable)}",
-            f"variable = {_quoted(variable.name)}",
-            f"unit = {_quoted(variable.unit or '1')}{_unit_note(variable)}",
-            "",
-        ]
-
-    def _vector(self, role: str, group: Sequence[VariableInfo]) -> list[str]:
+    def _table(self, role: str, *group: VariableInfo, key: str = "variable") -> list[str]:
+        """Return the table of a variable, or of several that are numbered."""
         first = group[0]
         numbered = _NUMBERED.fullmatch(first.name) if len(group) > 1 else None
         stem = numbered["stem"].rstrip("[._ ") or "values" if numbered else first.name
         return [
             f"[{role}.{self._key(role, stem)}]{_about(first)}",
-            f"variables = {_quoted(_pattern(group))}",
+            f"{key} = {_quoted(_pattern(group))}",
             f"unit = {_quoted(first.unit or '1')}{_unit_note(first)}",
             "",
         ]
@@ -159,9 +152,8 @@ class _Draft:
             match = _PORT.fullmatch(variable.name)
             units = PORT_QUANTITIES[match["quantity"].lower()] if match else ()
             if match and any(same_dimension(variable.unit or "", unit) for unit in units):
-                found.setdefault(match["stem"] + (match["rest"] or ""), {})[match["quantity"].lower()] = (
-                    variable
-                )
+                own = found.setdefault(match["stem"] + (match["rest"] or ""), {})
+                own[match["quantity"].lower()] = variable
         return {
             stem: port
             for stem, port in found.items()
@@ -175,15 +167,13 @@ class _Draft:
         }
 
     def _port(self, stem: str, port: dict[str, VariableInfo]) -> list[str]:
-        lines = [f"[port.{self._key('port', stem or 'port')}]"]
-        for quantity in PORT_QUANTITIES:
-            if quantity in port:
-                variable = port[quantity]
-                lines.append(
-                    f"{quantity} = "
-                    f"{{ variables = {_quoted(variable.name)}, unit = {_quoted(variable.unit or '1')} }}"
-                )
-        return [*lines, ""]
+        quantities = [
+            f"{quantity} = {{ variables = {_quoted(port[quantity].name)}, "
+            f"unit = {_quoted(port[quantity].unit or '1')} }}"
+            for quantity in PORT_QUANTITIES
+            if quantity in port
+        ]
+        return [f"[port.{self._key('port', stem or 'port')}]", *quantities, ""]
 
     def _record(self, recorded: Sequence[VariableInfo]) -> list[str]:
         lines = []

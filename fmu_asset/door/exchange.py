@@ -2,20 +2,29 @@
 
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
-from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
+from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
 from .binding import INPUT_ROLES, Binding, Input
-from .configuration import configured
-from .layout import BlockLayout, Place, element_names, find, start_values
+from .layout import (
+    BlockLayout,
+    Place,
+    Slot,
+    configured,
+    element_names,
+    find,
+    in_unit,
+    put,
+    start_values,
+    value_range,
+)
 from .reading import OutputTable, Selection
-from .slots import Slot, in_unit, put, value_range
 from .units import IDENTITY, conversion
 
 _LARGEST = sys.float_info.max
@@ -24,9 +33,18 @@ Values = Mapping[str, float | Sequence[float]]
 """Values by the binding's names: a number, or as many as the bound array or port has."""
 
 
+class Inputs(TypedDict, total=False):
+    """Inputs by role; those of a port are called `<port>.<quantity>`."""
+
+    control: Values | None
+    health: Values | None
+    load: Values | None
+    port: Values | None
+
+
 def plain_values(values: Values) -> dict[str, float | list[float]]:
-    """Return values as floats and lists of floats, which can be compared and kept as JSON."""
-    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+    """Return values as floats and lists of floats in the order of their names, to be kept as JSON."""
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in sorted(values.items())}
     return {
         name: array.item() if array.ndim == 0 else array.ravel().tolist() for name, array in arrays.items()
     }
@@ -63,6 +81,7 @@ class Exchange:
         description, configuration = configured(description, binding)
         self.description = self._description = description
         self.binding = self._binding = binding.with_arrays(self._elements)
+        self._whose = f"of the binding {binding.name}"
         self._reads_ports = self._port_directions()
         self._make_outputs()
         self._make_inputs()
@@ -91,7 +110,7 @@ class Exchange:
         return (name,) if variable is None else element_names(variable)
 
     def _find(self, name: str, label: str, causality: str) -> Place:
-        return find(self._description, name, f"{label} of the binding {self._binding.name}", causality)
+        return find(self._description, name, f"{label} {self._whose}", causality)
 
     def _port_directions(self) -> dict[str, bool]:
         """Return for every quantity of a port whether it is read; force and motion go opposite ways."""
@@ -102,21 +121,19 @@ class Exchange:
                 label = f"port.{name}.{quantity}"
                 if len(vector.variables) != len(port.force.variables):
                     raise BindingError(
-                        f"{label} of the binding {self._binding.name} has {len(vector.variables)} values "
-                        f"and the force {len(port.force.variables)}; give as many."
+                        f"{label} {self._whose} has {len(vector.variables)} values and the force "
+                        f"{len(port.force.variables)}; give as many."
                     )
                 causalities = {self._causality(variable) == "input" for variable in vector.variables}
                 if len(causalities) > 1:
-                    raise BindingError(
-                        f"{label} of the binding {self._binding.name} mixes inputs and outputs of the FMU."
-                    )
+                    raise BindingError(f"{label} {self._whose} mixes inputs and outputs of the FMU.")
                 own[quantity] = not causalities.pop()
                 reads[f"{name}.{quantity}"] = own[quantity]
-            if any(own[quantity] == own["force"] for quantity in own if quantity != "force"):
-                way = "outputs" if own["force"] else "inputs"
+            force = own.pop("force")
+            if force in own.values():
                 raise BindingError(
-                    f"In port.{name} of the binding {self._binding.name}, force and motion are both {way} "
-                    "of the FMU; at a port one is given for the other."
+                    f"In port.{name} {self._whose}, force and motion are both "
+                    f"{'outputs' if force else 'inputs'} of the FMU; at a port one is given for the other."
                 )
         return reads
 
@@ -135,61 +152,62 @@ class Exchange:
 
     def _make_inputs(self) -> None:
         """Lay out the request block: time, step size, all inputs."""
-        places = {
-            (role, name): [self._find(item.variable, f"{role}.{name}", "input")]
+        wanted: list[tuple[str, str, Input, tuple[str, ...]]] = [
+            (role, name, item, (item.variable,))
             for role in INPUT_ROLES
-            for name, item in self._table(role).items()
-        }
-        ports = self._port_vectors(read=False)
-        for name, variables, _ in ports:
-            places["port", name] = [self._find(item, f"port.{name}", "input") for item in variables]
+            for name, item in self._binding.inputs(role).items()
+        ]
+        wanted += [
+            ("port", name, Input(variable=variables[0], unit=unit), variables)
+            for name, variables, unit in self._port_vectors(read=False)
+        ]
+        places = [
+            [self._find(variable, f"{role}.{name}", "input") for variable in variables]
+            for role, name, _, variables in wanted
+        ]
         self._inputs = BlockLayout(
             self._description,
-            [place.variable for found in places.values() for place in found],
+            [place.variable for found in places for place in found],
             begin=2,
             linear=self._binding.binding.interpolation == "linear",
         )
         self._check_lines()
         self._slots: dict[str, dict[str, Slot]] = {role: {} for role in (*INPUT_ROLES, "port")}
         taken: dict[int, str] = {}
-        items: dict[tuple[str, str], Input] = {
-            (role, name): item for role in INPUT_ROLES for name, item in self._table(role).items()
-        }
-        items |= {("port", name): Input(variable=variables[0], unit=unit) for name, variables, unit in ports}
-        for (role, name), found in places.items():
-            positions = [position for place in found for position in self._inputs.positions(place)]
+        for (role, name, item, _), found in zip(wanted, places, strict=True):
+            label = f"{role}.{name}"
             if len({(place.variable.unit, place.variable.kind) for place in found}) > 1:
                 raise BindingError(
-                    f"The variables of {role}.{name} of the binding {self._binding.name} have different "
-                    "units or types in the FMU; make one port of each."
+                    f"The variables of {label} {self._whose} have different units or types in the FMU; make "
+                    "one port of each."
                 )
+            positions = [position for place in found for position in self._inputs.positions(place)]
             for position in positions:
-                if position in taken:
+                if taken.setdefault(position, label) != label:
                     raise BindingError(
-                        f"In the binding {self._binding.name}, {role}.{name} and {taken[position]} set the "
-                        f"same value of {found[0].variable.name!r}; keep one."
+                        f"In the binding {self._binding.name}, {label} and {taken[position]} set the same "
+                        f"value of {found[0].variable.name!r}; keep one."
                     )
-                taken[position] = f"{role}.{name}"
-            self._slots[role][name] = self._slot(
-                f"{role}.{name}", items[role, name], found[0].variable, positions
-            )
+            self._slots[role][name] = self._slot(label, item, found[0].variable, positions)
         # A float within these limits is sent as it is; NaN and infinities are not within them.
         self._direct = {
             role: {
-                name: (slot.position, max(slot.low, -_LARGEST), min(slot.high, _LARGEST))
+                name: (slot.positions[0], max(slot.low, -_LARGEST), min(slot.high, _LARGEST))
                 for name, slot in slots.items()
-                if slot.direct
+                if slot.conversion == IDENTITY and not slot.whole and len(slot.positions) == 1
             }
             for role, slots in self._slots.items()
         }
-        # Parameters are set once, each for itself; their positions count from the variable's own values.
-        self._parameter_slots = {}
-        for name, parameter in self._binding.parameter.items():
-            place = self._find(parameter.variable, f"parameter.{name}", "parameter")
-            positions = [place.element] if place.element is not None else [*range(place.size)]
-            self._parameter_slots[name] = self._slot(
-                f"parameter.{name}", parameter, place.variable, positions
-            )
+        self._parameter_slots = {
+            name: self._parameter_slot(name, item) for name, item in self._binding.parameter.items()
+        }
+
+    def _parameter_slot(self, name: str, item: Input) -> Slot:
+        """Return the slot of a parameter, whose positions count from the variable's own values."""
+        label = f"parameter.{name}"
+        place = self._find(item.variable, label, "parameter")
+        positions = [place.element] if place.element is not None else [*range(place.size)]
+        return self._slot(label, item, place.variable, positions)
 
     def _check_lines(self) -> None:
         """Refuse straight lines of inputs where the FMU or none of its inputs can follow them."""
@@ -219,40 +237,18 @@ class Exchange:
                 f"The binding {self._binding.name} has no parameter {name!r}; "
                 f"it has {', '.join(self._parameter_slots) or 'none'}."
             )
-        place = self._find(name, f"parameter.{name}", "parameter")
-        own = Input(variable=name, unit=variable.unit or "1")
-        return self._slot(f"parameter.{name}", own, variable, [*range(place.size)])
-
-    def _table(self, role: str) -> Mapping[str, Input]:
-        table: Mapping[str, Input] = getattr(self._binding, role)
-        return table
+        return self._parameter_slot(name, Input(variable=name, unit=variable.unit or "1"))
 
     def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
         scale = conversion(item.unit, variable, self._description.units, where=label)
         low, high = value_range(variable)
-        least, most = (
-            None if bound is None else scale.to_fmu(bound) for bound in (item.minimum, item.maximum)
-        )
-        if scale.factor < 0.0:
-            least, most = most, least
-        own_low, own_high = low if least is None else least, high if most is None else most
-        if own_low > high or own_high < low:
+        least, most = sorted(scale.to_fmu(end) for end in item.ends)
+        if least > high or most < low:
             raise BindingError(
-                f"The range of {label} of the binding {self._binding.name} lies outside that of "
-                f"{variable.name!r}, {low:g} to {high:g}{in_unit(variable)}; correct minimum or maximum."
+                f"The range of {label} {self._whose} lies outside that of {variable.name!r}, {low:g} to "
+                f"{high:g}{in_unit(variable)}; correct minimum or maximum."
             )
-        whole = variable.kind not in FLOAT_KINDS
-        return Slot(
-            position=positions[0] if positions else 0,
-            positions=positions,
-            low=max(low, own_low),
-            high=min(high, own_high),
-            conversion=scale,
-            label=label,
-            whole=whole,
-            direct=scale == IDENTITY and not whole and len(positions) == 1,
-            variable=variable,
-        )
+        return Slot(label, positions, max(low, least), min(high, most), scale, variable)
 
     def _make_outputs(self) -> None:
         """Lay out the reply block: observations, monitors, records, outputs of ports."""
@@ -301,12 +297,12 @@ class Exchange:
 
     # ------------------------------------------------------------------ sending
 
-    def start_values(self, *given: Values | None) -> list[float]:
+    def start_values(self, given: Mapping[str, Any]) -> list[float]:
         """Return a request block with the FMU's own start values of the inputs.
 
         Parameters
         ----------
-        *given : mapping of str to float, or None
+        given : mapping of str to mapping or None
             What is going to be put in their place, by role: whole arrays of it are left at zero.
 
         Raises
@@ -315,11 +311,7 @@ class Exchange:
             If a start value is no number.
         """
         values = [0.0, 0.0]
-        slots = [
-            self.slot(role, name)
-            for role, part in zip(self._slots, given, strict=False)
-            for name in part or ()
-        ]
+        slots = [self.slot(role, name) for role, part in given.items() for name in part or ()]
         whole = {slot.variable.name for slot in slots if len(slot.positions) == slot.variable.size}
         for variable in self._inputs.variables:
             values += start_values(self._description, variable, given=variable.name in whole)
@@ -365,22 +357,15 @@ class Exchange:
             put(set_values[variable.name][2], slots[name], value)
         return list(set_values.values())
 
-    def place(
-        self,
-        target: Any,
-        control: Values | None,
-        health: Values | None,
-        load: Values | None,
-        port: Values | None = None,
-    ) -> bool:
+    def place(self, target: Any, inputs: Mapping[str, Any]) -> bool:
         """Put inputs where they belong; return whether there were any.
 
         Parameters
         ----------
         target : list of float or ctypes array
             A request block; changed in place.
-        control, health, load, port : mapping or None
-            By the binding's names and in its units; a port's are called `<port>.<quantity>`.
+        inputs : mapping of str to mapping or None
+            By role, and by the binding's names and in its units.
 
         Raises
         ------
@@ -389,26 +374,20 @@ class Exchange:
         FmuInputError
             If a value is not finite or outside its range.
         """
-        if control:
-            self._place_role(target, "control", control)
-        if health:
-            self._place_role(target, "health", health)
-        if load:
-            self._place_role(target, "load", load)
-        if port:
-            self._place_role(target, "port", port)
-        return bool(control or health or load or port)
-
-    def _place_role(self, target: Any, role: str, values: Values) -> None:
-        direct = self._direct[role]
-        for name, value in values.items():
-            limits = direct.get(name)
-            if limits is not None and isinstance(value, float):
-                position, low, high = limits
-                if low <= value <= high:
-                    target[position] = value
-                    continue
-            put(target, self.slot(role, name), value)
+        there = False
+        for role, values in inputs.items():
+            if not values:
+                continue
+            there, direct = True, self._direct.get(role, {})
+            for name, value in values.items():
+                limits = direct.get(name)
+                if limits is not None and isinstance(value, float):
+                    position, low, high = limits
+                    if low <= value <= high:
+                        target[position] = value
+                        continue
+                put(target, self.slot(role, name), value)
+        return there
 
     def slot(self, role: str, name: str) -> Slot:
         """Return where an input goes.

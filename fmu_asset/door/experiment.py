@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,9 +13,9 @@ from reporting.progress import Progress
 from .binding import INPUT_ROLES, Binding
 from .draft import trial_binding
 from .history_file import InputHistories
-from .observation import Observation
+from .reading import Observation
 from .session import FmiAsset
-from .simulation import ObservationHistory
+from .simulation import ObservationHistory, SteppedAsset
 
 _STEPS = 500
 _MOST_STEPS = 10_000_000
@@ -29,7 +29,7 @@ class Experiment(NamedTuple):
     Attributes
     ----------
     binding : Binding
-        All outputs of the FMU, in its units.
+        All outputs of the FMU or system, in its units.
     steps : int
         Number of communication steps.
     parameters : dict of str to float or list
@@ -41,7 +41,7 @@ class Experiment(NamedTuple):
     binding: Binding
     steps: int
     parameters: dict[str, Value]
-    inputs: dict[str, dict[str, Value]]
+    inputs: dict[str, Any]
 
 
 def default_experiment(
@@ -156,12 +156,12 @@ def _from_start(first: Observation, then: ObservationHistory) -> ObservationHist
     )
 
 
-def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> ObservationHistory:
+def fly(asset: SteppedAsset, experiment: Experiment, progress: Progress) -> ObservationHistory:
     """Start an asset, and return its start and what came out of the steps after it.
 
     Parameters
     ----------
-    asset : FmiAsset
+    asset : FmiAsset or CoupledAsset
         The asset.
     experiment : Experiment
         Steps, parameters and inputs, which hold already in the initialisation.

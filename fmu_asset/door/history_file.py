@@ -14,8 +14,7 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table
 
 from .binding import INPUT_ROLES, Binding
-from .simulation import ObservationHistory
-from .stepped import SteppedAsset
+from .simulation import ObservationHistory, SteppedAsset
 
 Roles = dict[str, dict[str, npt.NDArray[np.float64]]]
 

@@ -3,12 +3,12 @@
 import os
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
-from fmu_asset.archive.declared import FmuDescription, describe_fmu
+from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.errors import (
     FmuCallError,
@@ -21,14 +21,12 @@ from fmu_asset.errors import (
 from fmu_asset.instances.base import STATUS_NAMES
 from fmu_asset.worker.client import WorkerInstance
 
-from .binding import INPUT_ROLES, Binding, load_binding
-from .exchange import Exchange, Values, plain_values
-from .observation import Observation
-from .placement import Housing, limits_of
-from .reading import Reader
-from .restart import Instance, ResetTrial, Start
+from .binding import Binding, load_binding
+from .exchange import Exchange, Inputs, Values, plain_values
+from .placement import Housing, Instance, ResetTrial, Start, limits_of
+from .reading import Observation, Reader
 from .saved_state import StateMethod
-from .stepped import SteppedAsset
+from .simulation import SteppedAsset
 
 _LOG_LENGTH = 200
 
@@ -132,32 +130,6 @@ class OpenedFmu(SteppedAsset):
         """
         self._exchange.settings(parameters)
 
-    def describe(self) -> dict[str, Any]:
-        """Return what the FMU is and how it is bound, as plain records for a listing.
-
-        Returns
-        -------
-        dict
-            `file`, `sha256`, `size`, `guid`, ... as in `FmuDescription`, `variables` as a list of
-            records with their role, and the binding's name, step size and state method.
-        """
-        roles = {
-            scalar.variable: f"{role}.{name}"
-            for role in (*INPUT_ROLES, "parameter", "monitor")
-            for name, scalar in getattr(self._binding, role).items()
-        }
-        for name, vector in self._binding.observation.items():
-            roles.update(dict.fromkeys(vector.variables, f"observation.{name}"))
-        for name, port in self._binding.port.items():
-            for quantity, vector in port.quantities.items():
-                roles.update(dict.fromkeys(vector.variables, f"port.{name}.{quantity}"))
-        return describe_fmu(self._description, roles) | {
-            "binding": self._binding.name,
-            "step_size": self._binding.step_size,
-            "decimation": self._binding.binding.decimation,
-            "state_method": self.state_method,
-        }
-
     # ------------------------------------------------------------------ life
 
     def close(self) -> None:
@@ -165,23 +137,16 @@ class OpenedFmu(SteppedAsset):
         self._phase = "closed"
         self._housing.close()
 
-    def reset(
-        self,
-        parameters: Values | None = None,
-        *,
-        control: Values | None = None,
-        health: Values | None = None,
-        load: Values | None = None,
-        port: Values | None = None,
-    ) -> None:
+    def reset(self, parameters: Values | None = None, **inputs: Unpack[Inputs]) -> None:
         """Go back to the start.
 
         Parameters
         ----------
         parameters : mapping of str to float, optional
             Parameters in the binding's units; those of the constructor if absent. They stay for later resets.
-        control, health, load, port : mapping of str to float, optional
-            Inputs that hold already during initialisation. If none is given, the FMU's start values hold.
+        **inputs : mapping of str to float, optional
+            `control`, `health`, `load` and `port`: inputs that hold already during initialisation. If none is
+            given, the FMU's start values hold.
 
         Raises
         ------
@@ -195,9 +160,9 @@ class OpenedFmu(SteppedAsset):
         if parameters is not None:
             self._settings = self._exchange.settings(parameters)
             self._parameters = plain_values(parameters)
-        self._start_anew(control, health, load, port)
+        self._start_anew(inputs)
 
-    def renew(self, **inputs: Values | None) -> None:
+    def renew(self, **inputs: Unpack[Inputs]) -> None:
         """Free the FMU's instance, make another one in the same process, and go back to the start.
 
         `reset` uses the FMU's own reset; this is what a batch of runs without it costs.
@@ -218,7 +183,7 @@ class OpenedFmu(SteppedAsset):
             self._housing.renew()
         except FmuError as error:
             self._fail(error, "making a new instance")
-        self._start_anew(**inputs, renewed=True)
+        self._start_anew(inputs, renewed=True)
 
     def sibling(self, parameters: Values | None = None) -> Self:
         """Return a new asset of the same FMU, binding and limits, without extracting the FMU again.
@@ -246,17 +211,9 @@ class OpenedFmu(SteppedAsset):
 
     # ------------------------------------------------------------------ inside
 
-    def _start_anew(
-        self,
-        control: Values | None = None,
-        health: Values | None = None,
-        load: Values | None = None,
-        port: Values | None = None,
-        *,
-        renewed: bool = False,
-    ) -> None:
-        start = self._exchange.start_values(control, health, load, port)
-        given = self._exchange.place(start, control, health, load, port)
+    def _start_anew(self, inputs: Mapping[str, Any], *, renewed: bool = False) -> None:
+        start = self._exchange.start_values(inputs)
+        given = self._exchange.place(start, inputs)
         self._begin(start, with_inputs=given, renewed=renewed)
 
     def _begin(self, request: list[float], *, with_inputs: bool, renewed: bool = False) -> None:
@@ -287,7 +244,7 @@ class OpenedFmu(SteppedAsset):
             self._request.cast("B")[:] = request
         return other
 
-    def _opened(self, *given: Mapping[str, Any] | None) -> Instance:
+    def _opened(self, given: Mapping[str, Any] | None = None) -> Instance:
         """Return the instance, which is opened by its first use but never started again unasked.
 
         Where a step gives a whole array that was resized, its start values need not fit.
@@ -300,8 +257,8 @@ class OpenedFmu(SteppedAsset):
             raise FmuStateError("The asset is closed; reset it to start anew.")
         if self._phase == "new":
             # Without them: what keeps its start values, and lines, which begin at them.
-            known = given if self._binding.binding.structural_parameters and not self._lines else ()
-            self._begin(self._exchange.start_values(*known), with_inputs=False)
+            known = given if self._binding.binding.structural_parameters and not self._lines else None
+            self._begin(self._exchange.start_values(known or {}), with_inputs=False)
         instance = self._housing.instance
         assert instance is not None
         return instance

@@ -1,31 +1,197 @@
-"""Where the instance of an asset lives: the extracted FMU, and the worker process or this one."""
+"""Where the instance of an asset lives, and how it gets back to its start: by its own reset if that is good.
+
+Some FMUs return OK from their reset and go on from where they were, or keep a clock that shows later only.
+The first step of the first instance is therefore kept. At every later start that step is made again, and
+where the flight itself begins with it, it is compared once more: the first difference turns to the next way
+of starting for good, a new instance in the same process and then a new process.
+"""
 
 import logging
 import math
 import weakref
+from array import array
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.archive.declared import FmuDescription
-from fmu_asset.archive.extraction import Extraction
+from fmu_asset.archive.fmu_file import extract_fmu
 from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance, forget_modules
-from fmu_asset.instances.plan import Plan
-from fmu_asset.worker.client import Limits, WorkerInstance
+from fmu_asset.instances.plan import Plan, Settings
+from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 
 from .binding import Binding
-from .restart import FirstStep, Instance, ResetTrial, Start, Way
+
+Instance = FmuInstance | WorkerInstance
+
+
+@dataclass(frozen=True)
+class Start:
+    """How an instance is brought to its first communication point.
+
+    Attributes
+    ----------
+    time, step_size : float
+        Start time, and size of a communication step [s].
+    settings : Settings
+        What is set before initialisation.
+    request : list of float
+        The request block: time, step size, inputs.
+    with_inputs : bool
+        Whether the inputs of the block hold already during initialisation.
+    """
+
+    time: float
+    step_size: float
+    settings: Settings
+    request: list[float]
+    with_inputs: bool
+
+    def make(self, instance: Instance) -> None:
+        """Initialise an instance that is as after its instantiation or reset.
+
+        Raises
+        ------
+        FmuCallError, FmuWorkerError, FmuTimeoutError
+            If the FMU or its worker fails.
+        """
+        memoryview(instance.request).cast("B").cast("d")[:] = array("d", self.request)
+        instance.initialise(self.time, self.settings, with_inputs=self.with_inputs)
+
+
+class Way(IntEnum):
+    """How an instance is brought back to its start, the fastest first."""
+
+    RESET = 0
+    RENEWAL = 1
+    LOADING = 2
+
+
+@dataclass(frozen=True)
+class FirstStep:
+    """The first step of a flight.
+
+    Attributes
+    ----------
+    start : Start
+        How the instance was started.
+    request : bytes
+        The request block of the step.
+    reply : (n,) ndarray
+        The outputs after it.
+    """
+
+    start: Start
+    request: bytes
+    reply: npt.NDArray[np.float64]
+
+    def again(self, instance: Instance) -> npt.NDArray[np.float64]:
+        """Return the outputs (n,) of an instance that is started and asked alike."""
+        self.start.make(instance)
+        memoryview(instance.request).cast("B")[:] = self.request
+        instance.step()
+        return np.array(instance.reply)
+
+
+class ResetTrial:
+    """Whether the reset of an FMU can be believed; shared by all assets of one opening.
+
+    Attributes
+    ----------
+    works : bool or None
+        None as long as nothing has shown it.
+    fault : str
+        What is wrong with it, one sentence; empty as long as nothing is known to be.
+    lies : bool
+        Whether it returns OK and does nothing of use.
+    way : Way
+        The fastest way to start again that has shown no difference.
+    first : FirstStep or None
+        Of the first instance; None as long as it has made none.
+    comparable : bool
+        Whether there are other instances to compare one with, and they begin alike.
+    """
+
+    def __init__(self, *, comparable: bool = True) -> None:
+        self.works: bool | None = None
+        self.fault = ""
+        self.lies, self.comparable = False, comparable
+        self.way = Way.RESET
+        self.first: FirstStep | None = None
+
+    def refused(self) -> None:
+        """Remember that the FMU has no reset."""
+        self.works, self.way = False, Way.RENEWAL
+        self.fault = "It cannot be reset; every start takes a new instance."
+
+    def agrees(self, path: Path, way: Way, reply: npt.NDArray[np.float64]) -> bool:
+        """Return whether a start can be believed; if not, say it once and turn to the next way for good.
+
+        Parameters
+        ----------
+        path : Path
+            The FMU.
+        way : Way
+            How it was started.
+        reply : (n,) ndarray
+            Outputs after the first step, which was asked as that of `first`.
+        """
+        assert self.first is not None
+        true = self.first.reply
+        different = ~((reply == true) | (np.isnan(reply) & np.isnan(true)))
+        if not different.any():
+            if way == Way.RESET:
+                self.works = True
+            return True
+        if way == Way.LOADING:
+            self.comparable, self.first, self.way = False, None, Way.RENEWAL
+            return True
+        at = np.flatnonzero(different)[0]
+        doubted = " Flights that began by a reset before may be wrong." * bool(self.works)
+        self.works, self.lies, self.way = False, True, Way(way + 1)
+        what, instead = _FAULTS[way]
+        self.fault = (
+            f"{what} (an output is {reply[at]:.9g} where that of a new instance is {true[at]:.9g}); "
+            f"every start takes a new {instead} instead.{doubted}"
+        )
+        if (path, way) not in _doubted:
+            _logger.warning("%s: %s", path, self.fault)
+            _doubted.add((path, way))
+        return False
+
+
+_doubted: set[tuple[Path, Way]] = set()
+_FAULTS = {
+    Way.RESET: ("Its reset returns OK and does not bring it back to its start", "instance"),
+    Way.RENEWAL: ("Another instance in the same process does not begin as the first one did", "process"),
+}
+
 
 _logger = logging.getLogger(__name__)
 _said: set[str] = set()
+
+
+class Extraction:
+    """An extracted FMU, at `folder`; it is removed when nothing refers to this any more.
+
+    Raises
+    ------
+    FmuFileError
+        If it cannot be extracted.
+    """
+
+    def __init__(self, description: FmuDescription) -> None:
+        self.folder: Path = extract_fmu(description)
+        weakref.finalize(self, remove_folder, self.folder)
 
 
 class Housing:
@@ -37,7 +203,7 @@ class Housing:
         The FMU.
     plan : Plan
         What is exchanged; its folder is still empty.
-    limits : Limits
+    limits : WorkerLimits
         What a worker may take.
     isolated : bool
         Whether there is a worker.
@@ -50,7 +216,9 @@ class Housing:
         Whether the FMU's reset works.
     """
 
-    def __init__(self, description: FmuDescription, plan: Plan, limits: Limits, *, isolated: bool) -> None:
+    def __init__(
+        self, description: FmuDescription, plan: Plan, limits: WorkerLimits, *, isolated: bool
+    ) -> None:
         self._description, self._plan, self._limits, self._isolated = description, plan, limits, isolated
         self._extraction: Extraction | None = None
         self._release: Callable[[], object] = lambda: None
@@ -164,18 +332,13 @@ class Housing:
         shared = self._extraction
         # After a crash the files of the FMU are not trusted either.
         crashed = self.instance is not None and self.instance.lost
-        if shared is not None and (crashed or not shared.usable):
-            shared = None
-        if shared is not None:
-            shared.hold()
         self.close()
-        if shared is None:
+        if shared is None or crashed or not shared.folder.is_dir():
             shared = Extraction(self._description)
-            shared.hold()
         try:
             instance = self._open(replace(self._plan, folder=str(shared.folder)))
         except BaseException:
-            shared.release()
+            del shared  # so that its folder goes now, and not with the traceback
             raise
         self.instance, self._extraction = instance, shared
         # Also at the end of the interpreter, or when the asset is forgotten without being closed.
@@ -185,7 +348,7 @@ class Housing:
     def _open(self, plan: Plan) -> Instance:
         if not self._isolated:
             return open_instance(plan)
-        grants = self._limits.sandbox
+        grants = self._limits.grants
         if grants is not None and (missing := missing_path(grants, plan.folder)):
             raise FmuInputError(
                 f"The table [limits] of the binding grants {missing!r}, which does not exist; correct it."
@@ -200,7 +363,7 @@ class Housing:
 
     def close(self) -> None:
         """Free the instance, end the worker and remove what nobody else uses."""
-        self.instance = None
+        self.instance = self._extraction = None
         self._release()
 
 
@@ -208,7 +371,6 @@ def _release(instance: Instance, extraction: Extraction) -> None:
     instance.close()
     if isinstance(instance, FmuInstance):
         forget_modules(str(extraction.folder))
-    extraction.release()
 
 
 def say_sandbox(path: Path, grants: Grants | None) -> None:
@@ -229,7 +391,7 @@ def say_sandbox(path: Path, grants: Grants | None) -> None:
 
 def limits_of(
     binding: Binding, step_timeout: float | None, load_timeout: float | None, memory_limit: float | None
-) -> Limits:
+) -> WorkerLimits:
     """Return what the caller says, else what the binding says, else the defaults.
 
     Raises
@@ -238,14 +400,11 @@ def limits_of(
         If one is not positive.
     """
     given = {"step_timeout": step_timeout, "load_timeout": load_timeout, "memory_limit": memory_limit}
-    for name, value in given.items():
+    changed = {}
+    for (name, value), key in zip(given.items(), ("step_time", "load_time", "memory"), strict=True):
         if value is not None and not (math.isfinite(value) and value > 0.0):
             unit = "MiB" if name == "memory_limit" else "seconds"
             raise FmuInputError(f"{name} must be a positive number of {unit}, but is {value!r}.")
-    own, default = binding.limits, Limits()
-    return Limits(
-        step_time=step_timeout or own.step_time or default.step_time,
-        load_time=load_timeout or own.load_time or default.load_time,
-        memory=memory_limit or own.memory or default.memory,
-        sandbox=Grants(own.read, own.write, own.ports, own.programs) if own.sandbox else None,
-    )
+        if value is not None:
+            changed[key] = value
+    return binding.limits.model_copy(update=changed)

@@ -10,8 +10,8 @@ from reporting.progress import Progress, SilentProgress, Stage
 
 from .exchange import Values, plain_values
 from .life import OpenedFmu
-from .observation import Observation
-from .restart import Instance
+from .placement import Instance
+from .reading import Observation
 from .saved_state import SavedState
 from .simulation import Histories, ObservationHistory, blocks, request_rows
 
@@ -80,14 +80,15 @@ class FmiAsset(OpenedFmu):
         FmuWorkerError, FmuTimeoutError
             If the worker died or took too long.
         """
-        instance = self._opened(control, health, load, port)
+        inputs = {"control": control, "health": health, "load": load, "port": port}
+        instance = self._opened(inputs)
         request = self._request
         before = request.tobytes()
         begin = self._start_time + self._index * self._interval
         if self._lines:
             request[-self._lines :] = request[2 : 2 + self._lines]
         try:
-            self._exchange.place(request, control, health, load, port)
+            self._exchange.place(request, inputs)
             request[0] = begin
             request[1] = self._step_size
             instance.step()
@@ -108,7 +109,7 @@ class FmiAsset(OpenedFmu):
         load: Values | None = None,
         port: Values | None = None,
     ) -> None:
-        """Let inputs stand at values from this moment on, without a step.
+        """Let inputs, as those of `step`, stand at values from this moment on, without a step.
 
         A step that does not name them keeps them; under linear interpolation the next step's lines begin
         there, so that an input can jump.
@@ -118,10 +119,11 @@ class FmiAsset(OpenedFmu):
         FmuInputError, BindingError
             As `step`.
         """
-        self._opened(control, health, load, port)
+        inputs = {"control": control, "health": health, "load": load, "port": port}
+        self._opened(inputs)
         before = self._request.tobytes()
         try:
-            self._exchange.place(self._request, control, health, load, port)
+            self._exchange.place(self._request, inputs)
         except FmuError:
             self._request.cast("B")[:] = before
             raise
@@ -160,8 +162,8 @@ class FmiAsset(OpenedFmu):
             As `step`; the message says at which step. A worker that dies or takes too long reports every 20
             ms: the step named may be a little early.
         """
-        self._opened(control, health, load, port)
         roles = {"control": control, "health": health, "load": load, "port": port}
+        self._opened(roles)
         rows = request_rows(self._exchange, np.array(self._request), roles, steps)
         index = np.arange(self._index, self._index + len(rows) + 1)
         moments = np.asarray(self._start_time + index * self._interval, dtype=np.float64)
@@ -292,14 +294,7 @@ class FmiAsset(OpenedFmu):
         """
         saved = SavedState.from_bytes(content)
         width = 8 * self._exchange.plan.input_count
-        saved.refuse_if_foreign(
-            path=self._description.path,
-            fmu=self._description.sha256,
-            interval=self._interval,
-            start_time=self._start_time,
-            method=self.state_method,
-            width=width,
-        )
+        self._refuse_foreign(saved, width)
         replayed = saved.method == "replay"
         ready = (
             self._phase == "ready" and self._housing.instance is not None and not self._housing.instance.lost
@@ -312,7 +307,7 @@ class FmiAsset(OpenedFmu):
             # Arrays that were resized may have no start values: zeros keep their place, and are not sent.
             empty = bytes(width) if self._binding.binding.structural_parameters else b""
             held = np.frombuffer(saved.start_inputs or empty).tolist()
-            start = [0.0, 0.0, *held] if held else self._exchange.start_values()
+            start = [0.0, 0.0, *held] if held else self._exchange.start_values({})
             self._begin(start, with_inputs=bool(saved.start_inputs))
         instance = self._housing.instance
         assert instance is not None
@@ -349,6 +344,25 @@ class FmiAsset(OpenedFmu):
             other.close()
             raise
         return other
+
+    def _refuse_foreign(self, saved: SavedState, width: int) -> None:
+        """Refuse a state of another FMU or binding; the inputs of one step have `width` bytes."""
+        if saved.fmu != self._description.sha256:
+            raise FmuStateError(
+                f"The state was saved with another FMU than {self._description.path} (its hash differs); use "
+                "that one."
+            )
+        if (saved.step_size, saved.start_time) != (self._interval, self._start_time):
+            raise FmuStateError("The state was saved with another step size or start time; use that binding.")
+        if (
+            saved.method != self.state_method
+            or len(saved.inputs) != width
+            or len(saved.start_inputs) not in (0, width)
+            or (saved.method == "replay" and len(saved.body) != width * saved.index)
+        ):
+            raise FmuStateError(
+                "The saved state is damaged, or another binding was in use; use that binding."
+            )
 
     def _replay(self, inputs: bytes) -> None:
         instance = self._housing.instance

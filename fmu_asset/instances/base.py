@@ -18,11 +18,10 @@ from fmpy.fmi1 import FMICallException
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, FmuWorkerError
 
-from .block import Block
+from .block import Block, prepared
 from .lines import Lines
 from .messages import Mailbox, callbacks
 from .plan import Group, Plan, Settings
-from .prepared import prepared
 from .series import Series, run
 
 STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")

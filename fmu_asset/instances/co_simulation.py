@@ -11,10 +11,10 @@ from fmpy.fmi3 import FMU3Slave
 from fmu_asset.errors import FmuCallError
 
 from .base import ACCEPTED, DISCARD, OK, Calls, FmuInstance
+from .block import prepared
 from .lines import Lines
 from .messages import Mailbox
 from .plan import Plan, Settings
-from .prepared import prepared
 
 _LAST_SUCCESSFUL_TIME, _TERMINATED = 2, 3
 """Of the enumeration `fmi2StatusKind`."""

@@ -6,19 +6,7 @@ import os
 from collections import deque
 from typing import Any
 
-from fmpy import calloc, free
-from fmpy.fmi1 import (
-    fmi1CallbackAllocateMemoryTYPE,
-    fmi1CallbackFreeMemoryTYPE,
-    fmi1CallbackFunctions,
-    fmi1CallbackLoggerTYPE,
-)
-from fmpy.fmi2 import (
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-)
+from fmpy import calloc, fmi1, fmi2, free
 from fmpy.logging import addLoggerProxy
 
 from fmu_asset.errors import visible
@@ -37,7 +25,8 @@ def _log(_: object, instance_name: bytes, status: int, category: bytes, message:
         mailbox.log(None, status, category, message)
 
 
-_LOGGER_1, _LOGGER_2 = fmi1CallbackLoggerTYPE(_log), fmi2CallbackLoggerTYPE(_log)
+_MODULES = {1: fmi1, 2: fmi2}
+_LOGGERS = {1: fmi1.fmi1CallbackLoggerTYPE(_log), 2: fmi2.fmi2CallbackLoggerTYPE(_log)}
 
 
 class Mailbox:
@@ -86,16 +75,10 @@ class Mailbox:
 
 def callbacks(fmi_version: int) -> Any:
     """Return new callbacks for FMI 1 or 2, whose logger knows all mailboxes."""
-    if fmi_version == 1:
-        given = fmi1CallbackFunctions()
-        given.logger = _LOGGER_1
-        given.allocateMemory = fmi1CallbackAllocateMemoryTYPE(calloc)
-        given.freeMemory = fmi1CallbackFreeMemoryTYPE(free)
-        given.stepFinished = None
-    else:
-        given = fmi2CallbackFunctions()
-        given.logger = _LOGGER_2
-        given.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
-        given.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
+    module, name = _MODULES[fmi_version], f"fmi{fmi_version}Callback"
+    given = getattr(module, f"{name}Functions")()  # what is not said, such as `stepFinished`, is none
+    given.logger = _LOGGERS[fmi_version]
+    given.allocateMemory = getattr(module, f"{name}AllocateMemoryTYPE")(calloc)
+    given.freeMemory = getattr(module, f"{name}FreeMemoryTYPE")(free)
     addLoggerProxy(ctypes.byref(given))
     return given

@@ -4,7 +4,6 @@ The files of an FMU are first written with a placeholder wherever its content ha
 GUID, module names). The hash is taken over them, and then fills the places.
 """
 
-import ast
 import hashlib
 import io
 import os
@@ -15,16 +14,18 @@ from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.resources import files
 from pathlib import Path
 
-from fmu_asset.errors import FmuBuildError
+from fmu_asset.description import PLACEHOLDER
+from fmu_asset.errors import FmuBuildError, FmuError
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
 
 PYTHONFMU_VERSION = "0.7.0"
 """The only version whose wrapper these FMUs were tried with; its conventions are not a public interface."""
 
-PLACEHOLDER = "0_content_0_"
-"""Stands for the tag, the first characters of the content hash, until that is known."""
-
+BASE_CLASS_FILES = (
+    "_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py",
+)  # fmt: skip
+"""Files of pythonfmu that its base class needs."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 _TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
 # Where the GUID itself stands, between these two; elsewhere the placeholder stands for the tag.
@@ -58,19 +59,26 @@ class FmuInfo:
     size: int
 
 
-def checked_target(path: str | os.PathLike[str], *, replace: bool) -> Path:
-    """Return where an FMU may be written.
+def checked_target(
+    path: str | os.PathLike[str],
+    *,
+    replace: bool,
+    what: str = "An FMU",
+    suffix: str = ".fmu",
+    error: type[FmuError] = FmuBuildError,
+) -> Path:
+    """Return where an FMU, or something else with a suffix of its own, may be written.
 
     Raises
     ------
-    FmuBuildError
+    error
         If the suffix is wrong, or the file exists and may not be replaced.
     """
     target = Path(path)
-    if target.suffix != ".fmu":
-        raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
+    if target.suffix != suffix:
+        raise error(f"{what} must have the suffix {suffix}, but {target} was given.")
     if target.exists() and not replace:
-        raise FmuBuildError(f"{target} exists: choose another name, or give --replace.")
+        raise error(f"{target} exists: choose another --out or give --replace.")
     return target
 
 
@@ -121,7 +129,7 @@ def pythonfmu_version() -> str:
     return installed
 
 
-def pythonfmu_members(module: str, folder: str, roots: Iterable[str]) -> dict[str, bytes]:
+def pythonfmu_members(module: str, folder: str, names: Iterable[str]) -> dict[str, bytes]:
     """Return the files that pythonfmu gives to an FMU, by their places in the archive.
 
     Parameters
@@ -130,8 +138,8 @@ def pythonfmu_members(module: str, folder: str, roots: Iterable[str]) -> dict[st
         The FMU's identifier, also the name of its binaries and of the script that they load.
     folder : str
         Where the Python files go.
-    roots : iterable of str
-        Python files that are needed; those that they import come along.
+    names : iterable of str
+        Python files that are needed.
 
     Raises
     ------
@@ -146,7 +154,7 @@ def pythonfmu_members(module: str, folder: str, roots: Iterable[str]) -> dict[st
         f"binaries/win64/{module}.dll": (binaries / "win64/pythonfmu-export.dll").read_bytes(),
         "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
         "resources/slavemodule.txt": module.encode(),
-        **{f"{folder}/{name}": (wrapper / name).read_bytes() for name in relative_imports(wrapper, roots)},
+        **{f"{folder}/{name}": (wrapper / name).read_bytes() for name in names},
     }
 
 
@@ -168,21 +176,6 @@ def room_members(room: str, folder: str) -> dict[str, bytes]:
         )
         for path in sorted(top.rglob("*.py"))
     }
-
-
-def relative_imports(folder: Path, names: Iterable[str]) -> list[str]:
-    """Return files of a package together with all files that they import relatively, sorted."""
-    found: set[str] = set()
-    pending = list(names)
-    while pending:
-        name = pending.pop()
-        if name in found:
-            continue
-        found.add(name)
-        for node in ast.walk(ast.parse((folder / name).read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.level == 1 and node.module:
-                pending.append(f"{node.module}.py")
-    return sorted(found)
 
 
 def _licence(package: str) -> bytes:

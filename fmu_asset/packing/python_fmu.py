@@ -1,12 +1,10 @@
 """The files of an FMU that runs in Python: a slave of ours, joined with pythonfmu's base class."""
 
-from collections.abc import Mapping, Sequence
-from importlib.metadata import version
+from collections.abc import Mapping
 
-from fmu_asset.description import documentation_page, model_description
-from fmu_asset.slaves.variables import ENUMERATIONS, EnumerationType, FmuVariable, Unit
+from fmu_asset.description import PLACEHOLDER, Declaration, documentation_page, model_description
 
-from .contents import PLACEHOLDER, pythonfmu_members, pythonfmu_version, room_members
+from .contents import BASE_CLASS_FILES, pythonfmu_members, pythonfmu_version, room_members
 
 _SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
 from {module}_runtime.entry import Fmi2Slave, Slave, keep_alive
@@ -53,57 +51,40 @@ class Slave(_Slave):
 
 
 def python_members(
-    name: str,
+    declared: Declaration,
     class_name: str,
     *,
     imports: str,
-    table: Sequence[FmuVariable],
-    description: str,
     resources: Mapping[str, bytes],
-    units: Sequence[Unit],
-    enumerations: Sequence[EnumerationType] = ENUMERATIONS,
-    dependencies: Mapping[str, Sequence[str]] | None = None,
     host: str = "It runs in a Python host that has NumPy.",
 ) -> dict[str, bytes]:
     """Return the files of the archive, with the placeholder wherever the content hash will stand.
 
     Parameters
     ----------
-    name, class_name : str
-        Of the model, and of the class in the FMU's script, to which the tag is added.
+    declared : Declaration
+        The model.
+    class_name : str
+        Of the class in the FMU's script, to which the tag is added.
     imports : str
         Lines that import `load_contents` into the runtime's package.
-    table, description, units, enumerations, dependencies
-        As of `fmu_asset.description.model_description`.
     resources : mapping of str to bytes
         What `load_contents` reads, by its names.
     host : str
         What the FMU runs in, for its documentation.
     """
-    module = f"{name}_{PLACEHOLDER}"
+    module = declared.identifier
     runtime = f"resources/{module}_runtime"
     script = _SCRIPT.format(module=module, class_name=f"{class_name}{PLACEHOLDER}", tag=PLACEHOLDER)
+    tool = f"uav-twin with PythonFMU {pythonfmu_version()}"
     return {
-        "modelDescription.xml": model_description(
-            identifier=module,
-            guid=PLACEHOLDER,
-            table=table,
-            description=description,
-            version=version("uav-twin"),
-            generation_tool=f"uav-twin with PythonFMU {pythonfmu_version()}",
-            model_name=name,
-            units=units,
-            enumerations=enumerations,
-            dependencies=dependencies,
-        ),
-        "documentation/index.html": documentation_page(
-            table, description, model_name=name, enumerations=enumerations, host=host
-        ),
+        "modelDescription.xml": model_description(declared, generation_tool=tool),
+        "documentation/index.html": documentation_page(declared, host),
         **{f"resources/{file}": content for file, content in resources.items()},
         f"resources/{module}.py": script.encode(),
         f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
         f"{runtime}/entry.py": _ENTRY.format(imports=imports).encode(),
         f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
         **room_members("fmu_asset.slaves", f"{runtime}/slaves"),
-        **pythonfmu_members(module, f"{runtime}/pythonfmu", ["fmi2slave.py"]),
+        **pythonfmu_members(module, f"{runtime}/pythonfmu", BASE_CLASS_FILES),
     }

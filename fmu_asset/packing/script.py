@@ -18,13 +18,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from xml.etree.ElementTree import Element, SubElement
 
-from fmu_asset.description import number
+from fmu_asset.archive.declared import BASE_UNITS
+from fmu_asset.description import PLACEHOLDER, number, xml_bytes
 from fmu_asset.errors import FmuBuildError
 
 from .contents import (
-    PLACEHOLDER,
+    BASE_CLASS_FILES,
     FmuInfo,
     checked_target,
     pythonfmu_members,
@@ -32,8 +33,6 @@ from .contents import (
     sealed,
     write_fmu,
 )
-
-_BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 _MODULE = '''"""Loaded by the FMI wrapper; the model is in the package beside it."""
 from pythonfmu import Fmi2Slave
@@ -112,7 +111,9 @@ def _members(file: Path, source: bytes) -> dict[str, bytes]:
         f"{runtime}/__init__.py": _RUNTIME.encode(),
         f"{runtime}/model.py": source,
     }
-    return members | pythonfmu_members(module, "resources/pythonfmu", ["__init__.py"])
+    return members | pythonfmu_members(
+        module, "resources/pythonfmu", ("__init__.py", "builder.py", "osutil.py", *BASE_CLASS_FILES)
+    )
 
 
 def _model_class(file: Path) -> type[Any]:
@@ -172,21 +173,20 @@ def _description(file: Path, model: type[Any], identifier: str) -> bytes:
     for index, variable in enumerate(variables, 1):
         if variable.get("causality") == "output":
             SubElement(unknowns, "Unknown", index=str(index))
-    indent(root)
-    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
+    return xml_bytes(root)
 
 
 def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Element:
     definitions = Element("UnitDefinitions")
     for name, entry in units.items():
-        unknown = sorted({*entry} - {*_BASE_UNITS, "factor", "offset", "displays"})
+        unknown = sorted({*entry} - {*BASE_UNITS, "factor", "offset", "displays"})
         if unknown:
             raise FmuBuildError(
                 f"The unit {name} of {file} has the entry {unknown[0]}: give exponents of "
-                f"{', '.join(_BASE_UNITS)}, and factor, offset or displays."
+                f"{', '.join(BASE_UNITS)}, and factor, offset or displays."
             )
         unit = SubElement(definitions, "Unit", name=name)
-        base = {symbol: str(int(entry[symbol])) for symbol in _BASE_UNITS if symbol in entry}
+        base = {symbol: str(int(entry[symbol])) for symbol in BASE_UNITS if symbol in entry}
         base |= {key: number(entry[key]) for key in ("factor", "offset") if key in entry}
         SubElement(unit, "BaseUnit", base)
         for display, factor in entry.get("displays", {}).items():

@@ -15,17 +15,17 @@ from typing import Literal, TypedDict, Unpack
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
-from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
+from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.compiled.compiler import PLATFORM, Platform
 from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
+from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
-from fmu_asset.slaves.table import Roles, is_wing, structure_table
+from fmu_asset.slaves.table import is_wing, structure_table
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .contents import (
-    PLACEHOLDER,
     FmuInfo,
     archive_bytes,
     check_start,
@@ -156,9 +156,12 @@ def fmu_bytes(
         table += effect_rows(effects, len(table), values)
     check_start(table)
     name, kept = stem_of(model), {} if not effects else patched_members(model, effects, arrays)
+    description = _OF_THE_WING if is_wing(model) else _OF_A_STRUCTURE.format(model.name)
+    declared = Declaration(name, f"{description} {note}".strip(), table, _units(table))
     if kind == "python":
-        kept["resources/start.json"] = (json.dumps(values, sort_keys=True, indent=1) + "\n").encode()
-    template = kept | _template(model, table, roles, kind, note, fmi, interface)
+        template = kept | _python_members(model, declared, values)
+    else:
+        template = compiled_members(model, declared, roles, fmi=fmi, interface=interface)
     for file, content in (resources or {}).items():
         if f"resources/{file}" in template or "/" in file or not file:
             raise FmuBuildError(f"A resource of an FMU cannot have the name {file!r}; choose another one.")
@@ -170,43 +173,19 @@ def fmu_bytes(
     return archive_bytes(members), content_hash
 
 
-def _template(
-    model: ReducedModel,
-    table: tuple[FmuVariable, ...],
-    roles: Roles,
-    kind: FmuKind,
-    note: str,
-    fmi: FmiVersion,
-    interface: Interface,
+def _python_members(
+    model: ReducedModel, declared: Declaration, values: Mapping[str, float]
 ) -> dict[str, bytes]:
-    """Return the files of an FMU with the placeholder in them, but for start values and effects."""
-    name = stem_of(model)
-    description = _OF_THE_WING if is_wing(model) else _OF_A_STRUCTURE.format(model.name)
-    description = f"{description} {note}".strip()
-    if kind == "python":
-        return python_members(
-            name,
-            "Structure_",
-            imports="from .slaves.contents import load_contents\n",
-            table=table,
-            description=description,
-            resources={
-                "reduced_model.npz": model.to_bytes(),
-                DESIGN_RECORD: design_record(model.design_hash),
-            },
-            units=_units(table),
-        ) | room_members("fe.runtime", f"resources/{name}_{PLACEHOLDER}_runtime/fe")
-    return compiled_members(
-        model,
-        table,
-        roles,
-        units=_units(table),
-        model_name=name,
-        placeholder=PLACEHOLDER,
-        description=description,
-        fmi=fmi,
-        interface=interface,
-    )
+    return python_members(
+        declared,
+        "Structure_",
+        imports="from .slaves.contents import load_contents\n",
+        resources={
+            "reduced_model.npz": model.to_bytes(),
+            "start.json": (json.dumps(values, sort_keys=True, indent=1) + "\n").encode(),
+            DESIGN_RECORD: design_record(model.design_hash),
+        },
+    ) | room_members("fe.runtime", f"resources/{declared.identifier}_runtime/fe")
 
 
 def stem_of(model: ReducedModel) -> str:

@@ -147,12 +147,8 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
     bound = "Certified bound of the error of any static {} against the full finite element model"
     table.add("strain_error_bound", "output", bound.format("strain"), unit="1", display="microstrain")
 
-    def add_status() -> None:
-        text = "What became of the last call"
-        table.add("status", "output", text, kind="Enumeration", enumeration="Status")
-
     if wing:
-        add_status()
+        table.add_status()
         table.add(
             "load_point_displacement", "output",
             "Displacement of the point near the tip where tip_force acts, positive upwards",
@@ -170,5 +166,5 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
     if wing:
         names = ("initial_tip_displacement", "load_point_displacement")
         return table.rows(), Roles(chosen, outputs, None, TIP_FORCE, *names)
-    add_status()
+    table.add_status()
     return table.rows(), Roles(chosen, outputs, "displacement_error_bound")

@@ -183,6 +183,11 @@ class Table:
             )
         )
 
+    def add_status(self) -> None:
+        """Append the row that says what became of the last call."""
+        text = "What became of the last call"
+        self.add("status", "output", text, kind="Enumeration", enumeration="Status")
+
     def rows(self) -> tuple[FmuVariable, ...]:
         """Return the table.
 

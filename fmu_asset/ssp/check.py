@@ -94,7 +94,7 @@ def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
                 f"The connector {end} is declared of the type {declared.type}, but its FMU has it as "
                 f"{variable.kind}."
             )
-        units = wiring.declared[end.component].description.units
+        units = wiring.declared[end.component].units
         if between(declared.unit, (*definitions, *units), variable.unit, units) != IDENTITY:
             raise SspError(
                 f"The connector {end} is declared in {declared.unit!r}, but its FMU has it in "
@@ -109,7 +109,7 @@ def left_out_sentence(wiring: Wiring, file: Path) -> str:
         return ""
     known = [*wiring.inward]
     for component, declared in wiring.declared.items():
-        settable = (v for v in declared.variables.values() if v.causality in ("parameter", "input"))
+        settable = (v for v in declared.variables if v.causality in ("parameter", "input"))
         known += [f"{component}.{variable.name}" for variable in settable]
     names = list(wiring.left_out)
     for index, name in enumerate(names[:12]):  # more are not listed
@@ -141,7 +141,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
         return SspCheck(
             path=file,
             problems=tuple(problems),
-            components=tuple((name, wiring.declared[name].description.model_name) for name in plan.order),
+            components=tuple((name, wiring.declared[name].model_name) for name in plan.order),
             connections=len(wiring.structure.connections),
             parameters=sum(len(component.settings) for component in wiring.structure.components),
             loops=(loop_sentence(plan.loops),) if plan.loops else (),

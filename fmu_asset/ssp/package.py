@@ -12,6 +12,7 @@ from lxml import etree
 
 from fmu_asset.archive.fmu_file import check_archive
 from fmu_asset.errors import FmuFileError, SspError
+from fmu_asset.instances.plan import Interface
 
 SSD_NAME = "SystemStructure.ssd"
 NAMESPACES = {
@@ -22,6 +23,14 @@ NAMESPACES = {
 }
 OWN_NAMESPACE = "urn:uav-twin:coupling"
 """Of the annotations that say what SSP 1.0 has no word for: delayed connections, several steps in one."""
+SET_TYPE = "application/x-ssp-parameter-set"
+MAPPING_TYPE = "application/x-ssp-parameter-mapping"
+FMU_TYPE = "application/x-fmu-sharedlibrary"
+INTERFACES: dict[str, Interface | None] = {
+    "any": None,
+    "CoSimulation": "co-simulation",
+    "ModelExchange": "model-exchange",
+}
 OWN_ANNOTATION = "org.uav-twin.coupling"
 
 _NUMBERS_OF_2 = {
@@ -173,7 +182,7 @@ def in_words_of_1(root: Any, where: str) -> None:
 def _put_into_namespace(element: Any, kind: str) -> None:
     """Give the namespaces of SSP 1.0 to a document that some tools write without any."""
     inner = "ssc" if element.tag in _HOLD_COMMON else kind
-    element.tag = tag(kind, element.tag)
+    element.tag = tag(f"{kind}:{element.tag}")
     for child in element.iterchildren(etree.Element):
         _put_into_namespace(child, inner)
 
@@ -200,6 +209,7 @@ def validate(root: Any, kind: str, where: str) -> None:
         )
 
 
-def tag(kind: str, name: str) -> str:
-    """Return a tag with its namespace."""
-    return f"{{{NAMESPACES[kind]}}}{name}"
+def tag(name: str) -> str:
+    """Return a tag such as `ssd:System` with its namespace."""
+    kind, _, local = name.partition(":")
+    return f"{{{NAMESPACES[kind]}}}{local}"

@@ -4,14 +4,12 @@ from dataclasses import replace
 from math import isfinite
 from typing import Any
 
-from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.archive.declared import BASE_UNITS, UnitInfo
 from fmu_asset.coupling.structure import Setting, SettingValue
 from fmu_asset.errors import SspError
 
-from .package import NAMESPACES, SspPackage, tag, validate
+from .package import MAPPING_TYPE, NAMESPACES, SET_TYPE, SspPackage, tag, validate
 
-_SET_TYPE = "application/x-ssp-parameter-set"
-_MAPPING_TYPE = "application/x-ssp-parameter-mapping"
 VALUE_TYPES = ("Real", "Integer", "Boolean", "Enumeration", "String", "Binary")
 """What SSP 1.0 knows; a text or a binary value is refused where something would take it."""
 
@@ -20,10 +18,8 @@ def read_units(root: Any, kind: str) -> tuple[UnitInfo, ...]:
     """Return the unit definitions of a document of a kind: "ssd" or "ssv"."""
     found = []
     for unit in root.findall(f"{kind}:Units/ssc:Unit", NAMESPACES):
-        base = unit.find(tag("ssc", "BaseUnit"))
-        exponents = tuple(
-            int(base.get(symbol, "0")) for symbol in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-        )
+        base = unit.find("ssc:BaseUnit", NAMESPACES)
+        exponents = tuple(int(base.get(symbol, "0")) for symbol in BASE_UNITS)
         found.append(
             UnitInfo(
                 unit.get("name"),
@@ -54,7 +50,7 @@ def read_bindings(element: Any, package: SspPackage, where: str) -> dict[str, Se
 
 def _read_binding(element: Any, package: SspPackage, where: str) -> dict[str, Setting]:
     what = f"a parameter binding of {where}"
-    if element.get("type", _SET_TYPE) != _SET_TYPE:
+    if element.get("type", SET_TYPE) != SET_TYPE:
         raise SspError(
             f"{what} in {package.path} is of the type {element.get('type')!r}; only parameter sets are read."
         )
@@ -67,9 +63,9 @@ def _read_binding(element: Any, package: SspPackage, where: str) -> dict[str, Se
         if name in values:
             raise SspError(f"{what} in {package.path} gives {name!r} twice; keep one of the two.")
         values[name] = replace(_value(parameter, f"{what} in {package.path}"), units=units)
-    mapping = element.find(tag("ssd", "ParameterMapping"))
+    mapping = element.find("ssd:ParameterMapping", NAMESPACES)
     if mapping is not None and (mapping.get("source") or len(mapping)):  # an empty one maps nothing
-        if mapping.get("type", _MAPPING_TYPE) != _MAPPING_TYPE:
+        if mapping.get("type", MAPPING_TYPE) != MAPPING_TYPE:
             raise SspError(f"{what} in {package.path} has a mapping of the type {mapping.get('type')!r}.")
         entries = _content(mapping, None, "ssm", "ParameterMapping", package, f"the mapping of {what}")
         values = _mapped(values, entries, package, f"{what} in {package.path}")
@@ -86,7 +82,7 @@ def _content(element: Any, inline: str | None, kind: str, name: str, package: Ss
             )
         return package.parse(package.resolve(source, what), kind)
     holder = element if inline is None else element.find(inline, NAMESPACES)
-    root = None if holder is None else holder.find(tag(kind, name))
+    root = None if holder is None else holder.find(f"{kind}:{name}", NAMESPACES)
     if root is None:
         raise SspError(f"{what} in {package.path} has neither a source nor content.")
     validate(_detached(root), kind, f"{what} in {package.path}")
@@ -102,13 +98,13 @@ def _detached(element: Any) -> Any:
 
 def _value(parameter: Any, where: str) -> Setting:
     name = parameter.get("name")
-    item = next(item for kind in VALUE_TYPES if (item := parameter.find(tag("ssv", kind))) is not None)
+    item = parameter.find("*")  # by the schema, its type comes first
     value: SettingValue = item.get("value")
-    if item.tag == tag("ssv", "Real"):
+    if item.tag == tag("ssv:Real"):
         value = _finite(item.get("value"), f"the value of {name!r} of {where}")
-    elif item.tag == tag("ssv", "Integer"):
+    elif item.tag == tag("ssv:Integer"):
         value = int(item.get("value"))
-    elif item.tag == tag("ssv", "Boolean"):
+    elif item.tag == tag("ssv:Boolean"):
         value = flag(item, "value")
     return Setting(value, item.get("unit"))
 
@@ -131,9 +127,9 @@ def read_transformation(element: Any, where: str) -> tuple[float, float]:
         "IntegerMappingTransformation",
         "EnumerationMappingTransformation",
     ):
-        if element.find(tag("ssc", kind)) is not None:
+        if element.find(f"ssc:{kind}", NAMESPACES) is not None:
             raise SspError(f"{where} has a {kind}, which is not supported; only linear transformations are.")
-    linear = element.find(tag("ssc", "LinearTransformation"))
+    linear = element.find("ssc:LinearTransformation", NAMESPACES)
     if linear is None:
         return 1.0, 0.0
     factor, offset = (
@@ -153,7 +149,7 @@ def _finite(text: str, what: str) -> float:
 def _mapped(values: dict[str, Setting], root: Any, package: SspPackage, where: str) -> dict[str, Setting]:
     """Return the values under the names that a mapping gives them; what it does not name is not used."""
     found: dict[str, Setting] = {}
-    for entry in root.findall(tag("ssm", "MappingEntry")):
+    for entry in root.findall("ssm:MappingEntry", NAMESPACES):
         source, target = entry.get("source"), entry.get("target")
         factor, offset = read_transformation(entry, f"the mapping of {source!r} of {where}")
         if source not in values:  # one mapping may serve several sets

@@ -17,20 +17,11 @@ from fmu_asset.coupling.structure import (
     Endpoint,
     SystemStructure,
 )
-from fmu_asset.instances.plan import Interface
 from reporting.files import atomic_write_bytes
 
-from .flatten import flat_connections, flat_settings
-from .package import NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
+from .package import FMU_TYPE, INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
 from .parameters import VALUE_TYPES, flag, read_bindings, read_transformation, read_units
-from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree
-
-_INTERFACES: dict[str, Interface | None] = {
-    "any": None,
-    "CoSimulation": "co-simulation",
-    "ModelExchange": "model-exchange",
-}
-_FMU_TYPE = "application/x-fmu-sharedlibrary"
+from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree, flat_connections, flat_settings
 
 
 @dataclass(frozen=True)
@@ -78,7 +69,7 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
     package = SspPackage(path)
     root = package.parse(SSD_NAME, "ssd")
     tree = Tree(package)
-    system = root.find(tag("ssd", "System"))
+    system = root.find("ssd:System", NAMESPACES)
     _system(tree, system, ())
     names = _names(tree)
     fmus = _extract(tree, Path(folder))
@@ -110,7 +101,7 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
 
 
 def _span(root: Any) -> tuple[float | None, float | None]:
-    found = root.find(tag("ssd", "DefaultExperiment"))
+    found = root.find("ssd:DefaultExperiment", NAMESPACES)
     if found is None:
         return None, None
     start, stop = (found.get(name) for name in ("startTime", "stopTime"))
@@ -130,7 +121,7 @@ def _kind(tree: Tree, node: Node, declared: DeclaredConnector) -> ConnectorKind:
 
 def _system(tree: Tree, element: Any, path: ElementPath) -> None:
     name = str(element.get("name"))
-    if element.find(tag("ssd", "SignalDictionaries")) is not None:
+    if element.find("ssd:SignalDictionaries", NAMESPACES) is not None:
         raise tree.error(
             f"the system {name!r} has signal dictionaries, which are not supported; connect directly."
         )
@@ -143,9 +134,9 @@ def _system(tree: Tree, element: Any, path: ElementPath) -> None:
                 f"the system {name!r} has two elements named {own!r}; each needs a name of its own."
             )
         children.add(own)
-        if child.tag == tag("ssd", "System"):
+        if child.tag == tag("ssd:System"):
             _system(tree, child, (*path, own))
-        elif child.tag == tag("ssd", "Component"):
+        elif child.tag == tag("ssd:Component"):
             _component(tree, child, (*path, own))
         else:
             raise tree.error(
@@ -159,10 +150,10 @@ def _system(tree: Tree, element: Any, path: ElementPath) -> None:
 
 def _component(tree: Tree, element: Any, path: ElementPath) -> None:
     where = f"the component {'.'.join(path)!r}"
-    if element.get("type", _FMU_TYPE) != _FMU_TYPE:
+    if element.get("type", FMU_TYPE) != FMU_TYPE:
         raise tree.error(f"{where} is of the type {element.get('type')!r}; only FMUs are supported.")
     implementation = element.get("implementation", "any")
-    if implementation not in _INTERFACES:
+    if implementation not in INTERFACES:
         raise tree.error(f"{where} asks for {implementation!r}, which is not supported.")
     source = tree.package.resolve(str(element.get("source")), where)
     substeps = _annotation(element).get("substeps", "1")
@@ -170,7 +161,7 @@ def _component(tree: Tree, element: Any, path: ElementPath) -> None:
         raise tree.error(
             f"{where} has the number of steps {substeps!r}, which must be a positive whole number."
         )
-    tree.components[path] = (source, int(substeps), _INTERFACES[implementation])
+    tree.components[path] = (source, int(substeps), INTERFACES[implementation])
     _connectors(tree, element, path)
     _bind(tree, element, path)
 
@@ -182,7 +173,7 @@ def _connectors(tree: Tree, element: Any, path: ElementPath) -> None:
             raise tree.error(f"the connector {str(node)!r} is there twice.")
         kind, unit = None, None
         for name in VALUE_TYPES:
-            item = connector.find(tag("ssc", name))
+            item = connector.find(f"ssc:{name}", NAMESPACES)
             if item is not None:
                 kind, unit = name, item.get("unit") or None
         if kind == "Binary":

@@ -1,27 +1,40 @@
 """Writing a system of FMUs as an SSP file: SSD, SSV, SSM and the FMUs; equal systems give equal bytes."""
 
+import dataclasses
 import os
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from xml.etree.ElementTree import Element, SubElement, indent, register_namespace, tostring
+from xml.etree.ElementTree import Element, SubElement, register_namespace
 
-from fmu_asset.archive.fmu_file import UnitInfo, VariableInfo
-from fmu_asset.coupling.structure import Component, Connection, Endpoint, Setting
+from fmu_asset.archive.declared import BASE_UNITS, UnitInfo
+from fmu_asset.coupling.structure import Component, Connection, Endpoint
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.description import number
+from fmu_asset.description import number, xml_bytes
 from fmu_asset.errors import SspError
-from fmu_asset.packing.contents import archive_bytes
+from fmu_asset.packing.contents import archive_bytes, checked_target
 from reporting.files import atomic_write_bytes
 
-from .package import NAMESPACES, OWN_ANNOTATION, OWN_NAMESPACE, SSD_NAME, parse_xml, tag, validate
+from .package import (
+    FMU_TYPE,
+    INTERFACES,
+    MAPPING_TYPE,
+    NAMESPACES,
+    OWN_ANNOTATION,
+    OWN_NAMESPACE,
+    SET_TYPE,
+    SSD_NAME,
+    parse_xml,
+    tag,
+    validate,
+)
 
 SSV_NAME = "resources/parameters.ssv"
 SSM_NAME = "resources/parameters.ssm"
-_SYMBOLS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
-_IMPLEMENTATIONS = {"co-simulation": "CoSimulation", "model-exchange": "ModelExchange"}
+_IMPLEMENTATIONS = {interface: name for name, interface in INTERFACES.items()}
+_CONNECTOR_KINDS = ("input", "output", "parameter", "calculatedParameter")
 
 
 def write_ssp(
@@ -39,11 +52,7 @@ def write_ssp(
     SspError
         If the file exists, the suffix is wrong, or the system cannot be written.
     """
-    target = Path(path)
-    if target.suffix != ".ssp":
-        raise SspError(f"An SSP file must have the suffix .ssp, but {target} was given.")
-    if target.exists() and not replace:
-        raise SspError(f"{target} exists: choose another name, or give --replace.")
+    target = checked_target(path, replace=replace, what="An SSP file", suffix=".ssp", error=SspError)
     content = ssp_bytes(wiring, parameter_names=parameter_names, stop_time=stop_time)
     return atomic_write_bytes(target, content)
 
@@ -67,15 +76,15 @@ def ssp_bytes(
     for kind, uri in NAMESPACES.items():
         register_namespace(kind, uri)
     register_namespace("uav", OWN_NAMESPACE)
-    names = dict(parameter_names or {})
-    units = _units(wiring)
-    members = {
-        SSD_NAME: _xml(_description(wiring, units, stop_time)),
-        SSV_NAME: _xml(_parameter_set(wiring, names, units)),
-        SSM_NAME: _xml(_mapping(wiring, names)),
-    }
-    for name, kind in ((SSD_NAME, "ssd"), (SSV_NAME, "ssv"), (SSM_NAME, "ssm")):
-        validate(parse_xml(members[name], name), kind, name)
+    writer = _Writer(wiring, dict(parameter_names or {}))
+    members = {}
+    for name, root in (
+        (SSD_NAME, writer.description(stop_time)),
+        (SSV_NAME, writer.parameter_set()),
+        (SSM_NAME, writer.mapping()),
+    ):
+        members[name] = xml_bytes(root)
+        validate(parse_xml(members[name], name), name[-3:], name)
     for component in wiring.structure.components:
         members[_resource(component)] = component.fmu.read_bytes()
     return archive_bytes(members, SSD_NAME)
@@ -90,221 +99,173 @@ def _resource(component: Component) -> str:
     return f"resources/{plain}.fmu"
 
 
-def _xml(root: Element) -> bytes:
-    indent(root)
-    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
-
-
-def _units(wiring: Wiring) -> dict[str, UnitInfo]:
-    """Return the units that can be written: with exponents, and meaning the same in all FMUs."""
-    found: dict[str, UnitInfo] = {}
-    ambiguous = set()
-    sources = [*wiring.structure.units, *(u for d in wiring.declared.values() for u in d.description.units)]
-    for unit in sources:
-        if unit.exponents is None:
-            continue
-        plain = UnitInfo(unit.name, unit.exponents, unit.factor, unit.offset, ())
-        if found.setdefault(unit.name, plain) != plain:
-            ambiguous.add(unit.name)
-    return {name: unit for name, unit in sorted(found.items()) if name not in ambiguous}
-
-
-def _write_units(parent: Element, kind: str, units: Mapping[str, UnitInfo]) -> None:
-    if not units:
-        return
-    holder = SubElement(parent, tag(kind, "Units"))
-    for unit in units.values():
-        element = SubElement(holder, tag("ssc", "Unit"), name=unit.name)
-        base = {s: str(power) for s, power in zip(_SYMBOLS, unit.exponents or (), strict=True) if power}
-        if (unit.factor, unit.offset) != (1.0, 0.0):
-            base |= {"factor": number(unit.factor), "offset": number(unit.offset)}
-        SubElement(element, tag("ssc", "BaseUnit"), base)
-
-
-def _attributes(name: str) -> dict[str, str]:
-    return {"version": "1.0", "name": name, "generationTool": f"uav-twin {version('uav-twin')}"}
-
-
-# ---------------------------------------------------------------------- SSD
-
-
-def _description(wiring: Wiring, units: Mapping[str, UnitInfo], stop_time: float | None) -> Element:
-    structure = wiring.structure
-    root = Element(tag("ssd", "SystemStructureDescription"), _attributes(structure.name))
-    system = SubElement(root, tag("ssd", "System"), name="system")
-    enumerations: dict[str, Mapping[str, int]] = {}
-    if structure.connectors:
-        holder = SubElement(system, tag("ssd", "Connectors"))
-        for connector in structure.connectors:
-            behind = _behind(wiring, connector.name)
-            element = SubElement(holder, tag("ssd", "Connector"), name=connector.name, kind=connector.kind)
-            if behind is not None:
-                own = wiring.units[connector.name]
-                _type(element, wiring, behind, own if own in units else None, enumerations)
-    bindings = SubElement(system, tag("ssd", "ParameterBindings"))
-    binding = SubElement(
-        bindings, tag("ssd", "ParameterBinding"), type="application/x-ssp-parameter-set", source=SSV_NAME
+def _root(name: str, /, **attributes: str) -> Element:
+    return Element(
+        tag(name), {"version": "1.0", **attributes, "generationTool": f"uav-twin {version('uav-twin')}"}
     )
-    SubElement(
-        binding, tag("ssd", "ParameterMapping"), type="application/x-ssp-parameter-mapping", source=SSM_NAME
-    )
-    elements = SubElement(system, tag("ssd", "Elements"))
-    for component in structure.components:
-        _component(elements, wiring, component, units, enumerations)
-    if structure.connections:
-        holder = SubElement(system, tag("ssd", "Connections"))
-        for connection in structure.connections:
-            _connection(holder, connection)
-    if enumerations:
-        holder = SubElement(root, tag("ssd", "Enumerations"))
-        for name, items in enumerations.items():
-            element = SubElement(holder, tag("ssc", "Enumeration"), name=name)
-            for item, value in items.items():
-                SubElement(element, tag("ssc", "Item"), name=item, value=str(value))
-    _write_units(root, "ssd", units)
-    if stop_time is not None:
-        SubElement(root, tag("ssd", "DefaultExperiment"), startTime="0.0", stopTime=number(stop_time))
-    return root
 
 
-def _behind(wiring: Wiring, name: str) -> Endpoint | None:
-    """Return a variable that a connector of the system stands for."""
-    if name in wiring.outward:
-        return wiring.outward[name].end
-    ports = wiring.inward.get(name, ())
-    return ports[0].end if ports else None
-
-
-def _type(
-    element: Element,
-    wiring: Wiring,
-    end: Endpoint,
-    unit: str | None,
-    enumerations: dict[str, Mapping[str, int]],
-) -> None:
-    variable = wiring.variable(end)
-    if variable.base_type == "Real":
-        SubElement(element, tag("ssc", "Real"), {} if unit is None else {"unit": unit})
-    elif variable.base_type == "Enumeration":
-        name = f"{end.component}.{variable.name}"
-        enumerations[name] = wiring.declared[end.component].items.get(variable.name, {})
-        SubElement(element, tag("ssc", "Enumeration"), name=name)
-    else:
-        SubElement(element, tag("ssc", variable.base_type))
-
-
-def _component(
-    elements: Element,
-    wiring: Wiring,
-    component: Component,
-    units: Mapping[str, UnitInfo],
-    enumerations: dict[str, Mapping[str, int]],
-) -> None:
-    element = SubElement(
-        elements,
-        tag("ssd", "Component"),
-        name=component.name,
-        type="application/x-fmu-sharedlibrary",
-        source=_resource(component),
-        implementation=_IMPLEMENTATIONS[wiring.declared[component.name].description.interface],
-    )
-    used = dict.fromkeys(
-        end.variable
-        for connection in wiring.structure.connections
-        for end in (connection.source, connection.target)
-        if end.component == component.name
-    )
-    holder = SubElement(element, tag("ssd", "Connectors")) if used else element
-    for name in used:
-        variable = wiring.variable(Endpoint(component.name, name))
-        connector = SubElement(holder, tag("ssd", "Connector"), name=name, kind=_kind(variable))
-        unit = variable.unit if variable.unit in units else None
-        _type(connector, wiring, Endpoint(component.name, name), unit, enumerations)
-    if component.substeps != 1:
-        _annotate(element, substeps=str(component.substeps))
-
-
-def _kind(variable: VariableInfo) -> str:
-    if variable.causality not in ("input", "output", "parameter", "calculatedParameter"):
-        raise SspError(
-            f"The variable {variable.name!r} is declared as {variable.causality}, which SSP 1.0 has no "
-            "connector for."
-        )
-    return variable.causality
-
-
-def _connection(holder: Element, connection: Connection) -> None:
-    attributes = {}
-    for side, end in (("start", connection.source), ("end", connection.target)):
-        if end.component:
-            attributes[f"{side}Element"] = end.component
-        attributes[f"{side}Connector"] = end.variable
-    if not connection.convert_units:
-        attributes["suppressUnitConversion"] = "true"
-    element = SubElement(holder, tag("ssd", "Connection"), attributes)
-    if (connection.factor, connection.offset) != (1.0, 0.0):
-        SubElement(
-            element,
-            tag("ssc", "LinearTransformation"),
-            factor=number(connection.factor),
-            offset=number(connection.offset),
-        )
-    if connection.delayed:
-        _annotate(element, delayed="true")
+def _add(parent: Element, name: str, /, **attributes: str | None) -> Element:
+    """Add an element with those of its attributes that have a value."""
+    given = {key: value for key, value in attributes.items() if value is not None}
+    return SubElement(parent, tag(name), given)
 
 
 def _annotate(element: Element, **attributes: str) -> None:
-    holder = SubElement(element, tag("ssd", "Annotations"))
-    annotation = SubElement(holder, tag("ssc", "Annotation"), type=OWN_ANNOTATION)
+    annotation = _add(_add(element, "ssd:Annotations"), "ssc:Annotation", type=OWN_ANNOTATION)
     SubElement(annotation, f"{{{OWN_NAMESPACE}}}Coupling", attributes)
 
 
-# ---------------------------------------------------------------------- SSV and SSM
+class _Writer:
+    """The documents of one system."""
 
+    def __init__(self, wiring: Wiring, names: Mapping[Endpoint, str]) -> None:
+        self._wiring = wiring
+        self._enumerations: dict[str, Mapping[str, int]] = {}
+        ends = {
+            Endpoint(component.name, name): setting
+            for component in wiring.structure.components
+            for name, setting in sorted(component.settings.items())
+        }
+        self._values = {end: wiring.number(end, setting) for end, setting in ends.items()}
+        self._names = {end: names.get(end, str(end)) for end in ends}
+        self._units = self._known_units()
 
-def _ends(wiring: Wiring) -> list[tuple[Endpoint, Setting]]:
-    return [
-        (Endpoint(component.name, name), setting)
-        for component in wiring.structure.components
-        for name, setting in sorted(component.settings.items())
-    ]
+    def _known_units(self) -> dict[str, UnitInfo]:
+        """Return the units that can be written: with exponents, and meaning the same in all FMUs."""
+        found: dict[str, set[UnitInfo]] = {}
+        of_fmus = (unit for fmu in self._wiring.declared.values() for unit in fmu.units)
+        for unit in (*self._wiring.structure.units, *of_fmus):
+            if unit.exponents is not None:
+                found.setdefault(unit.name, set()).add(dataclasses.replace(unit, displays=()))
+        return {name: units.pop() for name, units in sorted(found.items()) if len(units) == 1}
 
+    def _add_units(self, parent: Element, kind: str) -> None:
+        holder = _add(parent, f"{kind}:Units") if self._units else parent
+        for unit in self._units.values():
+            base = {s: str(n) for s, n in zip(BASE_UNITS, unit.exponents or (), strict=True) if n}
+            if (unit.factor, unit.offset) != (1.0, 0.0):
+                base |= {"factor": number(unit.factor), "offset": number(unit.offset)}
+            _add(_add(holder, "ssc:Unit", name=unit.name), "ssc:BaseUnit", **base)
 
-def _parameter_set(wiring: Wiring, names: Mapping[Endpoint, str], units: Mapping[str, UnitInfo]) -> Element:
-    root = Element(tag("ssv", "ParameterSet"), _attributes("parameters"))
-    holder = SubElement(root, tag("ssv", "Parameters"))
-    seen: set[str] = set()
-    for end, setting in _ends(wiring):
-        name = names.get(end, str(end))
-        if name in seen:
-            raise SspError(
-                f"Two parameters would be named {name!r} in the parameter set; rename one of them."
-            )
-        seen.add(name)
-        variable = wiring.variable(end)
-        parameter = SubElement(holder, tag("ssv", "Parameter"), name=name)
-        value = wiring.number(end, setting)
+    # ------------------------------------------------------------------ SSD
+
+    def description(self, stop_time: float | None) -> Element:
+        """Return the system structure."""
+        structure = self._wiring.structure
+        root = _root("ssd:SystemStructureDescription", name=structure.name)
+        system = _add(root, "ssd:System", name="system")
+        holder = _add(system, "ssd:Connectors") if structure.connectors else system
+        for connector in structure.connectors:
+            element = _add(holder, "ssd:Connector", name=connector.name, kind=connector.kind)
+            there = self._wiring.outward.get(connector.name)
+            behind = [there] if there else self._wiring.inward.get(connector.name)
+            if behind:
+                self._add_type(element, behind[0].end, self._wiring.units[connector.name])
+        bindings = _add(system, "ssd:ParameterBindings")
+        binding = _add(bindings, "ssd:ParameterBinding", type=SET_TYPE, source=SSV_NAME)
+        _add(binding, "ssd:ParameterMapping", type=MAPPING_TYPE, source=SSM_NAME)
+        elements = _add(system, "ssd:Elements")
+        for component in structure.components:
+            self._add_component(elements, component)
+        holder = _add(system, "ssd:Connections") if structure.connections else system
+        for connection in structure.connections:
+            _add_connection(holder, connection)
+        holder = _add(root, "ssd:Enumerations") if self._enumerations else root
+        for name, items in self._enumerations.items():
+            element = _add(holder, "ssc:Enumeration", name=name)
+            for item, value in items.items():
+                _add(element, "ssc:Item", name=item, value=str(value))
+        self._add_units(root, "ssd")
+        if stop_time is not None:
+            _add(root, "ssd:DefaultExperiment", startTime="0.0", stopTime=number(stop_time))
+        return root
+
+    def _add_type(self, element: Element, end: Endpoint, unit: str | None) -> None:
+        variable = self._wiring.variable(end)
         if variable.base_type == "Real":
-            # In the FMU's own unit, so that no conversion stands between the file and the value.
-            own = {"unit": variable.unit} if variable.unit in units and variable.unit is not None else {}
-            SubElement(parameter, tag("ssv", "Real"), {"value": number(value), **own})
-        elif variable.base_type == "Boolean":
-            SubElement(parameter, tag("ssv", "Boolean"), value="true" if value else "false")
+            _add(element, "ssc:Real", unit=unit if unit in self._units else None)
         elif variable.base_type == "Enumeration":
-            items = wiring.declared[end.component].items.get(variable.name, {})
-            item = next((key for key, number_ in items.items() if number_ == int(value)), None)
-            if item is None:
-                raise SspError(f"{end} = {value:g} is no item of its enumeration.")
-            SubElement(parameter, tag("ssv", "Enumeration"), value=item)
+            self._enumerations[str(end)] = variable.items
+            _add(element, "ssc:Enumeration", name=str(end))
         else:
-            SubElement(parameter, tag("ssv", "Integer"), value=str(int(value)))
-    _write_units(root, "ssv", units)
-    return root
+            _add(element, f"ssc:{variable.base_type}")
+
+    def _add_component(self, elements: Element, component: Component) -> None:
+        element = _add(
+            elements,
+            "ssd:Component",
+            name=component.name,
+            type=FMU_TYPE,
+            source=_resource(component),
+            implementation=_IMPLEMENTATIONS[self._wiring.declared[component.name].interface],
+        )
+        ends = (end for c in self._wiring.structure.connections for end in (c.source, c.target))
+        used = dict.fromkeys(end for end in ends if end.component == component.name)
+        holder = _add(element, "ssd:Connectors") if used else element
+        for end in used:
+            variable = self._wiring.variable(end)
+            if variable.causality not in _CONNECTOR_KINDS:
+                raise SspError(
+                    f"The variable {variable.name!r} is declared as {variable.causality}, which SSP 1.0 has "
+                    "no connector for."
+                )
+            connector = _add(holder, "ssd:Connector", name=end.variable, kind=variable.causality)
+            self._add_type(connector, end, variable.unit)
+        if component.substeps != 1:
+            _annotate(element, substeps=str(component.substeps))
+
+    # ------------------------------------------------------------------ SSV and SSM
+
+    def parameter_set(self) -> Element:
+        """Return the parameters, in the FMUs' own units: no conversion stands between file and value."""
+        root = _root("ssv:ParameterSet", name="parameters")
+        holder = _add(root, "ssv:Parameters")
+        seen: set[str] = set()
+        for end, value in self._values.items():
+            name = self._names[end]
+            if name in seen:
+                raise SspError(
+                    f"Two parameters would be named {name!r} in the parameter set; rename one of them."
+                )
+            seen.add(name)
+            variable = self._wiring.variable(end)
+            texts = {
+                "Real": number(value),
+                "Boolean": "true" if value else "false",
+                "Integer": str(int(value)),
+                "Enumeration": next((key for key, item in variable.items.items() if item == value), None),
+            }
+            text = texts[variable.base_type]
+            if text is None:
+                raise SspError(f"{end} = {value:g} is no item of its enumeration.")
+            known = variable.base_type == "Real" and variable.unit in self._units
+            parameter = _add(holder, "ssv:Parameter", name=name)
+            _add(parameter, f"ssv:{variable.base_type}", value=text, unit=variable.unit if known else None)
+        self._add_units(root, "ssv")
+        return root
+
+    def mapping(self) -> Element:
+        """Return which parameter goes where."""
+        root = _root("ssm:ParameterMapping")
+        for end, name in self._names.items():
+            _add(root, "ssm:MappingEntry", source=name, target=str(end))
+        return root
 
 
-def _mapping(wiring: Wiring, names: Mapping[Endpoint, str]) -> Element:
-    attributes = {key: value for key, value in _attributes("").items() if key != "name"}
-    root = Element(tag("ssm", "ParameterMapping"), attributes)
-    for end, _ in _ends(wiring):
-        SubElement(root, tag("ssm", "MappingEntry"), source=names.get(end, str(end)), target=str(end))
-    return root
+def _add_connection(holder: Element, connection: Connection) -> None:
+    source, target = connection.source, connection.target
+    element = _add(
+        holder,
+        "ssd:Connection",
+        startElement=source.component or None,
+        startConnector=source.variable,
+        endElement=target.component or None,
+        endConnector=target.variable,
+        suppressUnitConversion=None if connection.convert_units else "true",
+    )
+    if (connection.factor, connection.offset) != (1.0, 0.0):
+        factor, offset = number(connection.factor), number(connection.offset)
+        _add(element, "ssc:LinearTransformation", factor=factor, offset=offset)
+    if connection.delayed:
+        _annotate(element, delayed="true")

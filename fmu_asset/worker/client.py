@@ -7,16 +7,18 @@ import os
 import select
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from fmu_asset import errors
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.folders import remove_folder
 from fmu_asset.instances.plan import Plan, Settings
 from fmu_asset.instances.series import REPORT_PERIOD, Series
+from reporting.section import Section
 
-from .guard import resident_memory
 from .process import CLOSE_LIMIT, WorkerProcess
 from .protocol import (
     FAILURE,
@@ -46,9 +48,12 @@ _ERRORS: Mapping[str, type[FmuError]] = {
 }
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What a worker may take.
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_Paths = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(strict=False)]
+
+
+class WorkerLimits(Section):
+    """The table `[limits]` of a binding: what the FMU's worker may take.
 
     Attributes
     ----------
@@ -58,14 +63,25 @@ class Limits:
         Wall clock for loading, instantiation, initialisation and reset [s].
     memory : float
         Resident memory [MiB].
-    sandbox : Grants or None
-        What it may touch beyond what every FMU may; None for all that its user may.
+    sandbox : bool
+        Whether the system keeps the FMU from the user's files, from programs and from the network.
+    read, write, ports, programs
+        What it may touch all the same; see `Grants`.
     """
 
-    step_time: float = 60.0
-    load_time: float = 60.0
-    memory: float = 4096.0
-    sandbox: Grants | None = field(default_factory=Grants)
+    step_time: _Positive = 60.0
+    load_time: _Positive = 60.0
+    memory: _Positive = 4096.0
+    sandbox: bool = True
+    read: _Paths = ()
+    write: _Paths = ()
+    ports: Annotated[tuple[Annotated[int, Field(ge=1, le=65535)], ...], Field(strict=False)] = ()
+    programs: bool = False
+
+    @property
+    def grants(self) -> Grants | None:
+        """What it may touch beyond what every FMU may; None for all that its user may."""
+        return Grants(self.read, self.write, self.ports, self.programs) if self.sandbox else None
 
 
 class WorkerInstance:
@@ -77,7 +93,7 @@ class WorkerInstance:
         What is exchanged.
     scratch : Path
         Folder of the worker alone; it is removed when the worker ends.
-    limits : Limits
+    limits : WorkerLimits
         What it may take.
 
     Attributes
@@ -93,7 +109,7 @@ class WorkerInstance:
         If the FMU cannot be instantiated.
     """
 
-    def __init__(self, plan: Plan, scratch: Path, *, limits: Limits) -> None:
+    def __init__(self, plan: Plan, scratch: Path, *, limits: WorkerLimits) -> None:
         self.request = (ctypes.c_double * (2 + plan.input_count))()
         self.reply = (ctypes.c_double * max(plan.output_count, 1))()
         self._request = memoryview(self.request).cast("B")
@@ -107,7 +123,7 @@ class WorkerInstance:
         self._lost = False
         # An exception between question and answer, such as an interruption, leaves the two out of step.
         self._busy = False
-        self._process = WorkerProcess(scratch, plan.folder, limits.sandbox)
+        self._process = WorkerProcess(scratch, plan.folder, limits.grants)
         self._out, self._in = self._process.outgoing, self._process.incoming
         # The worker may leave it at half an answer.
         os.set_blocking(self._in, False)
@@ -134,39 +150,15 @@ class WorkerInstance:
 
     def step(self) -> None:
         """Make the step that the request block describes."""
-        what = "the step"
-        self._begin()
-        try:
-            send(self._out, HEADER.pack(_STEP, 0, self._number, len(self._request)), self._request)
-        except BrokenPipeError:
-            raise self._died(what) from None
-        look(self._poll)
-        kind, length = self._await(what, len(self._reply))
-        if kind == RESULT and length == len(self._reply):
-            self._fill(self._reply, what)
-            self._busy = False
-        elif kind == FAILURE:
-            self._fail(length, what)
-        else:
-            raise self._died(what)
-        if time.monotonic() > self._next_glance:
-            self._check_memory(what)
+        self._turn(_STEP, self._request, "the step")
 
     def run(self, series: Series, report: Callable[[], object]) -> None:
         """Make many steps; each may take the time of a step."""
         what = "a step"
-        self._begin()
-        try:
-            send(
-                self._out, HEADER.pack(Operation.RUN, 0, self._number, len(series.requests)), series.requests
-            )
-        except BrokenPipeError:
-            raise self._died(what) from None
+        self._ask(Operation.RUN, series.requests, what)
         kind = PART
         while kind == PART:
             kind, length = self._await(what, len(series.replies), part=True)
-            if kind == FAILURE:
-                self._fail(length, what)
             steps, rest = divmod(length, series.reply_size)
             if rest or series.done + steps > series.count:
                 raise self._died(what)
@@ -181,11 +173,7 @@ class WorkerInstance:
 
     def read(self) -> None:
         """Read the outputs of this moment."""
-        what = "reading the outputs"
-        content = self._call(Operation.READ, b"", what, len(self._reply))
-        if len(content) != len(self._reply):
-            raise self._died(what)
-        self._reply[:] = content
+        self._turn(Operation.READ, b"", "reading the outputs")
 
     def save(self) -> bytes:
         """Return the serialised FMU state."""
@@ -235,7 +223,7 @@ class WorkerInstance:
     @property
     def memory(self) -> int:
         """Resident memory of the worker [bytes]; 0 if it is gone."""
-        return resident_memory(self._process.number) or 0
+        return _resident_memory(self._process.number) or 0
 
     def close(self) -> None:
         """End the worker, kindly at first, and remove its folder."""
@@ -251,30 +239,41 @@ class WorkerInstance:
         self._process.end(CLOSE_LIMIT if kindly else 0.0)
         remove_folder(self._folder)
 
-    def _call(self, operation: Operation, content: bytes, what: str, largest: int = LARGEST_MESSAGE) -> bytes:
-        self._begin()
+    def _ask(self, operation: int, content: bytes | memoryview, what: str) -> None:
+        if self._lost or self._busy:
+            raise FmuWorkerError("The FMU's worker is gone or was interrupted; reset the asset to go on.")
+        self._busy = True
+        self._number = (self._number + 1) % 2**32
         try:
             send(self._out, HEADER.pack(operation, 0, self._number, len(content)), content)
         except BrokenPipeError:
             raise self._died(what) from None
+
+    def _turn(self, operation: int, content: bytes | memoryview, what: str) -> None:
+        """Ask for outputs, and fill the reply block with them."""
+        self._ask(operation, content, what)
+        look(self._poll)
+        _, length = self._await(what, len(self._reply))
+        if length != len(self._reply):
+            raise self._died(what)
+        self._fill(self._reply, what)
+        self._busy = False
+        if time.monotonic() > self._next_glance:
+            self._check_memory(what)
+
+    def _call(self, operation: Operation, content: bytes, what: str, largest: int = LARGEST_MESSAGE) -> bytes:
+        self._ask(operation, content, what)
         if operation in QUICK:
             look(self._poll)
-        kind, length = self._await(what, largest)
-        if kind == FAILURE:
-            self._fail(length, what)
+        _, length = self._await(what, largest)
         answer = bytearray(length)
         self._fill(memoryview(answer), what)
         self._busy = False
         self._check_memory(what)
         return bytes(answer)
 
-    def _begin(self) -> None:
-        if self._lost or self._busy:
-            raise FmuWorkerError("The FMU's worker is gone or was interrupted; reset the asset to go on.")
-        self._busy = True
-        self._number = (self._number + 1) % 2**32
-
     def _await(self, what: str, largest: int, *, part: bool = False) -> tuple[int, int]:
+        """Return kind and length of the answer; a failure is raised."""
         # The first wait covers the usual step; a longer one is a chance to look at the worker's memory.
         if not self._poll.poll(self._first_wait):
             slack = REPORT_PERIOD * part - self._first_wait / 1000.0
@@ -285,6 +284,8 @@ class WorkerInstance:
         if not known or length > (LARGEST_MESSAGE if kind == FAILURE else largest):
             raise self._died(what)
         self._logged = self._logged or logged != 0
+        if kind == FAILURE:
+            self._fail(length, what)
         return kind, length
 
     def _limit(self, what: str) -> float:
@@ -348,3 +349,17 @@ class WorkerInstance:
     def _died(self, what: str) -> FmuWorkerError:
         self._lost = True
         return self._process.death(what)
+
+
+def _resident_memory(process: int) -> int | None:
+    """Return the resident memory of a process [bytes], or None if it is gone or the system does not say.
+
+    `RLIMIT_AS` would refuse FMUs that reserve address space and never use it (Java, .NET, CUDA, the stacks of
+    threads); under either limit an allocation fails inside the FMU, which then crashes, and nobody could say
+    why.
+    """
+    try:
+        with open(f"/proc/{process}/statm", "rb") as file:  # noqa: PTH123 - half the time of Path.open
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError, ValueError):
+        return None

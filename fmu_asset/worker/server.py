@@ -19,7 +19,6 @@ from fmu_asset.instances.base import FmuInstance
 from fmu_asset.instances.plan import Plan
 from fmu_asset.instances.series import Series
 
-from .guard import restrict
 from .protocol import (
     DESERTED,
     FAILURE,
@@ -36,19 +35,9 @@ from .protocol import (
     send,
 )
 
-_STEP, _RUN, _OPEN, _RENEW, _CLOSE, _LOG = (
-    int(operation)
-    for operation in (
-        Operation.STEP,
-        Operation.RUN,
-        Operation.OPEN,
-        Operation.RENEW,
-        Operation.CLOSE,
-        Operation.LOG,
-    )
-)
-
-
+_STEP = int(Operation.STEP)
+LARGEST_FILE = 2 * 1024**3
+"""Bytes that an FMU may write to one file, such as an endless log."""
 _NOT_GRANTED = (
     " The system refused it something (Permission denied{}), as its sandbox does: what it needs can be "
     "granted by `read`, `write`, `ports` or `programs` in the table [limits] of its binding."
@@ -89,7 +78,7 @@ def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
     # The twin decides what an interruption means; the worker ends when its pipe closes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable()
-    restrict()
+    _restrict()
     asked = False
     try:
         asked, instance = _answer_requests(incoming, outgoing, confined=confined)
@@ -105,6 +94,17 @@ def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
         os._exit(OWN_FAILURE)
     # Without the interpreter's shutdown, which third-party libraries may not survive.
     os._exit(0 if asked else DESERTED)
+
+
+def _restrict() -> None:
+    """End an FMU that fills the disk."""
+    import resource
+
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    limit = LARGEST_FILE if hard == resource.RLIM_INFINITY else min(LARGEST_FILE, hard)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    # Python ignores this signal, and the FMU would see a write that fails again and again.
+    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
 
 
 def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[bool, FmuInstance | None]:
@@ -131,23 +131,23 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
                 payload: bytes | memoryview = reply
             else:
                 content = bytearray(length)
-                asked, system_error.value = operation == _CLOSE, 0
+                asked, system_error.value = operation == Operation.CLOSE, 0
                 _last_reach.clear()
                 if not receive(incoming, memoryview(content)) or asked:
                     break
-                if operation == _OPEN:
+                if operation == Operation.OPEN:
                     plan = Plan.from_json(bytes(content))
-                if operation in (_OPEN, _RENEW) and plan is not None:
+                if operation in (Operation.OPEN, Operation.RENEW) and plan is not None:
                     if instance is not None:
                         instance.close()
                     instance = open_instance(plan)
                     request = memoryview(instance.request).cast("B")
                     reply = memoryview(instance.reply).cast("B")
-                if operation == _RUN and instance is not None:
+                if operation == Operation.RUN and instance is not None:
                     payload = _run(instance, content, outgoing, number)
                 else:
                     payload = _answer(operation, bytes(content), instance, reply)
-            logged = instance is not None and instance.has_log and operation != _LOG
+            logged = instance is not None and instance.has_log and operation != Operation.LOG
             HEADER.pack_into(reply_header, 0, RESULT, logged, number, len(payload))
         except FmuError as error:
             refused = system_error.value == errno.EACCES or "ermission denied" in str(error)

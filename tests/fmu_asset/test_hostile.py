@@ -411,7 +411,7 @@ def test_what_a_dead_twin_left_is_removed_by_the_next(
         asset.step()
     (scratch / own.replace(f"-{os.getpid()}-", f"-{dead.pid}-")).mkdir()
     (scratch / "somebody-else").mkdir()
-    program = "import sys\nfrom fmu_asset.archive.fmu_file import plain_folder\nprint(plain_folder())\n"
+    program = "import sys\nfrom fmu_asset.folders import plain_folder\nprint(plain_folder())\n"
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, check=True, capture_output=True, text=True
     )

@@ -15,7 +15,7 @@ from calibration.parameters.result import ParameterCalibration
 from calibration.reading import load_calibration
 from fe.full.statics import Factorisation
 from fe.structure.operators import load_and_assemble
-from fmu_asset.archive.design_record import packed_design_hash
+from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.progress import SilentProgress
 from scenarios import scenario_files, structure_files
 from tests import command_line

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from fmu_asset.archive.design_record import packed_design_hash
+from fmu_asset.archive.fmu_file import packed_design_hash
 from fmu_asset.errors import FmuInputError
 from reporting.progress import Progress
 from reporting.provenance import hash_file

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.coupling.layout import Layout
-from fmu_asset.coupling.roles import resolve_roles
+from fmu_asset.coupling.roles import parameter_values, resolve_roles
 from fmu_asset.coupling.structure import (
     Component,
     Connection,
@@ -126,17 +125,20 @@ def _with_values(
 ) -> tuple[Wiring, dict[Endpoint, str]]:
     """Return the system with the values of a scenario, and the binding's names for its parameters."""
     roles = resolve_roles(wiring, binding)
-    values = Layout(wiring, binding, roles).parameters(parameters)
+    values = parameter_values(binding, roles, parameters)
     for name, value in load.items():
         for port in roles.inputs["load"][name]:
-            index = [c.name for c in wiring.structure.components].index(port.end.component)
-            values[index][port.end.variable] = port.conversion.to_fmu(value)
+            own = values.setdefault(port.end.component, {})
+            own[port.end.variable] = port.conversion.to_fmu(value)
     components = tuple(
         replace(
             component,
-            settings={**component.settings, **{key: Setting(number) for key, number in own.items()}},
+            settings={
+                **component.settings,
+                **{key: Setting(number) for key, number in values.get(component.name, {}).items()},
+            },
         )
-        for component, own in zip(wiring.structure.components, values, strict=True)
+        for component in wiring.structure.components
     )
     names = {
         ports[0].end: name

@@ -18,7 +18,7 @@ import numpy as np
 from fe.runtime.archive import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
 from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.placement import limits_of, say_sandbox
+from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
 from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftovers, write_error
 from reporting.json_file import parse_json
@@ -191,7 +191,7 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
         if any(b <= a for a, b in itertools.pairwise(levels)):
             raise InvalidObservationLibraryError(f"the levels of {name} must increase, and {levels} came.")
     fmu = FmiAsset(grid.fmu, binding)
-    say_sandbox(Path(grid.fmu), limits_of(binding, None, None, None).sandbox)
+    say_sandbox(Path(grid.fmu), binding.limits.grants)
     sensors = fmu.binding.observation_slice(grid.role)
     count = sensors.stop - sensors.start
     check_fits(

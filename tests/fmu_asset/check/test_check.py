@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from fmu_asset.check import check_fmu
-from fmu_asset.check.result import FmuCheck
+from fmu_asset.check import FmuCheck, check_fmu
 from fmu_asset.door.binding import parse_binding
 
 MODELS = ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]

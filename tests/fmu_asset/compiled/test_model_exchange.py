@@ -20,7 +20,7 @@ from scipy.linalg import expm
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.check import check_fmu
-from fmu_asset.compiled.exchange import STATES as STATE_NAMES
+from fmu_asset.compiled.package import STATES as STATE_NAMES
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from fe.runtime.reduced import ReducedModel
-from fmu_asset.compiled.data_file import MAGIC, NAME_BYTES, data_file_bytes, pack_arrays
+from fmu_asset.compiled.package import MAGIC, NAME_BYTES, data_file_bytes, pack_arrays
 
 DRIVER = Path(__file__).with_name("driver.c")
 WARNINGS = (

@@ -78,7 +78,7 @@ def test_connections_that_do_not_fit(
 
 def test_enumerations_and_integers_feed_each_other(base: SystemStructure) -> None:
     joined = Wiring(replace(base, connections=(link("damage.status", "spring.misbehaviour"),)))
-    assert joined.feeds[0].conversion == (1.0, 0.0)
+    assert next(iter(joined.feeds.values())).conversion == (1.0, 0.0)
 
 
 def test_ends_and_patterns_that_cannot_be_read() -> None:
@@ -154,7 +154,7 @@ def test_units_of_connections_are_converted(base: SystemStructure) -> None:
     )
     wiring = Wiring(replace(base, connections=connections))
     assert wiring.outward["percent"].conversion == (100.0, 0.0)
-    assert wiring.feeds[0].conversion == (1.0, 0.0)
+    assert next(iter(wiring.feeds.values())).conversion == (1.0, 0.0)
     assert wiring.outward["seen"].conversion == (2.0, 0.5)
     assert wiring.units["seen"] == "m"
     # The value is converted first, and transformed in the unit of the target.

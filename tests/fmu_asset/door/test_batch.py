@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmu_asset.archive import extraction
 from fmu_asset.archive.declared import FmuDescription
+from fmu_asset.door import placement
 from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuStateError
@@ -32,13 +32,13 @@ def described(state: str = "auto") -> Binding:
 def extractions(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Return the folders into which FMUs are extracted during the test."""
     made: list[Path] = []
-    extract = extraction.extract_fmu
+    extract = placement.extract_fmu
 
     def counting(description: FmuDescription) -> Path:
         made.append(extract(description))
         return made[-1]
 
-    monkeypatch.setattr(extraction, "extract_fmu", counting)
+    monkeypatch.setattr(placement, "extract_fmu", counting)
     return made
 
 

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_asset.archive.fmu_file import UnitInfo, VariableInfo
-from fmu_asset.door.binding import Binding, WorkerLimits, expand, load_binding
+from fmu_asset.archive.declared import UnitInfo, VariableInfo
+from fmu_asset.door.binding import Binding, expand, load_binding
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import Conversion, conversion
 from fmu_asset.errors import BindingError, FmuInputError
-from fmu_asset.worker.client import Limits
+from fmu_asset.worker.client import WorkerLimits
 
 GOOD = """
 [binding]
@@ -178,8 +178,8 @@ def test_ranges_of_the_binding_narrow_those_of_the_fmu(fmu: Path, binding: Bindi
 
 def test_limits_come_from_the_caller_then_from_the_binding(binding: Binding) -> None:
     bound = binding.model_copy(update={"limits": WorkerLimits(step_time=3.0, memory=500.0)})
-    assert limits_of(bound, None, None, None) == Limits(3.0, Limits().load_time, 500.0)
-    assert limits_of(bound, 1.0, 2.0, None) == Limits(1.0, 2.0, 500.0)
+    assert limits_of(bound, None, None, None) == WorkerLimits(step_time=3.0, memory=500.0)
+    assert limits_of(bound, 1.0, 2.0, None) == WorkerLimits(step_time=1.0, load_time=2.0, memory=500.0)
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(FmuInputError, match="memory_limit must be a positive number of MiB"):
             limits_of(bound, None, None, wrong)

@@ -291,7 +291,7 @@ def test_the_fmu_itself_refuses_and_says_why(
     fmu: Path, binding: Binding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the door's own check out of the way, the FMU's is seen: Discard, a sentence, nothing changed."""
-    monkeypatch.setattr("fmu_asset.door.slots.checked", lambda slot, value: value)
+    monkeypatch.setattr("fmu_asset.door.layout.checked", lambda slot, value: value)
     with FmiAsset(fmu, binding) as asset:
         before = asset.step({"load_factor": 3.0})
         for value, sentence in ((99, "lies outside its range"), (float("nan"), "not finite")):
@@ -302,16 +302,6 @@ def test_the_fmu_itself_refuses_and_says_why(
         after = asset.step()
         np.testing.assert_array_equal(before.values, after.values)
         assert after.time == 2.0
-
-
-def test_describe_lists_variables_with_their_roles(fmu: Path, binding: Binding) -> None:
-    record = FmiAsset(fmu, binding).describe()
-    json.dumps(record)
-    roles = {variable["name"]: variable["role"] for variable in record["variables"]}
-    assert roles["load_factor"] == "control.load_factor"
-    assert roles["strain[7]"] == "observation.strain"
-    assert roles["mass.pitot"] == "parameter.pitot_mass"
-    assert record["state_method"] == "serialised"
 
 
 @pytest.mark.parametrize("response", [1.0, 2.0], ids=["quasi-static", "transient"])

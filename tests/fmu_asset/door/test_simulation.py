@@ -16,7 +16,7 @@ from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.door import simulation
 from fmu_asset.door.binding import Binding, parse_binding
-from fmu_asset.door.observation import Observation
+from fmu_asset.door.reading import Observation
 from fmu_asset.door.saved_state import SavedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import (
@@ -292,11 +292,11 @@ def test_what_is_sent_is_what_a_step_sends(foreign_fmu: Any, power: list[float],
         }
     )
     exchange = Exchange(read_fmu(foreign_fmu("room2")), binding)
-    target, sent, refused = exchange.start_values(), [], ""
+    target, sent, refused = exchange.start_values({}), [], ""
     held, roles = np.array(target), {"control": {"power": power}, "load": {"outside": outside}}
     try:
         for value in power:
-            exchange.place(target, {"power": value}, None, {"outside": outside})
+            exchange.place(target, {"control": {"power": value}, "load": {"outside": outside}})
             sent.append(list(target))
     except FmuInputError as error:
         refused = error.sentence

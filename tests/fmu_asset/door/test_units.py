@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmu_asset.archive.declared import UnitInfo
-from fmu_asset.door.unit_symbols import Meaning, meaning_of, same_dimension
-from fmu_asset.door.units import contradictions
+from fmu_asset.door.units import Meaning, contradictions, meaning_of, same_dimension
 
 
 def si(**exponents: int) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ from fmpy.ssp.ssd import read_ssd
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.companions.build import build_companion
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import (
@@ -235,7 +235,7 @@ def test_files_are_not_overwritten_unasked(structure: SystemStructure, tmp_path:
     wiring = Wiring(structure)
     path = write_ssp(wiring, tmp_path / "x.ssp")
     before = path.read_bytes()
-    with pytest.raises(SspError, match="exists: choose another name"):
+    with pytest.raises(SspError, match="exists: choose another --out"):
         write_ssp(wiring, path)
     with pytest.raises(SspError, match=r"suffix \.ssp"):
         write_ssp(wiring, tmp_path / "x.zip")
@@ -398,8 +398,8 @@ def test_nested_systems_parameters_and_mappings(theirs: Pack, tmp_path: Path) ->
     assert wiring.settings["damage"] == {
         "initial.z1": pytest.approx(0.4), "initial.z2": pytest.approx(0.04), "seed": 17.0,
     }  # fmt: skip
-    (feed,) = wiring.feeds
-    assert (str(feed.source), str(feed.target)) == ("damage.z1", "structure.wing.health.z1")
+    ((target, feed),) = wiring.feeds.items()
+    assert (str(feed.end), str(target)) == ("damage.z1", "structure.wing.health.z1")
     assert feed.conversion == (0.5, 0.0)
     assert wiring.outward["loss"].conversion == (pytest.approx(100.0), 0.0)
     assert {str(port.end): port.conversion for port in wiring.inward["n"]} == {
