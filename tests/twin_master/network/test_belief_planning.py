@@ -8,23 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.study_planning import tiger
 from twin_master.errors import PlanningError
 from twin_master.network.belief_planning import DecisionProblem, plan_on_belief
 from twin_master.network.planner import value_iteration
 from twin_master.network.simulated_return import simulated_returns
 from twin_master.network.transition import TransitionModel
-
-
-def tiger(discount: float) -> DecisionProblem:
-    """Kaelbling, Littman and Cassandra 1998: listen, or open one of two doors."""
-    moves = np.array([np.eye(2), np.full((2, 2), 0.5), np.full((2, 2), 0.5)])
-    reward = np.array([[-1.0, -100.0, 10.0], [-1.0, 10.0, -100.0]])
-    heard = np.array([[0.85, 0.15], [0.15, 0.85]])
-    nothing = np.full((2, 2), 0.5)
-    return DecisionProblem(
-        TransitionModel((moves,)), reward, np.full(3, discount), (heard, nothing, nothing),
-        np.array([0.5, 0.5]), moves_first=True,
-    )  # fmt: skip
 
 
 def drawn(seed: int, states: int, moves_first: bool, discount: float = 0.8) -> DecisionProblem:
