@@ -155,12 +155,14 @@ def write_drn(problem: DecisionProblem, path: Path) -> float:
 def by_storm(problem: DecisionProblem, size: int, resolution: int) -> tuple[float, float]:
     """Return Storm's lower and upper bound: of so many beliefs, and of a grid."""
     import stormpy
-    from stormpy import pomdp
+    from stormpy import io, pomdp
 
     with TemporaryDirectory() as folder:
         file = Path(folder, "problem.drn")
         lift = write_drn(problem, file)
-        model = stormpy.build_model_from_drn(str(file))
+        options = io.DirectEncodingParserOptions()
+        options.build_choice_labeling = True
+        model = stormpy.build_model_from_drn(str(file), options=options)
     goal = stormpy.parse_properties('Rmax=? [F "sink"]')[0]
     below = pomdp.verify_with_belief_unfolding(model, goal, max_exploration_size=size)
     above = pomdp.verify_with_belief_discretization(model, goal, resolution)

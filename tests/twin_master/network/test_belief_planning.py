@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.study_planning import tiger
+from benchmarks.study_planning import PROBLEMS, tiger
 from twin_master.errors import PlanningError
 from twin_master.network.belief_planning import DecisionProblem, plan_on_belief
 from twin_master.network.planner import value_iteration
@@ -53,6 +53,19 @@ def test_the_tiger_is_worth_what_was_published(discount: float, published: float
     plan = plan_on_belief(tiger(discount), gap=1e-4, most_beliefs=5000)
     assert plan.lower - 5e-4 <= published <= plan.upper + 5e-4
     assert plan.upper - plan.lower <= 1e-4 * plan.upper
+
+
+STORM = {"tiger": (19.3711, 19.3716), "maze of 4 x 3": (1.8490, 1.9066)}
+"""Bounds of Storm 2.0 as in `benchmarks.study_planning`, of 200,000 beliefs and a grid of 400 and of 24."""
+
+
+@pytest.mark.parametrize("name", STORM)
+def test_an_independent_solver_finds_the_same_value(name: str) -> None:
+    below, above = STORM[name]
+    plan = plan_on_belief(PROBLEMS[name]())
+    assert plan.lower <= above
+    assert plan.upper >= below
+    assert plan.upper - plan.lower <= 0.01 * plan.upper
 
 
 @pytest.mark.parametrize("moves_first", [False, True])
