@@ -39,8 +39,8 @@ MISSIONS = 400
 """That are simulated for each rule."""
 PERIODS = (2, 3, 5, 8, 12, 20)
 """Turns between two inspections of the rules that inspect by the clock."""
-_PRICED_GAP = 0.06
-"""Between the bounds of a plan that is one of those tried."""
+_GAP, _PRICED_GAP = 0.005, 0.06
+"""Between the bounds of a plan, as a share of the return, and of those that are tried for a limit."""
 _HARDEST, _HALVINGS = 2.0**12, 4
 """The largest price of a turn beyond the limit, in rewards, and how often the interval of it is halved."""
 
@@ -105,11 +105,11 @@ def expected_plan(
     first = scenario.control_names.index(scenario.mission.first_control)
     allowed, risk = scenario.planner.limit_probability, _risk(rewards)
 
-    gap = {} if allowed is None else {"gap": _PRICED_GAP}
+    gap = _GAP if allowed is None else _PRICED_GAP
 
     def priced(price: float) -> tuple[BeliefPlan, float]:
         costly = replace(problem, reward=problem.reward - price * risk)
-        return plan_on_belief(costly, first=first, **gap), price
+        return plan_on_belief(costly, first=first, gap=gap), price
 
     def holds(plan: BeliefPlan) -> bool:
         return allowed is None or risk_of(scenario, problem, rewards, plan.policy) <= allowed

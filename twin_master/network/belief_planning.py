@@ -37,6 +37,8 @@ _ROUNDED = 0.15
 """Share of the largest probability below which others are left out of the beliefs that are composed."""
 _FIRST, _GROWTH = 32, 1.6
 """Beliefs that are visited before the bounds settle at all of them, and their growth until they do again."""
+_LARGEST = 1e9
+"""Products that are summed up to compose all beliefs once, at most."""
 _PASSES, _SWEEPS, _RAISED = 6, 15, 3
 """How often beliefs are composed anew then, sweeps in between, and sweeps of the lower bound."""
 
@@ -201,7 +203,8 @@ class _Upper:
         Beliefs of few states fit into many others.
         """
         rounded = np.where(belief < _ROUNDED * belief.max(), 0.0, belief)
-        corners = np.eye(len(belief))[rounded > 0.0]
+        likely = np.argsort(-rounded, kind="stable")[: min(_PARTS, np.count_nonzero(rounded))]
+        corners = np.equal.outer(likely, np.arange(len(belief))).astype(np.float64)
         for point in (*corners, rounded / rounded.sum(), belief):
             same = np.all(self._point == point, axis=1)
             if not same.any():
@@ -212,18 +215,22 @@ class _Upper:
         self._index()
 
     def settle(self) -> None:
-        """Improve the bound at all beliefs at once, until what each has of the others has gone round."""
+        """Improve the bound at all beliefs at once, until what each has of the others has gone round.
+
+        Where there is too much to compose the bound is left as it is.
+        """
         problem, controls = self._problem, len(self._corner)
+        if len(self._point) * sum(table.size for table in problem.likelihood) * controls > _LARGEST:
+            return
         certain = np.flatnonzero(self._point.max(axis=1) == 1.0)
         corners = np.argmax(self._point[certain], axis=1)
         now = self._point @ problem.reward
         for _ in range(_PASSES):
-            after = [problem.following(belief, u) for belief in self._point for u in range(controls)]
-            begins = np.cumsum([0, *(len(rows) for rows in after[:-1])])
-            parts = [self._compose(rows)[1:] for rows in after]
-            plain, chosen, share = (np.concatenate(column) for column in zip(*parts, strict=True))
+            after = (problem.following(belief, u) for belief in self._point for u in range(controls))
+            parts = [(*self._compose(rows)[1:], rows[:, corners]) for rows in after]
+            begins = np.cumsum([0, *(len(part[0]) for part in parts[:-1])])
+            plain, chosen, share, inside = (np.concatenate(column) for column in zip(*parts, strict=True))
             place = chosen * controls + np.arange(controls)[:, None]
-            inside = np.concatenate([rows[:, corners] for rows in after])
             for _ in range(_SWEEPS):
                 every = plain + np.einsum("kup,kup->ku", share, self._drop.ravel()[place])
                 later = np.add.reduceat(every.max(axis=1), begins).reshape(-1, controls)
