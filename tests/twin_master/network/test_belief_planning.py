@@ -118,6 +118,21 @@ def test_simulated_missions_bring_what_the_plan_promises(moves_first: bool) -> N
     assert plan.upper <= problem.prior @ known.value + 1e-9
 
 
+def test_the_difference_of_two_rules_varies_little_from_mission_to_mission() -> None:
+    problem = drawn(6, 4, moves_first=False)
+    known = value_iteration(problem.transition, problem.reward, problem.discount).action_value
+
+    def returns(values: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng(0)
+        return simulated_returns(
+            problem, lambda belief, _turn: np.argmax(belief @ values, axis=1), 1000, 20, rng
+        )
+
+    first, second = returns(known), returns(known + np.array([0.3, 0.0, 0.0]))
+    assert first.mean() - second.mean() == pytest.approx(0.92, abs=0.05)
+    assert (first - second).std() < 0.4  # rewards that are drawn with the states differ by 1.4
+
+
 def test_a_product_of_tables_is_planned_as_the_table_of_all_states() -> None:
     rng = np.random.default_rng(7)
     factors = tuple(rng.dirichlet(np.ones(3), (2, 3)) for _ in range(2))
