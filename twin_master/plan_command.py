@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,13 +13,16 @@ from twin_master.command import Calibration, Seed
 from twin_master.errors import MissionInputError
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
     from twin_master.mission.planning import ComparedPolicy
     from twin_master.mission.preparation import Knowledge
     from twin_master.network.belief_planning import BeliefPlan, DecisionProblem
     from twin_master.scenario.schema import Scenario
-    from twin_master.viewer.scene import Planform
+
+    Float = NDArray[np.float64]
 
 ValueOf = Annotated[
     str | None,
@@ -54,7 +58,7 @@ def plan(
     from twin_master.mission.planning import compared, risk_of, write_policy
     from twin_master.report.plan import plan_figure
 
-    knowledge = _knowledge(scenario, seed, calibration)
+    knowledge, _ = _knowledge(scenario, seed, calibration)
     found = _planned(knowledge)
     plan, promised = found.plan, found.promised
     if out is not None:
@@ -71,9 +75,9 @@ def plan(
     rows = [promised, *([] if value_of else compared(knowledge.scenario, found.problem))]
     if value_of is not None:
         without = _planned(_without(knowledge, [value_of])).promised
-        half = float((promised.half_width**2 + without.half_width**2) ** 0.5)
+        worth = promised.beyond(without)
         rows.append(replace(without, name=f"planned without {value_of}"))
-        record["value"] = {"of": value_of, "mean": promised.mean - without.mean, "half_width": half}
+        record["value"] = {"of": value_of, "mean": worth.mean, "half_width": worth.half_width}
     record["rules"] = {row.name: [row.mean, row.half_width] for row in rows}
     if json:
         terminal.print_json(record)
@@ -81,20 +85,27 @@ def plan(
     _show(record, rows)
 
 
-def _knowledge(scenario: str, seed: int | None, calibration: Path | None) -> "Knowledge":
-    """Return what the twin knows before any plan on the belief."""
-    from twin_master.assets.resolution import Overrides
-    from twin_master.mission.preparation import prepare_twin
+def _knowledge(
+    scenario: str, seed: int | None, calibration: Path | None, candidates: str | None = None
+) -> "tuple[Knowledge, tuple[Float | None, list[Float]]]":
+    """Return what the twin knows before any plan on the belief, and where its gauges are, see `_places`."""
+    from twin_master.assets.candidates import with_candidates
+    from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
+    from twin_master.mission.preparation import prepare_knowledge
     from twin_master.scenario.reading import load_scenario
 
-    loaded = load_scenario(scenario)
-    planner = loaded.scenario.planner
-    plain = planner.model_copy(update=_UNPLANNED)
-    unplanned = replace(loaded, scenario=loaded.scenario.model_copy(update={"planner": plain}))
-    found = prepare_twin(
-        unplanned, Overrides(seed=seed, calibration=calibration), progress=terminal.progress()
-    )
-    return replace(found, scenario=found.scenario.model_copy(update={"planner": planner}))
+    resolved = resolve_scenario(load_scenario(scenario), Overrides(seed=seed, calibration=calibration))
+    believed_source(resolved).check()
+    planner = resolved.planner
+    unplanned = resolved.model_copy(update={"planner": planner.model_copy(update=_UNPLANNED)})
+    with TemporaryDirectory(prefix="uav_twin_") as folder:
+        if candidates is not None:
+            unplanned = with_candidates(unplanned, candidates, Path(folder, "candidates"))
+        source = believed_source(unplanned)
+        source.prepare(Path(folder), terminal.progress())
+        found = prepare_knowledge(unplanned, source, unplanned.mission.seed)
+        places = _places(unplanned)
+    return replace(found, scenario=unplanned.model_copy(update={"planner": planner})), places
 
 
 def _planned(knowledge: "Knowledge") -> _Planned:
@@ -178,10 +189,15 @@ def design(
         str | None,
         typer.Option(metavar="NAMES", help="Candidates, by numbers or titles with commas; all by default."),
     ] = None,
-    picture: Annotated[Path | None, typer.Option(help="Draw the choice, as SVG or PNG.")] = None,
-    vtu: Annotated[
-        Path | None, typer.Option(help="Write the gauges of a wing as points with their ranks.")
+    candidates: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|FILE",
+            help="More candidates on a structure: N rosettes spread over its surface, or a file of gauges.",
+        ),
     ] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the choice, as SVG or PNG.")] = None,
+    vtu: Annotated[Path | None, typer.Option(help="Write the gauges as points with their ranks.")] = None,
     worth: Annotated[
         bool, typer.Option("--worth", help="Plan with the chosen and with all, and compare the returns.")
     ] = False,
@@ -191,17 +207,17 @@ def design(
     """Choose the sensors that tell most of the state, and name what none of them separates."""
     from twin_master.mission.sensor_design import chosen_sensors, drawn_readings, separations
 
-    knowledge = _knowledge(scenario, None, calibration)
+    knowledge, places = _knowledge(scenario, None, calibration, candidates)
     titles = _titles(knowledge.scenario)
     wanted = titles if among is None else tuple(among.split(","))
     if not {*wanted} <= {*titles} or len({*wanted}) < len(wanted):
         raise MissionInputError(
             f"--among names different sensors ({titles[0]} to {titles[-1]}), and `{among}` came."
         )
-    candidates, readings = [titles.index(name) for name in wanted], drawn_readings(knowledge)
-    found = chosen_sensors(readings, candidates, sensors)
+    pool, readings = [titles.index(name) for name in wanted], drawn_readings(knowledge)
+    found = chosen_sensors(readings, pool, sensors)
     names = [titles[sensor] for sensor in found.sensors]
-    apart = separations(knowledge, readings, candidates)
+    apart = separations(knowledge, readings, pool)
     record: dict[str, Any] = {
         "sensors": names,
         "information": list(found.information),
@@ -212,18 +228,19 @@ def design(
         others = [title for title in titles if title not in names]
         rest = [title for title in titles if title not in wanted]
         few, every = (_planned(_without(knowledge, some)).promised for some in (others, rest))
-        record["worth"] = {"chosen": [few.mean, few.half_width], "all": [every.mean, every.half_width]}
-    _draw_design(picture, vtu, knowledge, record, found.sensors)
+        compared = {"chosen": few, "all": every, "all beyond chosen": every.beyond(few)}
+        record["worth"] = {what: [one.mean, one.half_width] for what, one in compared.items()}
+    _draw_design(picture, vtu, places, record, found.sensors)
     if json:
         terminal.print_json(record)
         return
     for name, told in zip(names, found.information, strict=True):
         terminal.say(f"{name}: {told:.3f} bit with those before it.")
-    terminal.say(f"All {len(candidates)} candidates: {found.of_all:.3f} bit.")
+    terminal.say(f"All {len(pool)} candidates: {found.of_all:.3f} bit.")
     for pair in record["not_separated"]:
         terminal.say(f"No gauge separates {pair}: less than one standard deviation by all candidates.")
     for what, (mean, half) in record.get("worth", {}).items():
-        terminal.say(f"Expected return planned with {what}: {mean:.4g} ± {half:.2g} (95 %).")
+        terminal.say(f"Expected return, {what}: {mean:.4g} ± {half:.2g} (95 %).")
 
 
 def _between(knowledge: "Knowledge", name: str, level: int) -> str:
@@ -238,35 +255,46 @@ def _between(knowledge: "Knowledge", name: str, level: int) -> str:
 
 
 def _draw_design(
-    picture: Path | None, vtu: Path | None, knowledge: "Knowledge", record: Mapping[str, Any],
-    chosen: Sequence[int],
+    picture: Path | None, vtu: Path | None, where: "tuple[Float | None, list[Float]]",
+    record: Mapping[str, Any], chosen: Sequence[int],
 ) -> None:  # fmt: skip
     import numpy as np
 
     from fe.structure.field import write_vtu
     from twin_master.report.plan import design_figure
 
-    wing = _wing(knowledge.scenario)
+    places, outlines = where
     if vtu is not None:
-        if wing is None:
-            raise MissionInputError("--vtu needs a wing, whose design says where its gauges are.")
-        points, rank = np.insert(wing.gauges, 2, 0.0, axis=1), np.zeros(len(wing.gauges))
+        if places is None:
+            raise MissionInputError("--vtu needs a wing or a structure whose file says where its gauges are.")
+        rank = np.zeros(len(places))
         rank[list(chosen)] = np.arange(1, len(chosen) + 1)
-        write_vtu(vtu, points, ("vertex", np.arange(len(rank))[:, None]), {"rank": rank}, {})
+        write_vtu(vtu, places, ("vertex", np.arange(len(rank))[:, None]), {"rank": rank}, {})
     if picture is not None:
-        places = None if wing is None else wing.gauges
-        outlines = [] if wing is None else [wing.outline, *wing.regions]
+        if places is not None:  # the two axes along which they are spread most
+            places = places[:, np.sort(np.argsort(-np.ptp(places, axis=0), kind="stable")[:2])]
         figure = design_figure(
             record["information"], record["of_all"], record["sensors"], places, chosen, outlines
         )
         _draw(picture, figure)
 
 
-def _wing(scenario: "Scenario") -> "Planform | None":
-    """Return the wing that is believed from above; None for another asset."""
+def _places(scenario: "Scenario") -> "tuple[Float | None, list[Float]]":
+    """Return where the gauges are (G, 3) [m], None where no file says it, and outlines (N, 2) of a wing."""
+    import numpy as np
+
+    from fe.structure.design import MeshDesign, load_structure
     from fe.wing.design import load_design
     from twin_master.assets.design_source import DESIGN_COPY
+    from twin_master.assets.structure_source import MODEL_COPY
     from twin_master.viewer.scene import planform_of
 
-    file = scenario.belief.all_files().get(DESIGN_COPY)
-    return planform_of(None if file is None else load_design(file), scenario)
+    files = scenario.belief.all_files()
+    structure = load_structure(files[MODEL_COPY]) if MODEL_COPY in files else None
+    if isinstance(structure, MeshDesign) and scenario.observation.role == "strain":
+        return structure.unit * np.array([part.point for part in structure.gauge]), []
+    file = files.get(DESIGN_COPY)
+    wing = planform_of(None if file is None else load_design(file), scenario)
+    if wing is None:
+        return None, []
+    return np.insert(wing.gauges, 2, 0.0, axis=1), [wing.outline, *wing.regions]

@@ -10,7 +10,7 @@ from fe.runtime.errors import InvalidDesignError
 
 from .location import Locator, SurfacePoint
 from .mesh import StructureMesh
-from .rosettes import Gauge
+from .rosettes import Gauge, Rosette
 
 FloatArray = NDArray[np.float64]
 
@@ -117,3 +117,28 @@ def _add_strain(
     slope = np.einsum("nak,nki,i->na", slopes, np.linalg.inv(jacobian), direction)
     weights = share / len(spot.cell) * slope[..., None] * direction
     np.add.at(row.reshape(-1, 3), mesh.cells[spot.cell], weights)
+
+
+def spread_rosettes(locator: Locator, count: int) -> list[Rosette]:
+    """Return rosettes spread evenly over the faces of the surface, `spread_1` and on.
+
+    Parameters
+    ----------
+    locator : Locator
+        Of the mesh.
+    count : int
+        Rosettes; on a surface of fewer faces one on each.
+    """
+    from scipy.cluster.vq import kmeans2, vq
+
+    centre, _ = locator.faces
+    near, _ = kmeans2(centre, min(count, len(centre)), minit="++", rng=0)
+    found = []
+    for number, face in enumerate(np.unique(vq(near, centre)[0]).tolist(), start=1):
+        normal = locator.on_surface(centre[face], "a face").normal
+        first = np.eye(3)[np.argmin(np.abs(normal))]
+        first -= (first @ normal) * normal
+        axes = tuple(first.tolist()), tuple(np.cross(normal, first).tolist())
+        point = tuple((centre[face] / locator.mesh.unit).tolist())
+        found.append(Rosette(name=f"spread_{number}", point=point, axes=axes))
+    return found

@@ -59,7 +59,7 @@ class Locator:
         return np.asarray(np.linalg.norm(mesh.nodes - mesh.centres[:, None], axis=2).max(axis=1))
 
     @cached_property
-    def _faces(self) -> tuple[FloatArray, FloatArray]:
+    def faces(self) -> tuple[FloatArray, FloatArray]:
         """Centres (m, 3) [m] of the faces of the surface and the radii (m,) [m] around them."""
         mesh, surface = self.mesh, self.mesh.boundary
         centre, radius = np.empty((len(surface), 3)), np.empty(len(surface))
@@ -123,7 +123,7 @@ class Locator:
             If it lies farther off than `FARTHEST`; the sentence begins with `where`.
         """
         mesh, surface = self.mesh, self.mesh.boundary
-        centre, radius = self._faces
+        centre, radius = self.faces
         away = np.linalg.norm(centre - point, axis=1)
         near = np.flatnonzero(away - 1.1 * radius <= away.min())
         cells = surface.cell[near]

@@ -192,10 +192,10 @@ class LearningFilter:
         See `Estimator.turn`; `learnt` of the estimate holds by name the parameter, `transition_factor`,
         and `noise_scale[g]`, `gauge_gain[g]`, `gauge_offset[g]` for the sensors g from 1.
         """
-        seen = self._sensor_model.checked(observation)
+        seen, told = self._sensor_model.apart(observation)
         forecast, statistics, count = self._forecast(before)
         near = self._sensor_model.nearest(seen, control_index, self._value[control_index])
-        log_belief = forecast + near.log_density[self._draw]
+        log_belief = forecast + told + near.log_density[self._draw]
         log_belief += self._log_likelihood(seen, near.value, control_index, statistics, count)
         filtered = np.empty_like(log_belief)
         evidence = normalise(log_belief, filtered)

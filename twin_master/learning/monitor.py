@@ -150,13 +150,14 @@ class WatchfulEstimator:
 
     def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
         """Advance the belief to turn t and correct it by an observation, see `Estimator.turn`."""
-        seen = self._sensor_model.checked(observation)
+        seen, told = self._sensor_model.apart(observation)
         absurd = (seen < self._low[control_index]) | (seen > self._high[control_index])
         used = np.where(absurd, np.nan, seen)
-        estimate = self._inner.turn(before, used, control_index, turn)
+        given = np.append(used, observation[len(used) :])
+        estimate = self._inner.turn(before, given, control_index, turn)
         followed = before is not None and before.arrays.get(_PREFIX + "model_key") == self._key
         own = self._advanced(before) if before is not None and followed else self._start(estimate.forecast)
-        self._assimilate(own, used, control_index)
+        self._assimilate(own, used, told, control_index)
         notices = self._left_out(own["left_out"] > 0.0, absurd, seen, control_index, turn)
         # A gauge that is left out stays so while it is silent.
         own["left_out"] = (absurd | ((own["left_out"] > 0.0) & np.isnan(seen))).astype(np.float64)
@@ -294,11 +295,13 @@ class WatchfulEstimator:
         """Return the prior share of faults that begin after a turn."""
         return (1.0 - _FROM_THE_START) / (1.0 + turn / self._settings.onset_turns)
 
-    def _assimilate(self, own: Arrays, seen: Float, control_index: int) -> None:
+    def _assimilate(self, own: Arrays, seen: Float, told: Float, control_index: int) -> None:
+        """Correct all hypotheses by the sensors, and by what else is told of each state (S,)."""
         degrees, count = self._settings.noise_degrees, own["count"]
         # By the noise that is learnt: else a gauge that is off would pull the place, and with it all others.
         precision = np.minimum((degrees + count) / (degrees + own["model_squares"]), 1.0)
         near = self._sensor_model.nearest(seen, control_index, self._value[control_index], precision)
+        near.log_density[:] += told
         value, inverse = near.value, self._inverse[control_index]
         known, log_likelihood = np.ones(value.shape), near.log_density.copy()
         before, mended = own["model_squares"].copy(), own["mended_squares"].copy()

@@ -118,6 +118,8 @@ class Flight:
     ----------
     observed : (T, G)
         What the sensors said, SI; NaN where lost.
+    readings : (T, I)
+        What inspections read, SI; NaN where none was asked for.
     control_index : (T,)
         Control in force in each turn.
     filtered : (T, S)
@@ -151,6 +153,7 @@ class Flight:
     """
 
     observed: Float
+    readings: Float
     control_index: Index
     filtered: Float
     log_evidence: Float
@@ -170,7 +173,7 @@ class Flight:
     def behind(self, skipped: int) -> "Flight":
         """Return the turns behind the first `skipped` of a watched asset; the notices stay those of all."""
         by_turn = (
-            "observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted",
+            "observed", "readings", "control_index", "filtered", "log_evidence", "smoothed", "predicted",
             "decision_probability", "suspicion", "learnt", "carried",
         )  # fmt: skip
         cut = {name: getattr(self, name)[skipped:] for name in by_turn}
@@ -312,6 +315,7 @@ class Beliefs:
 
     sensors: int | None = None
     observed: list[Float] = field(default_factory=list)
+    beside: list[Float] = field(default_factory=list)
     control_index: list[int] = field(default_factory=list)
     filtered: list[Float] = field(default_factory=list)
     log_evidence: list[float] = field(default_factory=list)
@@ -326,6 +330,7 @@ class Beliefs:
     def add(self, observed: Float, turn: TwinTurn) -> None:
         """Keep a turn."""
         self.observed.append(observed[: self.sensors])
+        self.beside.append(observed[len(self.observed[-1]) :])
         self.control_index.append(turn.control_index)
         self.filtered.append(turn.filtered)
         self.log_evidence.append(turn.log_evidence)
@@ -339,7 +344,7 @@ class Beliefs:
             self.learnt.append(np.array([learnt.figures for learnt in turn.learnt.values()]))
         if turn.expected is not None:
             mean, noise = turn.expected()
-            self.residual.append((observed - mean) / noise)
+            self.residual.append((self.observed[-1] - mean) / noise)
 
     def flight(
         self,
@@ -351,9 +356,11 @@ class Beliefs:
         first_turn: int = 0,
     ) -> Flight:
         """Return the turns as arrays, see `Flight`; the twin has kept all of them."""
-        count = len(self.observed)
+        count, width = len(self.observed), max(map(len, self.beside), default=0)
+        none = np.full(width, np.nan)  # a row without readings has none of them
         return Flight(
             observed=np.array(self.observed),
+            readings=np.array([[*row, *none[len(row) :]] for row in self.beside]).reshape(count, width),
             control_index=np.array(self.control_index, dtype=np.int64),
             filtered=np.array(self.filtered),
             log_evidence=np.array(self.log_evidence),

@@ -39,6 +39,8 @@ MISSIONS = 400
 """That are simulated for each rule."""
 PERIODS = (2, 3, 5, 8, 12, 20)
 """Turns between two inspections of the rules that inspect by the clock."""
+_GAP, _PRICED_GAP = 0.005, 0.06
+"""Between the bounds of a plan, as a share of the return, and of those that are tried for a limit."""
 _HARDEST, _HALVINGS = 2.0**12, 4
 """The largest price of a turn beyond the limit, in rewards, and how often the interval of it is halved."""
 
@@ -103,8 +105,11 @@ def expected_plan(
     first = scenario.control_names.index(scenario.mission.first_control)
     allowed, risk = scenario.planner.limit_probability, _risk(rewards)
 
+    gap = _GAP if allowed is None else _PRICED_GAP
+
     def priced(price: float) -> tuple[BeliefPlan, float]:
-        return plan_on_belief(replace(problem, reward=problem.reward - price * risk), first=first), price
+        costly = replace(problem, reward=problem.reward - price * risk)
+        return plan_on_belief(costly, first=first, gap=gap), price
 
     def holds(plan: BeliefPlan) -> bool:
         return allowed is None or risk_of(scenario, problem, rewards, plan.policy) <= allowed
@@ -183,18 +188,31 @@ def read_policy(path: Path, model: GraphicalModel) -> BeliefPolicy:
 
 @dataclass(frozen=True)
 class ComparedPolicy:
-    """What a rule brings in simulated missions.
+    """What a rule brings in simulated missions, or by how much more than another one.
 
     Attributes
     ----------
     name : str
-    mean, half_width : float
-        Of the expected return: the half width of its 95 % interval.
+    returns : (B,)
+        Of each mission; those of the same number of two rules are met by the same chance.
     """
 
     name: str
-    mean: float
-    half_width: float
+    returns: Float
+
+    @property
+    def mean(self) -> float:
+        """Expected return."""
+        return float(self.returns.mean())
+
+    @property
+    def half_width(self) -> float:
+        """Of the 95 % interval of the mean."""
+        return float(1.96 * self.returns.std() / np.sqrt(len(self.returns)))
+
+    def beyond(self, other: "ComparedPolicy") -> "ComparedPolicy":
+        """Return by how much more it brings than another rule, mission by mission."""
+        return ComparedPolicy(f"{self.name} beyond {other.name}", self.returns - other.returns)
 
 
 def promised(scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy) -> ComparedPolicy:
@@ -203,7 +221,7 @@ def promised(scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy)
     def rule(belief: Float, _turn: int) -> Index:
         return policy.decide(belief)
 
-    return _summary("planned on the belief", _simulated(scenario, problem, rule))
+    return ComparedPolicy("planned on the belief", _simulated(scenario, problem, rule))
 
 
 def compared(scenario: Scenario, problem: DecisionProblem) -> tuple[ComparedPolicy, ...]:
@@ -227,11 +245,7 @@ def compared(scenario: Scenario, problem: DecisionProblem) -> tuple[ComparedPoli
     }
     for every in PERIODS if scenario.readings else ():
         rules[f"inspection every {every} {scenario.mission.step_name}s"] = by_the_clock(every)
-    return tuple(_summary(name, _simulated(scenario, problem, rule)) for name, rule in rules.items())
-
-
-def _summary(name: str, returns: Float) -> ComparedPolicy:
-    return ComparedPolicy(name, float(returns.mean()), float(1.96 * returns.std() / np.sqrt(len(returns))))
+    return tuple(ComparedPolicy(name, _simulated(scenario, problem, rule)) for name, rule in rules.items())
 
 
 def _simulated(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Float:

@@ -1,8 +1,9 @@
 """Planning on the belief: value iteration at points, between a lower and an upper bound of the return.
 
 The lower bound are vectors, each the return of a plan from each state; the upper one are values at beliefs,
-joined like the teeth of a saw to those at the corners. Beliefs are visited where the bounds differ most:
-Smith and Simmons 2005, heuristic search value iteration; Kurniawati et al. 2008, SARSOP.
+the corners among them, that others are composed of. Beliefs are visited where the bounds differ most: Smith
+and Simmons 2005, heuristic search value iteration; Kurniawati et al. 2008, SARSOP. Now and then both bounds
+settle at all of them, as of a problem of so many states: Pineau et al. 2003; Poupart et al. 2011.
 """
 
 from dataclasses import dataclass
@@ -24,12 +25,22 @@ _STEP = 1e-12
 """What a bound improves by at least."""
 _DEEPEST = 1000
 """Turns that a descent looks ahead at most."""
-MOST_BELIEFS = 1000
+MOST_BELIEFS = 250
 """Beliefs to improve the bounds at, where the gap stays wider than asked for."""
 _SHARE = 0.9
 """Of the gap of the prior that a descent leaves alone, so that it is short while the gap is wide."""
 _INFORMED = 200
 """Sweeps of the informed bound; each is a bound."""
+_PARTS = 4
+"""Beliefs that a belief is composed of at most, beside the corners."""
+_ROUNDED = 0.15
+"""Share of the largest probability below which others are left out of the beliefs that are composed."""
+_FIRST, _GROWTH = 32, 1.6
+"""Beliefs that are visited before the bounds settle at all of them, and their growth until they do again."""
+_LARGEST = 1e9
+"""Products that are summed up to compose all beliefs once, at most."""
+_PASSES, _SWEEPS, _RAISED = 6, 15, 3
+"""How often beliefs are composed anew then, sweeps in between, and sweeps of the lower bound."""
 
 
 @dataclass(frozen=True)
@@ -95,100 +106,183 @@ class DecisionProblem:
 
 
 @compiled
-def _saw(rows: Float, corner: Float, point: Float, drop: Float, result: Float) -> None:
-    """Fill result (K,) with the upper bound at rows (K, S), which need not sum to one.
+def _composed(
+    rows: Float, corner: Float, start: Index, state: Index, probability: Float, drop: Float, order: Index,
+    plain: Float, chosen: Index, share: Float,
+) -> Float:  # fmt: skip
+    """Return the upper bound at rows (K, S), which need not sum to one: (K,).
 
-    point (J, S) are beliefs, drop (J,) is by how much their value lies below that of the corners.
+    corner (U, S) bounds the return with each control first in each state; start (J + 1,), state and
+    probability are beliefs without their zeros, drop (J, U) is by how much the bounds there lie below those
+    of the corners, and order (J, U) the order in which it rises. Filled are what the corners alone give,
+    plain (K, U), the beliefs that are taken out of a row one after the other, chosen (K, U, P), each the one
+    that lowers the bound most, and how much of each fits into it, share (K, U, P).
     """
-    for row in range(rows.shape[0]):
-        lowest = 0.0
-        for j in range(point.shape[0]):
-            share = np.inf
-            for state in range(rows.shape[1]):
-                if point[j, state] > 0.0:
-                    share = min(share, rows[row, state] / point[j, state])
-                    if share * drop[j] >= lowest:
+    result = np.empty(len(rows))
+    for row in range(len(rows)):
+        plain[row] = corner @ rows[row]
+        best = -np.inf
+        for control in np.argsort(-plain[row]):
+            total, left, mass = plain[row, control], rows[row].copy(), rows[row].sum()
+            for part in range(chosen.shape[2]):
+                if total <= best:
+                    break
+                lowest, fits = 0.0, 0.0
+                for j in order[:, control]:
+                    if mass * drop[j, control] >= lowest:
                         break
-            lowest = min(lowest, share * drop[j])
-        total = lowest
-        for state in range(rows.shape[1]):
-            total += rows[row, state] * corner[state]
-        result[row] = total
+                    most = mass
+                    for i in range(start[j], start[j + 1]):
+                        if most * drop[j, control] >= lowest:
+                            break
+                        if left[state[i]] < most * probability[i]:
+                            most = left[state[i]] / probability[i]
+                    if most * drop[j, control] < lowest:
+                        lowest, fits = most * drop[j, control], most
+                        chosen[row, control, part] = j
+                if fits == 0.0:
+                    break
+                share[row, control, part] = fits
+                j = chosen[row, control, part]
+                for i in range(start[j], start[j + 1]):
+                    left[state[i]] = max(left[state[i]] - fits * probability[i], 0.0)
+                total, mass = total + lowest, mass - fits
+            best = max(best, total)
+        result[row] = best
+    return result
 
 
-@dataclass
+class _Upper:
+    """Upper bound of the return: at beliefs and at the corners, with each control first.
+
+    With each control it is convex and of degree one: a belief has at most what those have together that it is
+    composed of. The largest over the controls is the bound.
+    """
+
+    def __init__(self, problem: DecisionProblem) -> None:
+        controls, states, _ = problem.transition.shape
+        self._problem, self._corner = problem, _informed(problem)
+        self._point, self._value = np.empty((0, states)), np.empty((0, controls))
+        self._index()
+
+    def _index(self) -> None:
+        """List the beliefs without their zeros, the largest probability first."""
+        order = np.argsort(-self._point, axis=1, kind="stable")
+        count = np.count_nonzero(self._point, axis=1)
+        inside = np.arange(self._point.shape[1]) < count[:, None]
+        start = np.concatenate([[0], np.cumsum(count)])
+        self._sparse = start, order[inside], np.take_along_axis(self._point, order, axis=1)[inside]
+        self._lower()
+
+    def _lower(self) -> None:
+        """Tell by how much the bound at each belief lies below that of the corners."""
+        self._drop = np.minimum(self._value - self._point @ self._corner.T, 0.0)
+        self._order = np.argsort(self._drop, axis=0)
+
+    def _compose(self, rows: Float) -> tuple[Float, Float, Index, Float]:
+        shape = len(rows), len(self._corner)
+        plain, chosen = np.empty(shape), np.zeros((*shape, _PARTS), dtype=np.int64)
+        share = np.zeros(chosen.shape)
+        rows = np.ascontiguousarray(rows)
+        bound = _composed(rows, self._corner, *self._sparse, self._drop, self._order, plain, chosen, share)
+        return bound, plain, chosen, share
+
+    def at(self, rows: Float) -> Float:
+        """Return the bound at rows (K, S) that need not sum to one: (K,)."""
+        return self._compose(rows)[0]
+
+    def look(self, belief: Float) -> Float:
+        """Return the bound with each control first (U,), by what may follow."""
+        problem = self._problem
+        later = [self.at(problem.following(belief, u)).sum() for u in range(len(self._corner))]
+        return np.asarray(belief @ problem.reward + problem.discount * later)
+
+    def improve(self, belief: Float) -> None:
+        """Improve the bound at a belief, and know it near by: without what is improbable, and at the corners.
+
+        Beliefs of few states fit into many others.
+        """
+        rounded = np.where(belief < _ROUNDED * belief.max(), 0.0, belief)
+        likely = np.argsort(-rounded, kind="stable")[: min(_PARTS, np.count_nonzero(rounded))]
+        corners = np.equal.outer(likely, np.arange(len(belief))).astype(np.float64)
+        for point in (*corners, rounded / rounded.sum(), belief):
+            same = np.all(self._point == point, axis=1)
+            if not same.any():
+                self._point = np.vstack((self._point, point))
+                self._value = np.vstack((self._value, self.look(point)))
+            elif point is belief:
+                self._value[same] = np.minimum(self._value[same], self.look(point))
+        self._index()
+
+    def settle(self) -> None:
+        """Improve the bound at all beliefs at once, until what each has of the others has gone round.
+
+        Where there is too much to compose the bound is left as it is.
+        """
+        problem, controls = self._problem, len(self._corner)
+        if len(self._point) * sum(table.size for table in problem.likelihood) * controls > _LARGEST:
+            return
+        certain = np.flatnonzero(self._point.max(axis=1) == 1.0)
+        corners = np.argmax(self._point[certain], axis=1)
+        now = self._point @ problem.reward
+        for _ in range(_PASSES):
+            after = (problem.following(belief, u) for belief in self._point for u in range(controls))
+            parts = [(*self._compose(rows)[1:], rows[:, corners]) for rows in after]
+            begins = np.cumsum([0, *(len(part[0]) for part in parts[:-1])])
+            plain, chosen, share, inside = (np.concatenate(column) for column in zip(*parts, strict=True))
+            place = chosen * controls + np.arange(controls)[:, None]
+            for _ in range(_SWEEPS):
+                every = plain + np.einsum("kup,kup->ku", share, self._drop.ravel()[place])
+                later = np.add.reduceat(every.max(axis=1), begins).reshape(-1, controls)
+                self._value = np.minimum(self._value, now + problem.discount * later)
+                lower = np.minimum(self._value[certain].T - self._corner[:, corners], 0.0)
+                self._corner[:, corners] += lower
+                plain += inside @ lower.T
+                self._lower()
+
+
 class _Bounds:
-    """Lower and upper bound of the return from every belief."""
+    """Lower and upper bound of the return from every belief; they begin with one control for ever below."""
 
-    problem: DecisionProblem
-    vectors: Float
-    control: Index
-    corner: Float
-    point: Float
-    value: Float
-
-    @classmethod
-    def of(cls, problem: DecisionProblem) -> "_Bounds":
-        """Begin with one control for ever below, and with a state that is told behind each turn above."""
+    def __init__(self, problem: DecisionProblem) -> None:
         controls, states, _ = problem.transition.shape
         always = [np.tile(row, (states, 1)) for row in np.eye(controls)]
         blind = [evaluate_policy(problem.transition, problem.reward, problem.discount, row) for row in always]
-        corner = _informed(problem).max(axis=0)
-        return cls(problem, np.array(blind), np.arange(controls), corner, np.empty((0, states)), np.empty(0))
-
-    def upper(self, rows: Float) -> Float:
-        """Return the upper bound at rows (K, S) that need not sum to one: (K,)."""
-        result = np.empty(len(rows))
-        drop = np.minimum(self.value - self.point @ self.corner, 0.0)
-        _saw(np.ascontiguousarray(rows), self.corner, self.point, drop, result)
-        return result
+        self.problem, self.upper = problem, _Upper(problem)
+        self.vectors, self.control = np.array(blind), np.arange(controls)
 
     def lower(self, rows: Float) -> Float:
-        """Return the lower bound likewise."""
+        """Return the lower bound at rows (K, S) that need not sum to one: (K,)."""
         result: Float = (rows @ self.vectors.T).max(axis=1)
         return result
 
-    def look(self, belief: Float) -> tuple[list[Float], Float]:
-        """Return what may follow each control, and the upper bound of the return with that control first."""
+    def backup(self, control: int, rows: Float) -> Float:
+        """Return the vector (S,) of a control with the best that is known behind it at rows (K, S)."""
+        chosen = np.argmax(rows @ self.vectors.T, axis=1)
+        later = self.problem.behind(control, chosen, self.vectors)
+        return np.asarray(self.problem.reward[:, control] + self.problem.discount[control] * later)
+
+    def raise_at(self, belief: Float) -> None:
+        """Improve the lower bound at a belief."""
         after = [self.problem.following(belief, u) for u in range(len(self.problem.discount))]
-        later = np.array([self.upper(rows).sum() for rows in after])
-        return after, belief @ self.problem.reward + self.problem.discount * later
-
-    def backup(self, after: list[Float]) -> Float:
-        """Return the vector of each control with the best that is known behind it: (U, S)."""
-        found = self.problem.reward.T.copy()
-        for u, rows in enumerate(after):
-            chosen = np.argmax(rows @ self.vectors.T, axis=1)
-            found[u] += self.problem.discount[u] * self.problem.behind(u, chosen, self.vectors)
-        return found
-
-    def update(self, belief: Float) -> None:
-        """Improve both bounds at a belief."""
-        after, above = self.look(belief)
-        found = self.backup(after)
-        best = int(np.argmax(found @ belief))
-        if found[best] @ belief > self.lower(belief[None])[0] + _STEP:
-            kept = ~np.all(self.vectors <= found[best], axis=1)
-            self.vectors = np.vstack((self.vectors[kept], found[best]))
+        later = np.array([self.lower(rows).sum() for rows in after])
+        below = belief @ self.problem.reward + self.problem.discount * later
+        best = int(np.argmax(below))
+        if below[best] > self.lower(belief[None])[0] + _STEP:
+            found = self.backup(best, after[best])
+            kept = ~np.all(self.vectors <= found, axis=1)
+            self.vectors = np.vstack((self.vectors[kept], found))
             self.control = np.append(self.control[kept], best)
-        value = float(above.max())
-        if value < self.upper(belief[None])[0] - _STEP:
-            if belief.max() > 1.0 - _STEP:
-                self.corner[np.argmax(belief)] = value
-            else:
-                kept = np.any(self.point != belief, axis=1)
-                self.point = np.vstack((self.point[kept], belief))
-                self.value = np.append(self.value[kept], value)
 
     def descend(self, belief: Float, first: int | None, gap: float) -> list[Float]:
         """Return beliefs one behind the other, where the bounds differ by more than the gap allows."""
         path: list[Float] = []
         while len(path) < _DEEPEST:
             path.append(belief)
-            after, above = self.look(belief)
-            control = int(np.argmax(above)) if first is None or len(path) > 1 else first
-            rows, gap = after[control], gap / max(float(self.problem.discount[control]), _STEP)
-            excess = self.upper(rows) - self.lower(rows) - gap * rows.sum(axis=1)
+            control = first if first is not None and len(path) == 1 else np.argmax(self.upper.look(belief))
+            rows = self.problem.following(belief, int(control))
+            gap /= max(float(self.problem.discount[control]), _STEP)
+            excess = self.upper.at(rows) - self.lower(rows) - gap * rows.sum(axis=1)
             next_one = int(np.argmax(excess))
             if excess[next_one] <= 0.0:
                 break
@@ -198,10 +292,10 @@ class _Bounds:
     def at(self, belief: Float, first: int | None) -> tuple[float, float]:
         """Return lower and upper bound at a belief, under a first control where one is given."""
         if first is None:
-            return float(self.lower(belief[None])[0]), float(self.upper(belief[None])[0])
+            return float(self.lower(belief[None])[0]), float(self.upper.at(belief[None])[0])
         rows = self.problem.following(belief, first)
         now, later = float(belief @ self.problem.reward[:, first]), float(self.problem.discount[first])
-        return now + later * float(self.lower(rows).sum()), now + later * float(self.upper(rows).sum())
+        return now + later * float(self.lower(rows).sum()), now + later * float(self.upper.at(rows).sum())
 
 
 def _informed(problem: DecisionProblem) -> Float:
@@ -263,14 +357,20 @@ def plan_on_belief(
     most_beliefs : int
         Beliefs to improve the bounds at, counted each time.
     """
-    bounds, visited, trials = _Bounds.of(problem), list[Float](), 0
+    bounds, visited, trials, settled = _Bounds(problem), list[Float](), 0, _FIRST
     lower, upper = bounds.at(problem.prior, first)
     while upper - lower > gap * max(abs(lower), abs(upper)) and len(visited) < most_beliefs:
         path = bounds.descend(problem.prior, first, _SHARE * (upper - lower))
         for belief in reversed(path):
-            bounds.update(belief)
+            bounds.raise_at(belief)
+            bounds.upper.improve(belief)
         visited += path
         trials += 1
+        if len(visited) >= min(settled, most_beliefs):
+            settled = int(_GROWTH * len(visited))
+            bounds.upper.settle()
+            for belief in visited * _RAISED:
+                bounds.raise_at(belief)
         lower, upper = bounds.at(problem.prior, first)
     beliefs = np.unique(np.array(visited or [problem.prior]), axis=0)
     return BeliefPlan(_policy(bounds, beliefs), lower, upper, beliefs, trials)
@@ -280,7 +380,7 @@ def _policy(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
     """Return for each control the vectors that are largest at some belief."""
     controls = range(len(bounds.problem.discount))
     after = ([bounds.problem.following(belief, u) for u in controls] for belief in beliefs)
-    found = np.array([bounds.backup(rows) for rows in after])  # (B, U, S)
+    found = np.array([[bounds.backup(u, rows[u]) for u in controls] for rows in after])  # (B, U, S)
     kept = []
     for control in controls:
         vectors = np.vstack((bounds.vectors[bounds.control == control], found[:, control]))

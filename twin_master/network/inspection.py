@@ -52,19 +52,23 @@ class InspectedSensorModel(GaussianSensorModel):
 
     def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t) for a sequence of rows: (T, G + I) or (T, G), and (T,) -> (T, S)."""
-        rows, count = np.asarray(observations, dtype=np.float64), self.sensor_count
-        gauges = super().log_likelihood_sequence(rows[..., :count], control_index)
-        read = rows[..., count:]
+        gauges, told = self.apart(observations)
+        return np.asarray(super().log_likelihood_sequence(gauges, control_index) + told)
+
+    def apart(self, observation: ArrayLike) -> tuple[Float, Float]:
+        """Return the values of the sensors, and log p(readings | D); see `GaussianSensorModel.apart`."""
+        rows, count = np.asarray(observation, dtype=np.float64), self.sensor_count
+        gauges, read = self.checked(rows[..., :count]), rows[..., count:]
         if not read.shape[-1]:
-            return gauges
+            return gauges, np.zeros((*read.shape[:-1], self.state_count))
         if read.shape[-1] != self.reading.shape[1] or np.isinf(read).any():
             raise InvalidObservationError(
                 f"expected {count} finite values, or {count + self.reading.shape[1]} with the readings of "
                 f"inspections, got {rows.shape[-1]}"
             )
-        residual = (read[:, None] - self.reading) / self.reading_deviation
+        residual = (read[..., None, :] - self.reading) / self.reading_deviation
         density = -0.5 * residual**2 - np.log(self.reading_deviation) - LOG_ROOT_TWO_PI
-        return np.asarray(gauges + np.where(np.isnan(read)[:, None], 0.0, density).sum(axis=-1))
+        return gauges, np.where(np.isnan(read)[..., None, :], 0.0, density).sum(axis=-1)
 
     def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
         """Return the sensors that fit worst; see `GaussianSensorModel`."""

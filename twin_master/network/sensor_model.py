@@ -207,6 +207,13 @@ class GaussianSensorModel(QuantityModel):
             )
         return observation
 
+    def apart(self, observation: ArrayLike) -> tuple[Float, Float]:
+        """Return of an observation the values of the sensors (G,), and the rest of its log density (S,).
+
+        The rest is that of what does not pass through the sensors, in each state; zero here.
+        """
+        return self.checked(observation), np.zeros(self.state_count)
+
     def sampled(self, state: Index, control_index: int, generator: np.random.Generator) -> Float:
         """Return one observation drawn in each of N states (N,) under a control: (N, G), SI."""
         size = len(state), self.sensor_count

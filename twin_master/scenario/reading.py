@@ -80,7 +80,7 @@ def why_no_notices(scenario: Scenario) -> str:
     if observation.modes is not None:
         return "observations of modes have a covariance of their own"
     if scenario.readings:
-        return "inspections are read beside the sensors that it watches"
+        return "a scenario with inspections asks for them by `[notice]`"
     if observation.average_over_draws == "inside":
         return "the average over the draws is taken `inside`, so that each sensor has a parameter of its own"
     draws = 1 if calibration.source == "fixed" else min(calibration.draws, MOST_DRAWS)

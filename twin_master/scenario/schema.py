@@ -363,11 +363,14 @@ class Scenario(Section):
                     f"action `{action.name}` repairs, which a truth of the kind `random_growth` follows, and "
                     f"the kind is `{self.truth.kind}`"
                 )
-        tables = [name for name in ("learning", "notice") if getattr(self, name) is not None]
-        if self.readings and (tables or self.observation.modes is not None):
-            name = [*tables, "observation.modes"][0]
+        if self.readings and self.observation.modes is not None:
             raise ValueError(
-                f"`{name}` does not go together with actions that inspect: leave one of them out"
+                "`observation.modes` does not go together with actions that inspect: leave one of them out"
+            )
+        if self.planner.inspections_a_turn is not None and (self.learning or self.notice):
+            raise ValueError(
+                "`planner.inspections_a_turn` is for assets that fly side by side, and twins with `learning`"
+                " or `notice` fly alone: leave one of them out"
             )
 
     def _check_model_error(self) -> None:

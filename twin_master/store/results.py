@@ -123,6 +123,9 @@ def _observed(result: MissionResult, labels: _Labels) -> Group:
         role: (("step", "sensor"), flight.observed, unit, f"{role} as received; NaN where a sensor is lost"),
         "control_index": (("step",), flight.control_index, "1", "control in force"),
     }
+    for place, (_, state, name, _) in enumerate(scenario.readings[: flight.readings.shape[1]]):
+        read, text = flight.readings[:, place], "reading of an inspection; NaN where none was asked for"
+        variables[name] = (("step",), read, scenario.state[state].unit, text)
     for name in sorted(scenario.control[0].values):  # config.json does not keep their order
         values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
         variables[name] = (("step",), values, result.units.get(name, "1"), f"{name} in force")

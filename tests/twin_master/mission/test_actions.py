@@ -22,6 +22,8 @@ from tests.command_line import call
 from twin_master.assets.wing_model import ReducedModelSource
 from twin_master.errors import FleetError, PlanningError, ScenarioError
 from twin_master.fleet.plan import load_fleet
+from twin_master.learning.learning_filter import LearningFilter, LearntPriors
+from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator
 from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
@@ -34,9 +36,11 @@ from twin_master.mission.planning import (
 )
 from twin_master.mission.preparation import Knowledge, knowledge_of, prepare_knowledge
 from twin_master.mission.side_by_side import fly_side_by_side
+from twin_master.network.estimator import Carried, Estimator, ExactFilter
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.step_many import rationed
 from twin_master.network.transition import TransitionModel
+from twin_master.report.reading import open_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 
@@ -85,7 +89,11 @@ WRONG = {
     "does nothing": ('repairs = ["z1"]', "", ["repair_1", "repairs"]),
     "negative cost": ("cost = 3.0", "cost = -3.0", ["cost", "greater than or equal to 0"]),
     "a script": ('"random_growth"', '"scripted"', ["repair_1", "random_growth", "scripted"]),
-    "learning": ("[planner]", "[learning]\n[planner]", ["learning", "inspect"]),
+    "rationed and alone": (
+        "[planner]",
+        "[notice]\n[planner]\ninspections_a_turn = 3",
+        ["inspections_a_turn", "notice"],
+    ),
     "a limit for the mode": ('policy = "belief"', "limit_probability = 0.1", ["limit_probability", "belief"]),
 }
 
@@ -108,6 +116,51 @@ def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn() -> None:
     assert not known.sensor_model.log_likelihood(row[:24], INSPECT).any()
     drawn = known.sensor_model.sampled(np.zeros(9, dtype=int), 0, np.random.default_rng(0))  # type: ignore[attr-defined]
     assert np.isnan(drawn[:, 24:]).all()
+
+
+@pytest.mark.parametrize("gauges", [True, False])
+def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(gauges: bool) -> None:
+    known = knowledge()
+    model, sensors = known.model, known.sensor_model
+    exact = ExactFilter(model, sensors, "x")
+    others: list[Estimator] = [LearningFilter(model, sensors, LearntPriors())]
+    if not gauges:  # then no hypothesis about them is told from another, however probable it is
+        wary = MonitorSettings(prior=0.3)
+        others.append(WatchfulEstimator(exact, sensors, known.draws.values, wary))
+    rng, states = np.random.default_rng(1), np.array([0, 1, 6, 7, 12, 13])
+    controls = [1, INSPECT, 0, INSPECT, INSPECT, 1]
+    before: list[Carried | None] = [None] * (1 + len(others))
+    for turn, control in enumerate(controls):
+        row = sensors.sampled(states[[turn]], control, rng)[0]
+        row[:24] = row[:24] if gauges else np.nan
+        found = [
+            one.turn(last, row, control, turn) for one, last in zip([exact, *others], before, strict=True)
+        ]
+        for estimate in found[1:]:
+            assert estimate.filtered == pytest.approx(found[0].filtered, abs=1e-5)
+        before = [estimate.carried for estimate in found]
+    assert found[0].filtered.max() > 0.3  # something was told
+
+
+def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = TEXT.replace("notice = false", "").replace("steps = 120", "steps = 12")
+    path, policy = tmp_path / "mine.toml", tmp_path / "policy.npz"
+    path.write_text(text.replace("[planner]", "[learning]\n[notice]\n[planner]"), encoding="utf-8")
+    write_policy(policy, BeliefPolicy(np.ones((1, 25)), np.array([INSPECT])), knowledge().model)
+    words = ("run", path, "--policy", policy, "--out", tmp_path / "run", "--no-report")
+    assert call(monkeypatch, *words) == 0
+    run = open_run(tmp_path / "run")
+    observed, truth = run["observed"], run["truth"]
+    inspected = observed["control_index"].values == INSPECT
+    for name in ("z1", "z2"):
+        read = observed[f"inspect_{name}"].values
+        assert np.array_equal(np.isfinite(read), inspected)
+        assert inspected.sum() == 11
+        assert read[inspected] == pytest.approx(truth["state"].sel(region=name).values[inspected], abs=0.4)
+    assert "learnt" in run
+    assert "notice" in run
 
 
 def asset_of(known: Knowledge) -> Any:

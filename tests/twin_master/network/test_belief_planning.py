@@ -8,23 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.study_planning import PROBLEMS, tiger
 from twin_master.errors import PlanningError
 from twin_master.network.belief_planning import DecisionProblem, plan_on_belief
 from twin_master.network.planner import value_iteration
 from twin_master.network.simulated_return import simulated_returns
 from twin_master.network.transition import TransitionModel
-
-
-def tiger(discount: float) -> DecisionProblem:
-    """Kaelbling, Littman and Cassandra 1998: listen, or open one of two doors."""
-    moves = np.array([np.eye(2), np.full((2, 2), 0.5), np.full((2, 2), 0.5)])
-    reward = np.array([[-1.0, -100.0, 10.0], [-1.0, 10.0, -100.0]])
-    heard = np.array([[0.85, 0.15], [0.15, 0.85]])
-    nothing = np.full((2, 2), 0.5)
-    return DecisionProblem(
-        TransitionModel((moves,)), reward, np.full(3, discount), (heard, nothing, nothing),
-        np.array([0.5, 0.5]), moves_first=True,
-    )  # fmt: skip
 
 
 def drawn(seed: int, states: int, moves_first: bool, discount: float = 0.8) -> DecisionProblem:
@@ -64,6 +53,19 @@ def test_the_tiger_is_worth_what_was_published(discount: float, published: float
     plan = plan_on_belief(tiger(discount), gap=1e-4, most_beliefs=5000)
     assert plan.lower - 5e-4 <= published <= plan.upper + 5e-4
     assert plan.upper - plan.lower <= 1e-4 * plan.upper
+
+
+STORM = {"tiger": (19.3711, 19.3716), "maze of 4 x 3": (1.8490, 1.9066)}
+"""Bounds of Storm 2.0 as in `benchmarks.study_planning`, of 200,000 beliefs and a grid of 400 and of 24."""
+
+
+@pytest.mark.parametrize("name", STORM)
+def test_an_independent_solver_finds_the_same_value(name: str) -> None:
+    below, above = STORM[name]
+    plan = plan_on_belief(PROBLEMS[name]())
+    assert plan.lower <= above
+    assert plan.upper >= below
+    assert plan.upper - plan.lower <= 0.01 * plan.upper
 
 
 @pytest.mark.parametrize("moves_first", [False, True])
@@ -114,6 +116,21 @@ def test_simulated_missions_bring_what_the_plan_promises(moves_first: bool) -> N
     assert plan.lower - error <= total.mean() <= plan.upper + error
     known = value_iteration(problem.transition, problem.reward, problem.discount)
     assert plan.upper <= problem.prior @ known.value + 1e-9
+
+
+def test_the_difference_of_two_rules_varies_little_from_mission_to_mission() -> None:
+    problem = drawn(6, 4, moves_first=False)
+    known = value_iteration(problem.transition, problem.reward, problem.discount).action_value
+
+    def returns(values: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng(0)
+        return simulated_returns(
+            problem, lambda belief, _turn: np.argmax(belief @ values, axis=1), 1000, 20, rng
+        )
+
+    first, second = returns(known), returns(known + np.array([0.3, 0.0, 0.0]))
+    assert first.mean() - second.mean() == pytest.approx(0.92, abs=0.05)
+    assert (first - second).std() < 0.4  # rewards that are drawn with the states differ by 1.4
 
 
 def test_a_product_of_tables_is_planned_as_the_table_of_all_states() -> None:

@@ -1,0 +1,92 @@
+"""Gauges that a structure might have: beside those that its file declares, for the choice of the best."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from fe.runtime.errors import InvalidDesignError
+from fe.structure.design import MeshDesign, load_structure
+from fe.structure.gauges import spread_rosettes
+from fe.structure.location import Locator
+from fe.structure.mesh_file import read_mesh
+from fe.structure.rosettes import Gauge, with_rosettes
+from fe.wing.parts import Part
+from reporting.section import checked
+from reporting.toml_file import read_toml
+from twin_master.assets.asset_source import keep_files, read_files
+from twin_master.assets.structure_source import MODEL_COPY, StructureBelief
+from twin_master.errors import MissionInputError
+from twin_master.scenario.schema import Scenario
+
+__all__ = ["with_candidates"]
+
+
+class _Gauges(Part):
+    gauge: tuple[Gauge, ...] = Field(min_length=1)
+
+
+def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenario:
+    """Return a scenario whose structure has more gauges, which are sensors behind those that it had.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Its paths absolute.
+    candidates : str
+        A number of rosettes that are spread over the surface, or a TOML file with tables `gauge` and
+        `rosette` as a structure file has them.
+    folder : Path
+        Where the structure file with the gauges is put.
+
+    Raises
+    ------
+    MissionInputError
+        What is believed is no structure from a mesh, or the sensors are no strain gauges that are all alike.
+    InvalidDesignError
+        The candidates are wrong; the sentence names the place.
+    """
+    observation, belief = scenario.observation, scenario.belief
+    alike = (observation.standard_deviation, observation.model_error, scenario.rewards.error_scale)
+    if any(isinstance(one, tuple) for one in alike) or observation.role != "strain":
+        raise MissionInputError("--candidates needs strain gauges of one standard deviation and error scale.")
+    own = isinstance(belief, StructureBelief) and load_structure(belief.all_files()[MODEL_COPY])
+    if not isinstance(belief, StructureBelief) or not isinstance(own, MeshDesign):
+        raise MissionInputError("--candidates needs a structure from a mesh as what is believed.")
+    keep_files(folder, read_files(belief.all_files()))
+    file = folder / MODEL_COPY
+    with file.open("a", encoding="utf-8") as text:
+        for gauge in _gauges(candidates, own, file.parent):
+            rows = (f"{key} = {json.dumps(value)}\n" for key, value in gauge.items())
+            text.write("".join(("\n[[gauge]]\n", *rows)))
+    before, names = ([part.name for part in design.gauge] for design in (own, _design(file)))
+    known = dict(zip(before, observation.titles or before, strict=True))
+    chosen, titles = scenario.rewards.health_sensors, tuple(known.get(name, name) for name in names)
+    limited = range(1, len(before) + 1) if chosen == "all" else chosen
+    health = tuple(names.index(before[number - 1]) + 1 for number in limited)
+    return scenario.model_copy(
+        update={
+            "belief": belief.model_copy(update={"structure": str(file)}),
+            "observation": observation.model_copy(update={"count": len(names), "titles": titles}),
+            "rewards": scenario.rewards.model_copy(update={"health_sensors": health}),
+            "learning": None,
+            "notice": None,
+        }
+    )
+
+
+def _design(file: Path) -> MeshDesign:
+    design = load_structure(file)
+    assert isinstance(design, MeshDesign)
+    return design
+
+
+def _gauges(candidates: str, design: MeshDesign, folder: Path) -> list[dict[str, Any]]:
+    """Return the candidates as tables of a structure file."""
+    if candidates.isdecimal():
+        mesh = read_mesh(folder / design.mesh, design.unit, design.length_unit)
+        return [gauge for one in spread_rosettes(Locator(mesh), int(candidates)) for gauge in one.gauges()]
+    content = with_rosettes(read_toml(candidates, InvalidDesignError), candidates, InvalidDesignError)
+    found = checked(_Gauges, content, candidates, InvalidDesignError, what="a file of gauges")
+    return [gauge.model_dump() for gauge in found.gauge]
