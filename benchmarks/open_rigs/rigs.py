@@ -37,6 +37,10 @@ class Truth:
     pitch: float = 3.0
 
 
+BEFORE = 1e-9
+"""So long before its stamp a reading is taken [s]."""
+
+
 @dataclass(frozen=True)
 class Course:
     """What drives in one trial, as a function of time with two derivatives; with its random force."""
@@ -206,7 +210,9 @@ def servo(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
     found, _ = body(
         truth, course, stamps, inertia, SCALES["servo"], lambda t, x, v: torque(t, x, v) - rubs * v
     )
-    return np.column_stack((found[:, 0], [torque(t, x, v) for t, (x, v) in zip(stamps, found, strict=True)]))
+    # readings are taken just before a converter sets its next value
+    torques = [torque(t - BEFORE, x, v) for t, (x, v) in zip(stamps, found, strict=True)]
+    return np.column_stack((found[:, 0], torques))
 
 
 def support(truth: Truth, course: Course, stamps: FloatArray, *, order: int) -> FloatArray:
