@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from calibration.static.workflow import read_calibration
 from rich.console import Console
 from rich.table import Table
 
@@ -31,10 +32,9 @@ from benchmarks.fuzz_files import CONFIG_HASH, make_files
 from benchmarks.fuzz_mutations import ARCHIVE, BINARY, TEXT, Mutation
 from calibration.dynamics.records import read_records
 from calibration.geometry import read_lengths
+from calibration.result.file import load_calibration
 from calibration.static.experiments import read_measurements
-from calibration.static.workflow import read_calibration
 from calibration.wing.laboratory import read_weighed_mass
-from calibration.wing.result_file import load_calibration
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.files.patch import read_patch

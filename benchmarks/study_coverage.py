@@ -19,25 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
+from X import NAMES, JointPosterior, JointPrior
 
-from calibration.dynamics.masses_and_damping import DynamicTargets, MassRange, fit_masses
 from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, RingDownError
-from calibration.joint import (
-    NAMES,
-    JointPosterior,
-    JointPrior,
-    ModalMeasurement,
-    ModelError,
-    WeighedMass,
-    WingTables,
-    joint_posterior,
-    modal_measurement,
-    tabulate_wing,
-)
+from calibration.joint.frequency_table import WingTables, tabulate_wing
+from calibration.joint.inference import joint_posterior
+from calibration.joint.measurement import ModalMeasurement, modal_measurement
+from calibration.joint.prior import ModelError, WeighedMass
+from calibration.paper.procedure import DynamicTargets, MassRange, fit_masses
+from calibration.static.errors_in_variables import exact_posterior
+from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import GaussianPrior
-from calibration.static.stiffness import LoadDisplacementData, exact_posterior
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down, weigh
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel

@@ -86,6 +86,14 @@ class WingTables:
     frequency: FrequencyTable
     stiffness: StiffnessCurve
 
+    @property
+    def validity(self) -> dict[str, tuple[float, float]]:
+        """Range of e and the masses in which the tables hold."""
+        return {
+            name: (low, high)
+            for name, (low, high) in zip(_NAMES, self.frequency.limits.tolist(), strict=True)
+        }
+
 
 def tabulate_wing(model: ReducedModel) -> WingTables:
     """Tabulate a healthy model; see `tabulate_frequencies` and `stiffness_curve_of`."""

@@ -26,7 +26,7 @@ def test_the_published_figures_are_those_of_the_authors_folder(authors_folder: P
     assert [origin.read for origin in read.origins] == [True, True, False]
     assert "left aside" in read.origins[2].text
     assert read.authors is not None
-    assert read.authors.young_modulus_factor.size == 100
+    assert read.authors.samples.shape == (100, 5)
     assert read.trials is None
 
 
