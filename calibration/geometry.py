@@ -94,11 +94,6 @@ class MeasuredLength:
         scatter = math.hypot(self.tolerance, self.reading_uncertainty) / HALF_WIDTH_95
         return (self.measured - self.designed) / scatter
 
-    @property
-    def uncertainty_reduction(self) -> float:
-        """Share of the prior's standard deviation that the measurement took away [1]."""
-        return 1.0 - self.posterior.standard_deviation / self.prior.standard_deviation
-
 
 @dataclass(frozen=True)
 class GeometryCalibration:

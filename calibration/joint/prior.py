@@ -58,8 +58,9 @@ def wing_priors(
 
     e is the paper's N(1, (0.05 / 1.96)^2). The others are weak: of the masses a third of the weighed total
     each, with standard deviations of 50 and 100 g, which under the weighed total leave 30 g of uncertainty to
-    a servo; of the damping half Gaussians from zero, of scales 3 1/s and 1.5e-3 s, which alone would damp mode
-    1 by 4 % and mode 2 by 14 %, twice what was measured. e and the masses are confined to the model's range.
+    a servo; of the damping half Gaussians from zero, of scales 3 1/s and 1.5e-3 s, which alone would damp
+    mode 1 by 4 % and mode 2 by 14 %, twice what was measured. e and the masses are confined to the range of
+    the model.
 
     Parameters
     ----------

@@ -73,7 +73,8 @@ def result_bytes(calibration: Calibration) -> bytes:
     root = {
         "schema": SCHEMA,
         "title": f"Calibration of {calibration.asset}",
-        **{name: getattr(calibration, name) for name in _PLAIN},
+        **{name: getattr(calibration, name) for name in _WORDS},
+        "seed": calibration.seed,
         **{name: _json([asdict(item) for item in getattr(calibration, name)]) for name in _LISTS},
         "explained": _json(calibration.explained),
         "findings": _json(list(calibration.findings)),
@@ -85,7 +86,7 @@ def result_bytes(calibration: Calibration) -> bytes:
     return bytes(tree.to_netcdf(engine="h5netcdf"))
 
 
-_PLAIN = ("asset", "model", "model_hash", "design_hash", "procedure", "source", "seed")
+_WORDS = ("asset", "model", "model_hash", "design_hash", "procedure", "source")
 
 
 def _samples(calibration: Calibration, values: NDArray[np.float64], what: str) -> xr.Dataset:
@@ -167,8 +168,9 @@ def _calibration(groups: Groups, root: Root) -> Calibration:
         np.column_stack([groups[group][name].values[0] for name in names]) for group in ("posterior", "prior")
     )
     found = Calibration(
-        **{name: root[name] for name in _PLAIN},
+        **{name: root[name] for name in _WORDS},
         **lists,
+        seed=int(root["seed"]),
         samples=samples,
         prior_samples=prior,
         explained=json.loads(root["explained"]),

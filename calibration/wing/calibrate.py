@@ -1,8 +1,9 @@
 """The calibration of a wing: from the measurements of its laboratory to what tailors its twin."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -122,7 +123,6 @@ def calibrate_wing(
     procedure: Procedure = "joint",
     seed: int = 0,
     progress: Progress | None = None,
-    model_of: Callable[[WingDesign], ReducedModel] | None = None,
 ) -> WingCalibration:
     """Calibrate planform, stiffness, masses and damping of one wing: Kapteyn et al. 2021, Table 1.
 
@@ -140,8 +140,6 @@ def calibrate_wing(
         Seed of all samples.
     progress : Progress, optional
         Where the steps are reported.
-    model_of : callable, optional
-        Gives the reduced model of the tailored design; `fe.reduction.model_cache.reduced_model` by default.
 
     Raises
     ------
@@ -156,7 +154,7 @@ def calibrate_wing(
     drawn = design or load_design()
     name = check_name(drawn.name if asset is None else asset)
     tailored = tailored_design(drawn, lab.lengths)
-    model = (model_of or (lambda wing: reduced_model(wing, progress=progress)))(tailored)
+    model = reduced_model(tailored, progress=progress)
     with progress.stage("Step 2: Young's modulus factor"):
         curve = stiffness_curve_of(model, "tip stiffness of the tailored model")
         static = calibrate_static(curve, lab.pairs, seed)
@@ -172,49 +170,52 @@ def calibrate_wing(
     priors = (*wing_priors(model.validity), *_length_priors(lab.lengths))
     prior = prior_samples(priors, SAMPLE_COUNT, seed)
     prior = np.column_stack([prior, quantities_of(model, prior)])
-    readings = _readings(lab, modal)
-    provenance = collect_provenance(
-        seed,
-        input_hashes={**lab.input_hashes, "design": drawn.hash},
-        packages=("calibration", "fe"),
-        distributions=("uav-twin", "numpy", "scipy", "scikit-fem", "pymor"),
-    ).as_dict()
 
     def record(way: Procedure, state: Float) -> Calibration:
-        samples = np.column_stack(
-            [state, _lengths(lab.lengths, len(state), seed), quantities_of(model, state)]
-        )
-        factor = float(state[:, 0].mean())
-        before, after = (
-            np.sqrt(np.mean(assess_fit(lab.pairs, float(curve.stiffness(e))).standardised_residual ** 2))
-            for e in (priors[0].mean, factor)
-        )
+        lengths = _lengths(lab.lengths, len(state), seed)
         found = Calibration(
             asset=name,
             model=tailored.name,
             model_hash=tailored.hash,
             procedure=way,
             priors=priors,
-            samples=samples,
+            samples=np.column_stack([state, lengths, quantities_of(model, state)]),
             prior_samples=prior,
             explained=None,
             findings=(),
-            channels=(ChannelFit("load test", "fitted", lab.pairs.count, float(before), float(after)),),
+            channels=(_fit(static, float(state[:, 0].mean())),),
             source="; ".join(origin.text for origin in lab.origins),
             seed=seed,
-            provenance=provenance,
+            provenance=_provenance(lab, drawn, seed),
             design_hash=tailored.hash,
             quantities=QUANTITIES,
-            readings=readings,
+            readings=_readings(lab, modal),
             measured=_measured(lab.pairs),
             design=tailored,
         )
         return replace(found, findings=tuple(disagreements(found, lab, static.quality)))
 
-    return WingCalibration(
-        record("joint", joint.samples), record("paper", paper.samples), procedure, lab, modal, model, static,
-        published,
-    )  # fmt: skip
+    ways = record("joint", joint.samples), record("paper", paper.samples)
+    return WingCalibration(*ways, procedure, lab, modal, model, static, published)
+
+
+def _provenance(lab: LabData, drawn: WingDesign, seed: int) -> Mapping[str, Any]:
+    """Return of what the calibration was made."""
+    return collect_provenance(
+        seed,
+        input_hashes={**lab.input_hashes, "design": drawn.hash},
+        packages=("calibration", "fe"),
+        distributions=("uav-twin", "numpy", "scipy", "scikit-fem", "pymor"),
+    ).as_dict()
+
+
+def _fit(static: StaticCalibration, factor: float) -> ChannelFit:
+    """Return how far the load test is from the model at the prior mean of e and at a calibrated one."""
+    before, after = (
+        float(np.sqrt(np.mean(assess_fit(static.data, stiffness).standardised_residual ** 2)))
+        for stiffness in static.curve.stiffness([static.prior.mean, factor]).tolist()
+    )
+    return ChannelFit("load test", "fitted", static.data.count, before, after)
 
 
 def quantities_of(model: ReducedModel, samples: Float) -> Float:

@@ -107,9 +107,9 @@ def _add_sections(page: Page, calibration: WingCalibration, drawings: Mapping[st
     _add_load_test(page, calibration, drawings)
     page.add_figure(
         drawings["procedure"],
-        "Samples of the joint posterior and of the paper's procedure (its histograms have scales of their own): "
-        "the masses that meet the measured frequencies best under the weighed total, eqs. (19) and (20), and the "
-        "Rayleigh coefficients of eq. (25), for each sample of e"
+        "Samples of the joint posterior and of the paper's procedure (its histograms have scales of their "
+        "own): the masses that meet the measured frequencies best under the weighed total, eqs. (19) and "
+        "(20), and the Rayleigh coefficients of eq. (25), for each sample of e"
         + ("; grey are the authors' published samples." if calibration.lab.authors else "."),
         title="Masses and damping by the paper's procedure",
     )
@@ -144,9 +144,9 @@ def _add_table_1(page: Page, calibration: WingCalibration) -> None:
             [row.cells for row in calibration.table_1],
         ),
         "Mean ± standard deviation. The paper's procedure: e by its particle filter on its stiffness line, "
-        "then masses by eqs. (19), (20) and damping by eq. (25) on the tailored model for each sample of e; its "
-        "standard deviations hold the uncertainty of e alone. In the paper: planform and e are printed in "
-        "its Table 1; masses are the means of the authors' published samples of step 3, alpha and beta "
+        "then masses by eqs. (19), (20) and damping by eq. (25) on the tailored model for each sample of e; "
+        "its standard deviations hold the uncertainty of e alone. In the paper: planform and e are printed "
+        "in its Table 1; masses are the means of the authors' published samples of step 3, alpha and beta "
         "follow from their frequencies by eq. (25). Difference: this wing less the paper's, which is of its "
         f"own wing. table_1.csv has all figures in SI. {SOURCE}",
         title="This calibration beside Table 1 of the paper",

@@ -107,6 +107,11 @@ def draw_parameter(
             "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
             "let the twin believe a `design`, or set `calibration.curve` to `published`."
         )
+    return _draws_of_load_test(calibration, seed, model if calibration.curve == "design" else None)
+
+
+def _draws_of_load_test(calibration: Calibration, seed: int, model: "ReducedModel | None") -> ParameterDraws:
+    """Return draws of e from the published load test, on the stiffness of a model or the published line."""
     # A scenario can be read without any of this, and it takes a while to load.
     from calibration.paper.load_test import push_forward
     from calibration.paper.particle_filter import particle_filter
@@ -117,8 +122,7 @@ def draw_parameter(
     from reporting.record_json import plain
 
     sequence, pairs = seed_sequence(seed, "calibration"), published_measurements()
-    own = model if calibration.curve == "design" else None
-    curve = PUBLISHED_LINE if own is None else stiffness_curve_of(own)
+    curve = PUBLISHED_LINE if model is None else stiffness_curve_of(model)
     if calibration.method == "exact":
         posterior = exact_posterior(pairs, curve=curve)
     else:
