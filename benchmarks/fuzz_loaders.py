@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from calibration.static.workflow import read_calibration
 from rich.console import Console
 from rich.table import Table
 
@@ -114,7 +113,6 @@ LOADERS: dict[str, Loader] = {
     "run, report": Loader("run/run.nc", lambda path: read_record(path.parent), BINARY),
     "checkpoint": Loader("checkpoint/journal.jsonl", _checkpoint, TEXT),
     "configuration": Loader("run/config.json", _config, TEXT),
-    "calibration of e": Loader("static/calibration.json", read_calibration, TEXT),
     "calibration": Loader("calibrated/calibration.nc", load_calibration, BINARY),
     "observations": Loader("library.nc", load_observation_library, BINARY),
     "strains": Loader("strains.json", load_strain_library, TEXT),

@@ -63,7 +63,8 @@ class FrequencyTable:
                 "build one with a wider range."
             )
         scaled = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
-        return np.exp(chebval3d(*scaled.T, self.coefficient)).T
+        first, second, third = scaled.T
+        return np.asarray(np.exp(chebval3d(first, second, third, self.coefficient)).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +122,8 @@ def tabulate_frequencies(model: ReducedModel, tolerance: float = TOLERANCE) -> F
         nodes = [np.cos(np.pi * (np.arange(n + 1) + 0.5) / (n + 1)) for n in degrees]
         grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
         values = np.array([_frequencies(model, centre + half * point) for point in grid])
-        vandermonde = chebvander3d(*grid.T, degrees)
+        first, second, third = grid.T
+        vandermonde = chebvander3d(first, second, third, degrees)
         coefficient = np.linalg.solve(vandermonde, np.log(values))
         coefficient = coefficient.reshape(*(degree + 1 for degree in degrees), 2)
         table = FrequencyTable(limits, coefficient, 0.0)
