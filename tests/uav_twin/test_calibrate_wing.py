@@ -151,8 +151,7 @@ def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
         *["planform"] * 3, "load test", "weighing", *["ring-down"] * 4,
     ]  # fmt: skip
     for experiment in ("load test", "weighing", "ring-down"):
-        assert -1.0 < result.error(experiment) <= 0.0
-        assert result.error(experiment) > result.error(experiment, prior=True) - 0.2
+        assert result.error(experiment, prior=True) - 0.2 < result.error(experiment) <= 0.0
     assert result.information is not None
     assert result.information > 5.0
     assert result.mean("semi_span") == pytest.approx(1.828005, abs=1e-6)
@@ -361,9 +360,7 @@ def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(
     assert lines[0] == "Step 1: not measured; published lengths (Kapteyn et al. 2021, Table 1)."
     assert lines[1] == "Step 2: step2/load_displacement_measurements.csv read, 8 pairs."
     assert lines[2].startswith("Step 3: published frequencies and damping ratios")
-    assert (
-        "UAV wing: UAV wing; posterior by the paper's procedure, step after step, 100 samples" in captured.out
-    )
+    assert "modulus factor e" in captured.out
     assert "No space is left on the disk" in captured.err
     assert [path.name for path in tmp_path.iterdir()] == ["lab"]
 
