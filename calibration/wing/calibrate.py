@@ -65,10 +65,7 @@ SAMPLE_COUNT = 1000
 PAPER_SAMPLE_COUNT = 100
 """Samples of e for which masses are sought, as in the paper."""
 
-_PAPER_PURPOSE, _LENGTHS_PURPOSE = (
-    31,
-    35,
-)  # of the seed: the samples of e of the paper's step 3, those of lengths
+_PAPER_PURPOSE, _LENGTHS_PURPOSE = 31, 35  # of the seed: the paper's samples of e, those of lengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +80,6 @@ class WingCalibration:
         Which of them is kept.
     lab : LabData
         What was measured.
-    modal : ModalMeasurement
-        What the ring-down says.
     model : ReducedModel
         The model of the tailored design.
     static, static_published : StaticCalibration
@@ -95,7 +90,6 @@ class WingCalibration:
     paper: Calibration
     procedure: Procedure
     lab: LabData
-    modal: ModalMeasurement
     model: ReducedModel
     static: StaticCalibration
     static_published: StaticCalibration
@@ -196,7 +190,7 @@ def calibrate_wing(
         return replace(found, findings=tuple(disagreements(found, lab, static.quality)))
 
     ways = record("joint", joint.samples), record("paper", paper.samples)
-    return WingCalibration(*ways, procedure, lab, modal, model, static, published)
+    return WingCalibration(*ways, procedure, lab, model, static, published)
 
 
 def _provenance(lab: LabData, drawn: WingDesign, seed: int) -> Mapping[str, Any]:

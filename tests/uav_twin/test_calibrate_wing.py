@@ -123,6 +123,29 @@ def test_wings_are_told_apart(wings: dict[str, Tailored]) -> None:
     assert stiff.mean("damping_ratio_2") > soft.mean("damping_ratio_2")
 
 
+def test_the_published_figures_give_table_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    assert call(monkeypatch, "calibrate") == 0
+    rows = {line.split("  ")[0].strip(): line for line in capsys.readouterr().out.splitlines() if "±" in line}
+    table = {name: re.findall(r"[−+]?[\d.]+", line.replace(name, "", 1)) for name, line in rows.items()}
+    assert table["modulus factor e"][4:8] == ["1.0073", "0.0103", "1.0073", "0.0103"]  # procedure and paper
+    for name, near in (
+        ("servo mass, g", 1.0),
+        ("pitot mass, g", 2.0),
+        ("alpha, 1/s", 0.01),
+        ("beta, ms", 0.01),
+    ):
+        assert float(table[name][4]) == pytest.approx(float(table[name][6]), abs=near)
+    for name, length in (
+        ("semi-span, mm", "1828.00"),
+        ("root chord, mm", "433.00"),
+        ("tip chord, mm", "260.00"),
+    ):
+        assert table[name][6] == length
+
+
 def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
     made = wings["soft"]
     names = {path.relative_to(made.out).as_posix() for path in made.out.rglob("*") if path.is_file()}
