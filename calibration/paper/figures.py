@@ -1,9 +1,10 @@
 """Figures of calibration step 2: the panels of Kapteyn et al. 2021, Fig. 5, and what they leave open."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from calibration.paper.load_test import StaticCalibration
 from calibration.paper.table_1 import PAPER_MEAN, PAPER_STANDARD_DEVIATION
@@ -76,13 +77,7 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
             data.load[of_run],
             xerr=HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3,
             yerr=HALF_WIDTH_95 * data.load_standard_deviation,
-            fmt=_MARKERS[number % len(_MARKERS)],
-            color=OBSERVED,
-            mfc="white" if number % 2 else OBSERVED,
-            ms=3.6,
-            mew=0.9,
-            elinewidth=0.8,
-            capsize=1.8,
+            **_of_run(number),
             label=f"measured, run {index + 1}",
             zorder=3 + number,
         )
@@ -94,23 +89,31 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
     panel_label(axes, "a", "Load and displacement")
 
 
+def _of_run(number: int) -> dict[str, Any]:
+    """Return how the pairs of a loading run are marked."""
+    return {
+        "fmt": _MARKERS[number % len(_MARKERS)],
+        "color": OBSERVED,
+        "mfc": "white" if number % 2 else OBSERVED,
+        "ms": 3.6,
+        "mew": 0.9,
+        "elinewidth": 0.8,
+        "capsize": 1.8,
+    }
+
+
 def _draw_factor(axes: Axes, result: StaticCalibration) -> None:
-    particle, exact, prior = result.particle, result.exact, result.prior
-    reach = 3.6 * prior.standard_deviation
-    grid = np.linspace(prior.mean - reach, prior.mean + reach, 601)
-    axes.fill_between(exact.grid, exact.density, color=PAST, alpha=BAND_OPACITY, lw=0.0)
+    particle, prior = result.particle, result.prior
     for pair in range(result.data.count):
         run = result.data.run_indices.index(int(result.data.run[pair]))
         axes.plot(
             particle.likelihood_grid, particle.likelihood[pair], color=OBSERVED, lw=0.7,
             ls=_RUN_LINES[run % len(_RUN_LINES)], label="likelihood of one pair" if pair == 0 else None,
         )  # fmt: skip
-    axes.plot(grid, prior.density(grid), color=REFERENCE, lw=1.8, label="prior")
-    axes.plot(exact.grid, exact.density, color=PAST, lw=1.6, label="posterior, exact")
-    _draw_bars(axes, particle.posterior, 1.0)
+    grid = np.linspace(-8.0, 8.0, 2001) * prior.standard_deviation + prior.mean
+    before = ScalarPosterior(grid, prior.density(grid))
+    _draw_densities(axes, before, result.exact, particle.posterior)
     axes.axvline(PAPER_MEAN, color=REFERENCE, lw=0.7, ls=":", label="mean in the paper")
-    axes.set_xlim(grid[0], grid[-1])
-    axes.set_ylim(0.0, 1.12 * float(exact.density.max()))
     axes.set_xlabel("Young's modulus factor $e$", parse_math=True)
     axes.set_ylabel("probability density")
     axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
@@ -119,25 +122,14 @@ def _draw_factor(axes: Axes, result: StaticCalibration) -> None:
 
 def _draw_stiffness(axes: Axes, result: StaticCalibration) -> None:
     posterior = result.tip_stiffness_exact
-    scale = 1e-3  # N/m to N/mm
-    reach = 3.6 * result.tip_stiffness_prior.standard_deviation
-    axes.fill_between(
-        *_inside(posterior, scale), color=PAST, alpha=BAND_OPACITY, lw=0.0, label="95 % interval"
-    )
-    axes.plot(*_curve(result.tip_stiffness_prior, scale), color=REFERENCE, lw=1.8, label="prior")
-    axes.plot(*_curve(posterior, scale), color=PAST, lw=1.6, label="posterior, exact")
-    _draw_bars(axes, result.tip_stiffness_particle, scale)
-    axes.set_xlim(
-        (result.tip_stiffness_prior.mean - reach) * scale, (result.tip_stiffness_prior.mean + reach) * scale
-    )
-    axes.set_ylim(0.0, 1.12 * float(posterior.density.max()) / scale)
+    _draw_densities(axes, result.tip_stiffness_prior, posterior, result.tip_stiffness_particle, 1e-3)
     axes.set_xlabel("tip stiffness $k$ (N/mm)", parse_math=True)
     axes.set_ylabel("probability density (mm/N)")
     axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
     axes.text(
         0.99,
         0.60,
-        f"{posterior.mean * scale:.4f} ± {posterior.standard_deviation * scale:.4f} N/mm",
+        f"{posterior.mean * 1e-3:.4f} ± {posterior.standard_deviation * 1e-3:.4f} N/mm",
         transform=axes.transAxes,
         color=PAST,
         ha="right",
@@ -146,21 +138,24 @@ def _draw_stiffness(axes: Axes, result: StaticCalibration) -> None:
     panel_label(axes, "c", "Quantity of interest")
 
 
-def _draw_bars(axes: Axes, posterior: ScalarPosterior, scale: float) -> None:
-    """Draw a posterior of particles as a histogram."""
-    edges = posterior.mean + posterior.standard_deviation * np.linspace(-4.0, 4.0, 33)
-    density = np.diff(posterior.cumulative(edges)) / np.diff(edges)
+def _draw_densities(
+    axes: Axes, prior: ScalarPosterior, exact: ScalarPosterior, particle: ScalarPosterior, scale: float = 1.0
+) -> None:
+    """Draw prior, exact posterior with its 95 % interval, and the posterior of particles as a histogram."""
+    lower, upper = exact.interval(0.95)
+    inside = (exact.grid >= lower) & (exact.grid <= upper)
+    axes.fill_between(
+        exact.grid[inside] * scale, exact.density[inside] / scale,
+        color=PAST, alpha=BAND_OPACITY, lw=0.0, label="95 % interval",
+    )  # fmt: skip
+    axes.plot(prior.grid * scale, prior.density / scale, color=REFERENCE, lw=1.8, label="prior")
+    axes.plot(exact.grid * scale, exact.density / scale, color=PAST, lw=1.6, label="posterior, exact")
+    edges = particle.mean + particle.standard_deviation * np.linspace(-4.0, 4.0, 33)
+    density = np.diff(particle.cumulative(edges)) / np.diff(edges)
     axes.stairs(density / scale, edges * scale, color=PRESENT, lw=0.9, label="posterior, particles")
-
-
-def _curve(posterior: ScalarPosterior, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return posterior.grid * scale, posterior.density / scale
-
-
-def _inside(posterior: ScalarPosterior, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    lower, upper = posterior.interval(0.95)
-    inside = (posterior.grid >= lower) & (posterior.grid <= upper)
-    return posterior.grid[inside] * scale, posterior.density[inside] / scale
+    reach = 3.6 * prior.standard_deviation
+    axes.set_xlim((prior.mean - reach) * scale, (prior.mean + reach) * scale)
+    axes.set_ylim(0.0, 1.12 * float(exact.density.max()) / scale)
 
 
 def _draw_residuals(axes: Axes, result: StaticCalibration) -> None:
@@ -177,13 +172,7 @@ def _draw_residuals(axes: Axes, result: StaticCalibration) -> None:
             data.load[of_run] + side,
             quality.displacement_residual[of_run] * 1e3,
             yerr=half_width * 1e3,
-            fmt=_MARKERS[number % len(_MARKERS)],
-            color=OBSERVED,
-            mfc="white" if number % 2 else OBSERVED,
-            ms=3.6,
-            mew=0.9,
-            elinewidth=0.8,
-            capsize=1.8,
+            **_of_run(number),
             label=f"run {index + 1} ({run.offset * 1e3:+.2f} mm)".replace("-", "−"),
         )
         line.lines[0].set_zorder(3 + number)

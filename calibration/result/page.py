@@ -1,6 +1,7 @@
 """The page of a calibration."""
 
 from collections.abc import Mapping
+from textwrap import fill
 
 from matplotlib.figure import Figure
 
@@ -22,19 +23,24 @@ from reporting.page import Column, Page, Table
 FIGURE_NAMES = ("posterior", "prior_and_posterior", "readings")
 """All that `report_figures` may draw, the last where single numbers were measured."""
 
+_TITLE_WIDTH = 14  # letters of a line beside an axis
 
-def axis_titles(result: Calibration) -> list[str]:
-    """Return what the parameters are, with their units, for the axes of figures."""
-    return [
-        prior.name.replace("_", " ") + ("" if prior.unit == "1" else f" ({prior.unit})")
-        for prior in result.priors
+
+def drawn_parameters(result: Calibration) -> tuple[list[int], list[str]]:
+    """Return which parameters are drawn pair by pair, those that have no reading of their own, and titles."""
+    measured = {reading.name for reading in result.readings}
+    drawn = {at: prior for at, prior in enumerate(result.priors) if prior.name not in measured}
+    titles = [
+        fill(prior.name.replace("_", " ") + ("" if prior.unit == "1" else f" ({prior.unit})"), _TITLE_WIDTH)
+        for prior in drawn.values()
     ]
+    return list(drawn), titles
 
 
 def report_figures(result: Calibration) -> dict[str, Figure]:
     """Draw every figure of the page, by the name of its file."""
-    titles, count = axis_titles(result), len(result.priors)
-    posterior, prior = result.samples[:, :count], result.prior_samples[:, :count]
+    places, titles = drawn_parameters(result)
+    posterior, prior = result.samples[:, places], result.prior_samples[:, places]
     drawn = [
         corner_figure(titles, [("posterior", posterior)]),
         corner_figure(titles, [("posterior", posterior), ("prior", prior)]),

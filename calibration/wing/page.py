@@ -10,8 +10,7 @@ from calibration.paper.figures import calibration_figure, residual_figure
 from calibration.paper.table_1 import HEADINGS, write_table_1
 from calibration.result.figures import corner_figure
 from calibration.result.folder import drawing_names, write_calibration_folder
-from calibration.result.page import axis_titles
-from calibration.result.record import STATE
+from calibration.result.page import drawn_parameters
 from calibration.result.text import with_deviation
 from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
 from fe.reduction.model_cache import wing_fields
@@ -77,17 +76,17 @@ def _figures(calibration: WingCalibration, fields: WingFields) -> Mapping[str, F
         f"mode {index + 1}, {frequency:.2f} Hz" + (f", {flapwise[index]}" if index in flapwise else "")
         for index, frequency in enumerate(modes.frequency[:6])
     ]
-    count = len(STATE)
+    places, names = drawn_parameters(calibration.joint)
     sets = [
-        ("joint posterior", calibration.joint.samples[:, :count]),
-        ("the paper's procedure", calibration.paper.samples[:, :count]),
+        ("joint posterior", calibration.joint.samples[:, places]),
+        ("the paper's procedure", calibration.paper.samples[:, places]),
     ]
     if calibration.lab.authors is not None:
         sets.append(("authors' model", calibration.lab.authors.samples))
     drawn = [
         calibration_figure(calibration.static),
         residual_figure(calibration.static),
-        corner_figure(axis_titles(calibration.result)[:count], sets),
+        corner_figure(names, sets),
         modes_figure(fields, modes, titles),
     ]
     if calibration.lab.trials is not None:
