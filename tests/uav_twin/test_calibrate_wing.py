@@ -160,7 +160,7 @@ def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
     page = (made.out / "report.html").read_text(encoding="utf-8")
     assert "Calibration of soft" in page
     assert "This calibration beside Table 1 of the paper" in page
-    assert re.findall(r".{0,60}http.{60}", page.replace("http://www.w3.org", "")) == []  # nothing is fetched
+    assert not re.search(r"https?://", page.replace("http://www.w3.org", ""))  # nothing is fetched
     assert str(made.out) not in page
     for word in (
         "Step 1: step1/geometry_data.csv read",
