@@ -32,10 +32,9 @@ from benchmarks.fuzz_files import CONFIG_HASH, make_files
 from benchmarks.fuzz_mutations import ARCHIVE, BINARY, TEXT, Mutation
 from calibration.dynamics.records import read_records
 from calibration.geometry import read_lengths
+from calibration.result.file import load_calibration
 from calibration.static.experiments import read_measurements
-from calibration.static.workflow import read_calibration
 from calibration.wing.laboratory import read_weighed_mass
-from calibration.wing.result_file import load_calibration
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.files.patch import read_patch
@@ -114,7 +113,6 @@ LOADERS: dict[str, Loader] = {
     "run, report": Loader("run/run.nc", lambda path: read_record(path.parent), BINARY),
     "checkpoint": Loader("checkpoint/journal.jsonl", _checkpoint, TEXT),
     "configuration": Loader("run/config.json", _config, TEXT),
-    "calibration of e": Loader("static/calibration.json", read_calibration, TEXT),
     "calibration": Loader("calibrated/calibration.nc", load_calibration, BINARY),
     "observations": Loader("library.nc", load_observation_library, BINARY),
     "strains": Loader("strains.json", load_strain_library, TEXT),

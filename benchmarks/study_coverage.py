@@ -20,24 +20,17 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from calibration.dynamics.masses_and_damping import DynamicTargets, MassRange, fit_masses
 from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, RingDownError
-from calibration.joint import (
-    NAMES,
-    JointPosterior,
-    JointPrior,
-    ModalMeasurement,
-    ModelError,
-    WeighedMass,
-    WingTables,
-    joint_posterior,
-    modal_measurement,
-    tabulate_wing,
-)
-from calibration.static.posterior import GaussianPrior
-from calibration.static.stiffness import LoadDisplacementData, exact_posterior
+from calibration.joint.frequency_table import WingTables, tabulate_wing
+from calibration.joint.inference import joint_posterior
+from calibration.joint.measurement import ModalMeasurement, modal_measurement
+from calibration.joint.prior import ModelError, WeighedMass, wing_priors
+from calibration.paper.procedure import fit_masses
+from calibration.result.record import STATE, prior_samples
+from calibration.static.errors_in_variables import exact_posterior
+from calibration.static.experiments import LoadDisplacementData
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down, weigh
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
@@ -54,12 +47,12 @@ ALLOWED_REFUSALS = 0.1
 
 # Wings whose second mode is seen in a record: weak as the default prior is, it has wings without damping and
 # wings that do not ring. Everything else is the default.
-PRIOR = JointPrior(damping_alpha=GaussianPrior(1.0, 0.3), damping_beta=GaussianPrior(6e-4, 1.5e-4))
+DAMPING = {"damping_alpha": (1.0, 0.3), "damping_beta": (6e-4, 1.5e-4)}
 
 
 @dataclass(frozen=True, eq=False)
 class Wing:
-    """One wing: truth (5,) of `NAMES`, and what was measured of it."""
+    """One wing: truth (5,) of `STATE`, and what was measured of it."""
 
     truth: NDArray[np.float64]
     static: LoadDisplacementData
@@ -69,7 +62,7 @@ class Wing:
 
 def measure(model: ReducedModel, seed: int, model_error: ModelError, procedure: Frequencies) -> Wing:
     generator = np.random.default_rng([2021, seed])
-    truth = PRIOR.samples(model.validity, generator, 1)[0]
+    truth = prior_samples(wing_priors(model.validity, **DAMPING), 1, int(generator.integers(2**32)))[0]
     state = DigitalState(Geometry(), *truth.tolist())
     first, second = (model_error.frequency * generator.standard_normal(2)).tolist()
     bench = VirtualWing(model, state, (first, second))
@@ -95,13 +88,12 @@ def paper(model: ReducedModel, tables: WingTables, wing: Wing, seed: int) -> NDA
     result = fit_masses(
         frequencies,
         factors,
-        MassRange(model.validity["servo_mass"], model.validity["pitot_mass"]),
-        DynamicTargets(wing.modal.frequency, wing.modal.damping_ratio),
+        model.validity,
+        wing.modal,
         total_mass=wing.total_mass.mass,
     )
-    samples = np.column_stack([result.young_modulus_factor, result.samples])
     tail = 0.5 * (1.0 - PROBABILITY)
-    return np.quantile(samples, [tail, 1.0 - tail], axis=0).T
+    return np.quantile(result.samples, [tail, 1.0 - tail], axis=0).T
 
 
 def main() -> int:
@@ -114,6 +106,7 @@ def main() -> int:
     given = parser.parse_args()
     model = reduced_model(progress=RichProgress())
     tables = tabulate_wing(model)
+    priors = wing_priors(model.validity, **DAMPING)
     of_wings = ModelError((0.0, 0.0)) if given.exact_model else ModelError()
     assumed = ModelError((0.0, 0.0)) if given.trusting else ModelError()
     procedure = Frequencies.PEAKS if given.peaks else Frequencies.FITTED
@@ -130,8 +123,8 @@ def main() -> int:
         seconds["measuring and fitting"] += time.perf_counter() - begin
         begin = time.perf_counter()
         try:
-            result: JointPosterior = joint_posterior(
-                tables, wing.static, wing.modal, prior=PRIOR, total_mass=wing.total_mass,
+            result = joint_posterior(
+                tables, wing.static, wing.modal, priors=priors, total_mass=wing.total_mass,
                 model_error=assumed, seed=seed,
             )  # fmt: skip
         except CalibrationError as error:
@@ -139,7 +132,8 @@ def main() -> int:
             refused += 1
             continue
         seconds["joint posterior"] += time.perf_counter() - begin
-        lower, upper = result.interval(PROBABILITY).T
+        tail = 0.5 * (1.0 - PROBABILITY)
+        lower, upper = np.quantile(result.samples, [tail, 1.0 - tail], axis=0)
         held.append((lower <= wing.truth) & (wing.truth <= upper))
         widths.append(upper - lower)
         begin = time.perf_counter()
@@ -160,7 +154,7 @@ def main() -> int:
         "width, paper's over joint", title=f"{count} wings, share of 90 % intervals that hold the truth",
     )  # fmt: skip
     reached = (share >= TARGET[0]) & (share <= TARGET[1])
-    for place, name in enumerate(NAMES):
+    for place, name in enumerate(STATE):
         table.add_row(
             name, f"{100 * share[place]:.1f} %", "85 to 95 %", "yes" if reached[place] else "NO",
             f"{100 * share_paper[place]:.1f} %", f"{width[place]:.3g}", f"{ratio[place]:.2f}",

@@ -7,8 +7,8 @@ from dataclasses import replace as changed
 from pathlib import Path
 from typing import Any
 
-from calibration.wing.result_file import load_calibration
-from calibration.wing.wing_record import WingTailoring, tailoring
+from calibration.result.file import load_calibration
+from calibration.result.plain import WingTailoring, tailoring
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.files.patch import (
     APPLIED,

@@ -5,7 +5,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from calibration.errors import CalibrationError
-from calibration.wing.result_file import load_calibration
+from calibration.result.file import load_calibration
 from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.document import Origin
 from discrepancy.files.patch import StoredPatch, read_patch
@@ -279,7 +279,7 @@ def _wing(path: Path | None, progress: Progress | None) -> ModelChoice:
 def _calibrated(path: Path, progress: Progress | None) -> ModelChoice:
     model = WingModel.of_calibration(path, progress)
     try:
-        design = load_calibration(path).design
+        design = load_calibration(path).wing_design
     except (CalibrationError, OSError) as cause:
         raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
     return ModelChoice(model, ModelKind.CALIBRATION, path.name, hash_file(path), design, path, design.hash)

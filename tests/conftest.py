@@ -23,7 +23,7 @@ from hypothesis import settings
 from tests.kept import FE, ROOT, kept, remove_old
 
 if TYPE_CHECKING:
-    from calibration.wing.result import CalibrationResult
+    from calibration.result.record import Calibration
     from fe.reduction.reduced_basis import Reduction
     from fe.runtime.patch_arrays import PatchArrays
     from fe.runtime.reduced import ReducedModel
@@ -212,41 +212,60 @@ def library_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def synthetic_calibration(
     count: int = 40, seed: int = 1, asset: str = "Wing 7 (é)", young_modulus_factor: float = 1.01
-) -> CalibrationResult:
+) -> Calibration:
     """A calibration drawn from Gaussians, for a design 2 mm longer than the shipped one, on a coarse mesh."""
-    from calibration.geometry import published_lengths
-    from calibration.joint import WeighedMass, published_modal_measurement
-    from calibration.static.experiments import published_measurements
-    from calibration.wing.result import CalibrationResult
-    from calibration.wing.steps import CalibrationStep, StepReward, Update
+    import xarray as xr
+
+    from calibration.joint.prior import wing_priors
+    from calibration.result.record import Calibration, Reading
+    from calibration.wing.calibrate import QUANTITIES
     from fe.wing.design import load_design
 
     generator = np.random.default_rng(seed)
     mean = np.array([young_modulus_factor, 0.17, 0.132, 1.05, 7.6e-4])
     spread = np.array([0.01, 0.004, 0.008, 0.1, 1e-4])
-    quantity = np.array([682.0, 5.65, 28.6, 0.028, 0.07])
-    update = Update("tip_stiffness", "tip stiffness", "N/m", 677.0, 15.0, 682.0, 6.0, 682.1, 6.5)
-    step = CalibrationStep(3, "Ring-down", "joint", "drawn", (), (update,), StepReward(-2.0, -0.7, 0.7, None))
-    return CalibrationResult(
+    quantity = np.array([682.0, 5.65, 28.6, 0.028, 0.07, 0.472])
+    validity = {"young_modulus_factor": (0.9, 1.1), "servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
+
+    def drawn(rows: int, wider: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+        state = mean + wider * spread * generator.normal(size=(rows, 5))
+        return np.hstack([state, quantity * (1.0 + 0.01 * wider * generator.normal(size=(rows, 6)))])
+
+    design = load_design().changed(planform={"semi_span": 1.83}, mesh={"refinement": 0.25})
+    samples = drawn(count, 1.0)
+    return Calibration(
         asset=asset,
-        design=load_design().changed(planform={"semi_span": 1.83}, mesh={"refinement": 0.25}),
-        geometry=published_lengths(),
+        model=design.name,
+        model_hash=design.hash,
         procedure="joint",
-        samples=mean + spread * generator.normal(size=(count, 5)),
-        prior_samples=mean + 3.0 * spread * generator.normal(size=(count + 3, 5)),
-        quantity_samples=quantity * (1.0 + 0.01 * generator.normal(size=(count, 5))),
-        prior_quantity_samples=quantity * (1.0 + 0.05 * generator.normal(size=(count + 3, 5))),
-        pairs=published_measurements(),
-        total_mass=WeighedMass(0.47, 2e-3),
-        modal=published_modal_measurement(),
-        steps=(step,),
+        priors=wing_priors(validity),
+        samples=samples,
+        prior_samples=drawn(count + 3, 3.0),
+        explained=None,
+        findings=("The wing is drawn.",),
+        channels=(),
+        source="nowhere",
         seed=5,
         provenance={"versions": {"numpy": "2"}, "input_hashes": {}},
+        design_hash=design.hash,
+        quantities=QUANTITIES,
+        readings=(Reading("tip_stiffness", "load test", 682.1, 6.5),),
+        measured=xr.Dataset(
+            {
+                "load": ("pair", np.array([2.5, 5.0]), {"units": "N", "long_name": "load of the test"}),
+                "displacement": (
+                    "pair",
+                    np.array([0.004, 0.007]),
+                    {"units": "m", "long_name": "displacement of the test"},
+                ),
+            }
+        ),
+        design=design,
     )
 
 
 @pytest.fixture(scope="session")
-def make_calibration() -> Callable[..., CalibrationResult]:
+def make_calibration() -> Callable[..., Calibration]:
     """What makes a calibration without a wing."""
     return synthetic_calibration
 

@@ -43,8 +43,8 @@ ROOMS = {
         "packing", "companions", "structures", "coupling", "check", "ssp",
     ),
     "calibration": (
-        "errors", "lab_folder", "static", "geometry", "dynamics", "published_strains", "joint",
-        "virtual_wing", "samples", "wing", "parameters", "reading",
+        "errors", "lab_folder", "static", "geometry", "result", "dynamics", "published_strains", "joint",
+        "virtual_wing", "paper", "wing",
     ),
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from calibration.wing.result import CalibrationResult
-from calibration.wing.result_file import save_calibration
+from calibration.result.file import save_calibration
+from calibration.result.record import Calibration
 from discrepancy.sources.examples import write_example
 from fmu_asset.packing.structure_fmu import build_fmu
 from tests import command_line
@@ -252,7 +252,7 @@ def short_mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def calibrated_wing(
-    make_calibration: Callable[..., CalibrationResult], tmp_path_factory: pytest.TempPathFactory
+    make_calibration: Callable[..., Calibration], tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """The folder of a calibration."""
     folder = tmp_path_factory.mktemp("calibration")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same when it runs
     from calibration.dynamics.modal_identification import identify_modes
-    from calibration.reading import load_calibration
-    from calibration.wing.three_steps import calibrate_wing as calibrate
+    from calibration.result.file import load_calibration
+    from calibration.wing.calibrate import calibrate_wing as calibrate
     from discrepancy.application import apply_verdict
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.files.verdict import read_verdict_folder as read_verdict
@@ -103,7 +103,7 @@ _HOMES = {
     "assemble": "fe.full.operators",
     "assemble_structure": "fe.structure.operators:load_any",
     "build_fmu": "fmu_asset.packing.structure_fmu",
-    "calibrate": "calibration.wing.three_steps:calibrate_wing",
+    "calibrate": "calibration.wing.calibrate:calibrate_wing",
     "eigenmodes": "fe.full.modes",
     "filter_sequence": "twin_master.network.inference",
     "fly": "twin_master.workflow:new_run",
@@ -111,7 +111,7 @@ _HOMES = {
     "identify_modes": "calibration.dynamics.modal_identification",
     "investigate": "discrepancy.workflow",
     "learn_from_fleet": "twin_master.fleet.lessons",
-    "load_calibration": "calibration.reading",
+    "load_calibration": "calibration.result.file",
     "load_design": "fe.wing.design",
     "load_model": "discrepancy.model_choice",
     "load_scenario": "twin_master.scenario.reading",

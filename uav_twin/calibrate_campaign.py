@@ -8,7 +8,7 @@ import typer
 from reporting import terminal
 
 if TYPE_CHECKING:
-    from calibration.parameters.result import ParameterCalibration
+    from calibration.result.record import Calibration
 
 
 def calibrate_campaign(
@@ -31,10 +31,9 @@ def calibrate_campaign(
     no_report: terminal.NoReport = False,
 ) -> None:
     """Posterior of the parameters of any model, an FMU or a structure too, from a campaign."""
-    from calibration.parameters.folder import REPORT_NAME, write_parameters_folder
-    from calibration.parameters.result import ParameterCalibration
-    from calibration.reading import check_folder
-    from calibration.samples.record import check_name
+    from calibration.result.file import check_folder
+    from calibration.result.folder import write_calibration_folder
+    from calibration.result.record import check_name
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.model_choice import choose_model
     from discrepancy.parameters.calibration import calibrate_parameters
@@ -44,11 +43,16 @@ def calibrate_campaign(
     data = read_campaign(campaign)
     name = check_name(data.name if asset is None else asset)
     if out is not None:
-        check_folder(out, name, ParameterCalibration)
+        check_folder(out, name, wing=False)
     progress = terminal.progress()
     choice = choose_model(model, progress)
     result = calibrate_parameters(data, choice, asset=name, samples=samples, seed=seed, progress=progress)
-    written = None if out is None else write_parameters_folder(result, out, progress, report=not no_report)
+    written = None if out is None else write_calibration_folder(result, out, progress, report=not no_report)
+    show(result, written, json=json, report=not no_report)
+
+
+def show(result: "Calibration", written: Path | None, *, json: bool, report: bool) -> None:
+    """Say what a calibration found, and where it was written."""
     if json:
         terminal.print_json({"calibration": None if written is None else str(written)} | _record(result))
         return
@@ -57,15 +61,16 @@ def calibrate_campaign(
         terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
         return
     terminal.say(f"Calibration: {written}")
-    if not no_report:
+    if report:
+        from calibration.result.folder import REPORT_NAME
+
         terminal.say(f"Report: {written.with_name(REPORT_NAME)}")
 
 
-def _record(result: "ParameterCalibration") -> dict[str, Any]:
+def _record(result: "Calibration") -> dict[str, Any]:
     """Return the calibration as plain data."""
     from dataclasses import asdict
 
-    from calibration.samples.moments import correlation
     from reporting.record_json import plain
 
     return {
@@ -85,29 +90,25 @@ def _record(result: "ParameterCalibration") -> dict[str, Any]:
             }
             for prior in result.priors
         ],
-        "correlation": correlation(result.samples).tolist(),
+        "correlation": result.correlation.tolist(),
         "information_nat": result.information,
-        "channels": plain(list(result.channels)),
+        "readings": plain(result.readings),
+        "channels": plain(result.channels),
         "findings": list(result.findings),
     }
 
 
-def _show(result: "ParameterCalibration") -> None:
-    from calibration.parameters.text import (
-        CHANNEL_HEADINGS,
-        HEADINGS,
-        channel_rows,
-        correlation_lines,
-        headline,
-        parameter_rows,
-    )
+def _show(result: "Calibration") -> None:
+    from calibration.result import text
     from uav_twin.console_table import console_table
 
     console = terminal.console()
-    console.print(headline(result), soft_wrap=True)
-    console.print(console_table(HEADINGS, parameter_rows(result), console.width))
-    for line in correlation_lines(result):
+    console.print(text.headline(result), soft_wrap=True)
+    console.print(console_table(text.HEADINGS, text.parameter_rows(result), console.width))
+    for line in text.correlation_lines(result):
         console.print(line, soft_wrap=True)
-    console.print(console_table(CHANNEL_HEADINGS, channel_rows(result), console.width))
+    if result.readings:
+        console.print(console_table(text.READING_HEADINGS, text.reading_rows(result), console.width))
+    console.print(console_table(text.CHANNEL_HEADINGS, text.channel_rows(result), console.width))
     for sentence in result.findings:
         console.print(f"- {sentence}", soft_wrap=True)

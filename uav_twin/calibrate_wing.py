@@ -2,14 +2,11 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from reporting import terminal
-
-if TYPE_CHECKING:
-    from calibration.wing.three_steps import WingCalibration
 
 
 class ProcedureName(StrEnum):
@@ -54,6 +51,7 @@ def calibrate_wing(
     design: Design = None,
     measured: Measured = None,
     fitted: Fitted = False,
+    json: terminal.Json = False,
     no_report: terminal.NoReport = False,
 ) -> None:
     """Tailor the model to one wing: planform, stiffness, masses and damping, in this order.
@@ -67,6 +65,7 @@ def calibrate_wing(
             or seed
             or fitted
             or no_report
+            or json
             or procedure is not ProcedureName.joint
         ):
             raise typer.BadParameter(
@@ -78,68 +77,30 @@ def calibrate_wing(
     if fitted and (data is None or measured is False):
         raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
     from calibration.dynamics.ringdown import Frequencies
-    from calibration.reading import check_folder
-    from calibration.wing.folder import write_calibration_folder
+    from calibration.paper.table_1 import HEADINGS
+    from calibration.result.file import check_folder
+    from calibration.wing.calibrate import calibrate_wing as calibrate
     from calibration.wing.lab_data import Targets, published_data, read_lab_folder
-    from calibration.wing.result import CalibrationResult
-    from calibration.wing.three_steps import calibrate_wing as calibrate
+    from calibration.wing.page import write_wing_folder
     from fe.wing.design import load_design
+    from uav_twin.calibrate_campaign import show
+    from uav_twin.console_table import console_table
 
     drawn = load_design(design)
     name = drawn.name if asset is None else asset
     if out is not None:
-        check_folder(out, name, CalibrationResult)
+        check_folder(out, name, wing=True)
     targets: Targets | None = None if measured is None else "measured" if measured else "published"
     frequencies = Frequencies.FITTED if fitted else Frequencies.PEAKS
     lab = published_data() if data is None else read_lab_folder(data, targets, frequencies)
-    for origin in lab.origins:
-        terminal.say(f"Step {origin.step}: {origin.text}.")
+    if not json:
+        for origin in lab.origins:
+            terminal.say(f"Step {origin.step}: {origin.text}.")
     progress = terminal.progress()
     calibration = calibrate(lab, drawn, asset=name, procedure=procedure.value, seed=seed, progress=progress)
-    _show(calibration)
-    if out is None:
-        terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
-        return
-    paths = write_calibration_folder(calibration, out, progress, report=not no_report)
-    terminal.say(f"Calibration: {paths.calibration}")
-    if not no_report:
-        terminal.say(f"Report: {paths.report}")
-
-
-def _show(calibration: "WingCalibration") -> None:
-    from rich import box
-    from rich.table import Table
-
-    from calibration.wing.disagreements import disagreements, misses
-    from calibration.wing.table_1 import SHOWN, printed, signed, signed_number, table_1
-
-    result = calibration.result
-    console = terminal.console()
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("figure", "this wing", "in the paper", "difference"):
-        table.add_column(heading, no_wrap=True)
-    for row in table_1(calibration):
-        shown = SHOWN[row.name]
-        table.add_row(
-            f"{shown.title}, {shown.unit}" if shown.unit else shown.title,
-            printed(row.name, *row.found),
-            printed(row.name, row.paper.mean, row.paper.standard_deviation),
-            signed(row.name, row.difference),
-        )
-    console.print(f"{result.asset}, {result.procedure}, {len(result.samples)} samples")
-    console.print(table)
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("quantity", "measured", "calibrated model", "off", "unit"):
-        table.add_column(heading, no_wrap=True)
-    for miss in misses(calibration):
-        shown = SHOWN[miss.name]
-        table.add_row(
-            shown.title,
-            printed(miss.name, *miss.measured),
-            printed(miss.name, *miss.model),
-            f"{signed_number(100.0 * miss.relative, 1)} %",
-            shown.unit,
-        )
-    console.print(table)
-    for sentence in disagreements(calibration):
-        console.print(f"- {sentence}", soft_wrap=True)
+    if not json:
+        console = terminal.console()
+        rows = [row.cells for row in calibration.table_1]
+        console.print(console_table(HEADINGS, rows, console.width))
+    written = None if out is None else write_wing_folder(calibration, out, progress, report=not no_report)
+    show(calibration.result, written, json=json, report=not no_report)

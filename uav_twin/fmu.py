@@ -134,11 +134,11 @@ def _build_wing(
     if calibration is None:
         shape = load_design(design)
     else:
-        from calibration.wing.result_file import load_calibration
-        from calibration.wing.wing_record import tailoring
+        from calibration.result.file import load_calibration
+        from calibration.result.plain import tailoring
 
         wing = load_calibration(calibration)
-        shape, tailored = wing.design, tailoring(wing)
+        shape, tailored = wing.wing_design, tailoring(wing)
     info = pack_wing(
         shape,
         out,

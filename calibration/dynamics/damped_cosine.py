@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 _GREATEST_GROWTH = 50.0  # exponent at the end of a record; an iteration may pass through growing waves
 
@@ -20,6 +21,14 @@ class Solution(NamedTuple):
     fitted: NDArray[np.float64]
     residual_deviation: float
     covariance: NDArray[np.float64]
+
+
+class Search(NamedTuple):
+    """Decay rates (K,) [1/s] and angular frequencies (K,) [rad/s], and half the sum of squares there."""
+
+    decay: NDArray[np.float64]
+    omega: NDArray[np.float64]
+    cost: float
 
 
 class DampedCosines:
@@ -49,6 +58,22 @@ class DampedCosines:
         basis = self._basis(decay, omega)
         orthogonal = np.linalg.qr(basis)[0]
         return np.asarray(self._signal - orthogonal @ (orthogonal.T @ self._signal))
+
+    def fitted(
+        self, decay: NDArray[np.float64], omega: NDArray[np.float64], *, frequencies_fitted: bool = True
+    ) -> Search:
+        """Return the decay rates and frequencies nearest to the record, begun at these."""
+        scale = np.concatenate([decay, omega]) if frequencies_fitted else decay
+
+        def residual(unknown: NDArray[np.float64]) -> NDArray[np.float64]:
+            scaled = unknown * scale
+            return self.residual(scaled[: decay.size], scaled[decay.size :] if frequencies_fitted else omega)
+
+        found = least_squares(residual, np.ones(scale.size), method="lm", xtol=1e-12, ftol=1e-14, gtol=1e-14)
+        best = found.x * scale
+        return Search(
+            best[: decay.size], best[decay.size :] if frequencies_fitted else omega, float(found.cost)
+        )
 
     def solve(
         self, decay: NDArray[np.float64], omega: NDArray[np.float64], *, frequencies_fitted: bool

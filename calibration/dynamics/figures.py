@@ -1,4 +1,4 @@
-"""Figures of calibration step 3: ring-down, spectrum, dependence on the amplitude, posterior of step 3."""
+"""Figure of ring-down records: fit, spectra, dependence on the amplitude."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,13 +10,11 @@ from reporting.figures import (
     PAST,
     PREDICTION,
     PRESENT,
-    REFERENCE,
     new_figure,
     panel_label,
     publication_style,
 )
 
-from .masses_and_damping import DynamicCalibration
 from .ringdown import RingDownFit
 from .trials import RingDownTrials, amplitude_dependence
 
@@ -31,38 +29,6 @@ def ring_down_figure(trials: RingDownTrials) -> Figure:
         _draw_spectra(figure.add_subplot(grid[0, 1]), trials)
         frequency, damping = (figure.add_subplot(grid[1, column]) for column in (0, 1))
         _draw_amplitudes(frequency, damping, trials)
-    return figure
-
-
-def masses_figure(ours: DynamicCalibration, authors: DynamicCalibration | None = None) -> Figure:
-    """Draw the samples of step 3 over e, beside the authors' where given."""
-    with publication_style():
-        figure = new_figure(height=4.4)
-        grid = figure.add_gridspec(2, 2, wspace=0.28, hspace=0.48)
-        figure.subplots_adjust(left=0.085, right=0.985, bottom=0.10, top=0.94)
-        rows = (
-            ("servo_mass", "mass of a servo (g)", 1e3, "Servo"),
-            ("pitot_mass", "mass of the pitot tube (g)", 1e3, "Pitot tube"),
-            ("damping_alpha", r"$\alpha$ (1/s)", 1.0, "Mass-proportional damping"),
-            ("damping_beta", r"$\beta$ (ms)", 1e3, "Stiffness-proportional damping"),
-        )
-        for place, (name, label, scale, title) in enumerate(rows):
-            axes = figure.add_subplot(grid[place // 2, place % 2])
-            for result, colour, marker, text in (
-                (authors, REFERENCE, "s", "authors' model"),
-                (ours, PAST, "o", "this model"),
-            ):
-                if result is not None:
-                    axes.plot(
-                        result.young_modulus_factor, getattr(result, name) * scale, marker,
-                        color=colour, ms=2.4, label=text,
-                    )  # fmt: skip
-            axes.set_xlabel("Young's modulus factor $e$", parse_math=True)
-            axes.set_ylabel(label, parse_math=True)
-            axes.ticklabel_format(useOffset=False)
-            panel_label(axes, "abcd"[place], title)
-            if place == 0:
-                axes.legend(loc="upper right")
     return figure
 
 

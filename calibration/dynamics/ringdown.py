@@ -10,7 +10,6 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.signal import decimate, detrend, find_peaks
 
 from calibration.errors import RingDownError
@@ -263,20 +262,10 @@ def fit_ring_down(
     model = DampedCosines(record.time, record.signal, record.averaging_width)
     omega = 2.0 * math.pi * peaks
     fixed = procedure is Frequencies.PEAKS
-
-    def residual(unknown: NDArray[np.float64]) -> NDArray[np.float64]:
-        scaled = unknown * scale
-        return model.residual(scaled[:2], omega if fixed else scaled[2:])
-
-    best = None
-    for ratio in _STARTING_RATIOS:
-        scale = ratio * omega if fixed else np.concatenate([ratio * omega, omega])
-        trial = least_squares(residual, np.ones(scale.size), method="lm", xtol=1e-12, ftol=1e-14, gtol=1e-14)
-        if best is None or trial.cost < best[0]:
-            best = trial.cost, trial.x * scale
-    assert best is not None
-    decay = best[1][:2]
-    omega = omega if fixed else best[1][2:]
+    searches = [
+        model.fitted(ratio * omega, omega, frequencies_fitted=not fixed) for ratio in _STARTING_RATIOS
+    ]
+    decay, omega, _ = min(searches, key=lambda search: search.cost)
     for number in range(2):
         if not 0.0 < decay[number] < omega[number]:
             raise RingDownError(

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from calibration.errors import RingDownError
 
@@ -62,16 +60,6 @@ class RingDownTrials:
             ]
         )
 
-    @property
-    def target_frequencies(self) -> tuple[float, float]:
-        """Mean natural frequencies of the two modes [Hz]."""
-        return self.frequency(0).mean, self.frequency(1).mean
-
-    @property
-    def target_damping_ratios(self) -> tuple[float, float]:
-        """Mean damping ratios of the two modes [1]."""
-        return self.damping_ratio(0).mean, self.damping_ratio(1).mean
-
 
 class AmplitudePoint(NamedTuple):
     """First mode within one window: middle [s], amplitude [V], frequency [Hz], damping ratio [1]."""
@@ -123,16 +111,9 @@ def amplitude_dependence(
         inside = (record.time >= begin) & (record.time < begin + window)
         time = record.time[inside]
         model = DampedCosines(time, record.signal[inside], record.averaging_width)
-        scale = np.array([mode.decay_rate, omega])
-
-        def residual(
-            unknown: NDArray[np.float64], model: DampedCosines = model, scale: NDArray[np.float64] = scale
-        ) -> NDArray[np.float64]:
-            decay, omega = unknown * scale
-            return model.residual(np.array([decay]), np.array([omega]))
-
-        decay, damped = least_squares(residual, np.ones(2), method="lm", xtol=1e-12).x * scale
-        solution = model.solve(np.array([decay]), np.array([damped]), frequencies_fitted=True)
+        found = model.fitted(np.array([mode.decay_rate]), np.array([omega]))
+        solution = model.solve(found.decay, found.omega, frequencies_fitted=True)
+        decay, damped = float(found.decay[0]), float(found.omega[0])
         middle = 0.5 * window
         amplitude = abs(complex(solution.amplitude[0])) * math.exp(-decay * middle)
         if amplitude > 4.0 * solution.residual_deviation:

@@ -26,14 +26,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.result.record import ParameterPrior
 from calibration.static.errors_in_variables import log_likelihood
 from calibration.static.experiments import LoadDisplacementData
-from calibration.static.posterior import GaussianPrior
-from calibration.static.stiffness_curve import StiffnessCurve
 
-from .frequency_table import FrequencyTable
+from .frequency_table import WingTables
 from .measurement import ModalMeasurement
-from .prior import JointPrior, ModelError, WeighedMass
+from .prior import ModelError, WeighedMass
 
 FloatArray = NDArray[np.float64]
 
@@ -56,32 +55,37 @@ class JointDensity:
 
     Attributes
     ----------
-    table : FrequencyTable
-        Frequencies of the model.
-    curve : StiffnessCurve
-        k(e) of the same model.
+    tables : WingTables
+        Frequencies and stiffness of the model.
     static, modal, total_mass
         What was measured.
-    prior, model_error
+    priors, model_error
         What is assumed.
     """
 
-    table: FrequencyTable
-    curve: StiffnessCurve
+    tables: WingTables
     static: LoadDisplacementData
     modal: ModalMeasurement
     total_mass: WeighedMass
-    prior: JointPrior
+    priors: tuple[ParameterPrior, ...]
     model_error: ModelError
 
     def inside(self, reduced: FloatArray) -> NDArray[np.bool_]:
         """Return which rows (e, s, t) of (N, 3) lie within the model's range."""
-        limits = self.table.limits
+        limits = self.tables.frequency.limits
         quantities = masses_of(reduced)
         return np.asarray(((quantities >= limits[:, 0]) & (quantities <= limits[:, 1])).all(axis=1))
 
-    def log_density(self, reduced: FloatArray) -> tuple[FloatArray, FloatArray, DampingGiven]:
-        """Return the log of prior times likelihood, the frequencies, and the damping given them.
+    def __call__(self, reduced: FloatArray) -> FloatArray:
+        """Return the log density of rows (e, s, t) of (N, 3); minus infinity beyond the model's range."""
+        inside = self.inside(reduced)
+        value = np.full(reduced.shape[0], -np.inf)
+        if inside.any():
+            value[inside] = self.log_density(reduced[inside])[0]
+        return value
+
+    def log_density(self, reduced: FloatArray) -> tuple[FloatArray, DampingGiven]:
+        """Return the log of prior times likelihood, and the damping given e and masses.
 
         The priors enter as whole Gaussians, not normalised for their limits.
 
@@ -92,34 +96,31 @@ class JointDensity:
 
         Returns
         -------
-        (N,) array, (N, 2) array [Hz], DampingGiven
+        (N,) array, DampingGiven
         """
         quantities = masses_of(reduced)
-        frequency = self.table.frequency(quantities)
+        frequency = self.tables.frequency.frequency(quantities)
         damping = self.damping(frequency)
-        total = np.asarray(log_likelihood(self.curve, self.static, quantities[:, 0]) + damping.log_likelihood)
-        for place, prior in enumerate(self.prior.marginals[:3]):
-            total += prior.log_density(quantities[:, place])
-        total += GaussianPrior(*self.total_mass).log_density(reduced[:, 2])
-        error = np.array(self.modal.frequency_standard_deviation)
-        variance = error**2 + (np.array(self.model_error.frequency) * frequency) ** 2
-        residual = np.array(self.modal.frequency) - frequency
-        total -= 0.5 * np.sum(residual**2 / variance + np.log(2.0 * math.pi * variance), axis=1)
-        return total, frequency, damping
+        total = log_likelihood(self.tables.stiffness, self.static, quantities[:, 0]) + damping.log_likelihood
+        for place, prior in enumerate(self.priors[:3]):
+            total += log_normal(quantities[:, place], prior.mean, prior.deviation)
+        total += log_normal(reduced[:, 2], *self.total_mass)
+        spread = np.hypot(
+            self.modal.frequency_standard_deviation, np.array(self.model_error.frequency) * frequency
+        )
+        total += np.sum(log_normal(frequency, np.array(self.modal.frequency), spread), axis=1)
+        return total, damping
 
     def damping(self, frequency: FloatArray) -> DampingGiven:
         """Return the Gaussian of alpha and beta given frequencies (N, 2) [Hz] and the damping ratios."""
         omega = 2.0 * math.pi * frequency
         design = np.stack([0.5 / omega, 0.5 * omega], axis=2)  # (N, mode, coefficient)
-        alpha, beta = self.prior.damping_alpha, self.prior.damping_beta
-        centre = np.array([alpha.mean, beta.mean])
-        scale = np.array([alpha.standard_deviation, beta.standard_deviation])
+        centre = np.array([prior.mean for prior in self.priors[3:]])
+        scale = np.array([prior.deviation for prior in self.priors[3:]])
         # Coefficients in units of their prior: alpha and beta differ by four decades.
         design = design * scale
-        ratio, error = (
-            np.array(self.modal.damping_ratio),
-            np.array(self.modal.damping_ratio_standard_deviation),
-        )
+        ratio = np.array(self.modal.damping_ratio)
+        error = np.array(self.modal.damping_ratio_standard_deviation)
         across = np.swapaxes(design, 1, 2)
         variance = design @ across + np.diag(error**2)
         residual = ratio - design @ (centre / scale)
@@ -133,6 +134,13 @@ class JointDensity:
         misfit = np.sum(residual * solved, axis=1)
         determinant = np.linalg.slogdet(2.0 * math.pi * variance)[1]
         return DampingGiven(mean * scale, covariance * np.outer(scale, scale), -0.5 * (misfit + determinant))
+
+
+def log_normal(value: FloatArray, mean: FloatArray | float, deviation: FloatArray | float) -> FloatArray:
+    """Return the log density of a normal distribution, elementwise."""
+    return np.asarray(
+        -0.5 * ((value - mean) / deviation) ** 2 - np.log(deviation) - 0.5 * math.log(2.0 * math.pi)
+    )
 
 
 def masses_of(reduced: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial.chebyshev import chebvander
+from numpy.polynomial.chebyshev import chebval3d, chebvander3d
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.errors import OutsideValidityError, PosteriorError
@@ -63,12 +63,8 @@ class FrequencyTable:
                 "build one with a wider range."
             )
         scaled = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
-        shape = self.coefficient.shape
-        first, second, third = (chebvander(scaled[:, axis], shape[axis] - 1) for axis in range(3))
-        inner = (first @ self.coefficient.reshape(shape[0], -1)).reshape(-1, *shape[1:])
-        inner = np.einsum("nj,njkl->nkl", second, inner)
-        logarithm = np.einsum("nk,nkl->nl", third, inner)
-        return np.asarray(np.exp(logarithm))
+        first, second, third = scaled.T
+        return np.asarray(np.exp(chebval3d(first, second, third, self.coefficient)).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +81,14 @@ class WingTables:
 
     frequency: FrequencyTable
     stiffness: StiffnessCurve
+
+    @property
+    def validity(self) -> dict[str, tuple[float, float]]:
+        """Range of e and the masses in which the tables hold."""
+        return {
+            name: (low, high)
+            for name, (low, high) in zip(_NAMES, self.frequency.limits.tolist(), strict=True)
+        }
 
 
 def tabulate_wing(model: ReducedModel) -> WingTables:
@@ -116,12 +120,12 @@ def tabulate_frequencies(model: ReducedModel, tolerance: float = TOLERANCE) -> F
     error = np.inf
     for degrees in _DEGREES:
         nodes = [np.cos(np.pi * (np.arange(n + 1) + 0.5) / (n + 1)) for n in degrees]
-        grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1)
-        values = np.array([_frequencies(model, centre + half * point) for point in grid.reshape(-1, 3)])
-        coefficient = np.log(values).reshape(*grid.shape[:3], 2)
-        for axis, node in enumerate(nodes):
-            to_coefficients = np.linalg.inv(chebvander(node, degrees[axis]))
-            coefficient = np.moveaxis(np.tensordot(to_coefficients, coefficient, axes=(1, axis)), 0, axis)
+        grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+        values = np.array([_frequencies(model, centre + half * point) for point in grid])
+        first, second, third = grid.T
+        vandermonde = chebvander3d(first, second, third, degrees)
+        coefficient = np.linalg.solve(vandermonde, np.log(values))
+        coefficient = coefficient.reshape(*(degree + 1 for degree in degrees), 2)
         table = FrequencyTable(limits, coefficient, 0.0)
         error = float(np.abs(table.frequency(centre + half * checks) / exact - 1.0).max())
         if error <= tolerance:

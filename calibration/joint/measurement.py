@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.special import chdtri
 
 from calibration.dynamics.damped_cosine import DampedCosines, NaturalMode, natural_mode
@@ -203,17 +201,11 @@ def _refit(fit: RingDownFit, delay: float) -> NaturalMode | None:
     after = record.time >= record.time[0] + delay
     model = DampedCosines(record.time[after], record.signal[after], record.averaging_width)
     omega = 2.0 * math.pi * np.array([mode.damped_frequency for mode in fit.modes])
-    scale = np.concatenate([[mode.decay_rate for mode in fit.modes], omega])
-
-    def residual(unknown: NDArray[np.float64]) -> NDArray[np.float64]:
-        scaled = unknown * scale
-        return model.residual(scaled[:2], scaled[2:])
-
-    found = least_squares(residual, np.ones(4), method="lm", xtol=1e-12, ftol=1e-14, gtol=1e-14)
-    decay, damped = (found.x * scale)[[1, 3]].tolist()
+    found = model.fitted(np.array([mode.decay_rate for mode in fit.modes]), omega)
+    decay, damped = float(found.decay[1]), float(found.omega[1])
     if not (0.0 < decay < damped and abs(damped / omega[1] - 1.0) < _SAME_MODE):
         return None
-    solution = model.solve((found.x * scale)[:2], (found.x * scale)[2:], frequencies_fitted=True)
+    solution = model.solve(found.decay, found.omega, frequencies_fitted=True)
     if abs(solution.amplitude[1]) < _VISIBLE * solution.residual_deviation:
         return None
     return natural_mode(decay, damped, solution.covariance[np.ix_([1, 3], [1, 3])])

@@ -1,23 +1,33 @@
-"""What is known before the ring-down: priors of the five quantities, weighed masses, error of the model."""
+"""What is known of a wing before the ring-down: priors, weighed mass, error of the model."""
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
+from calibration.result.record import ParameterPrior
+from calibration.static.experiments import HALF_WIDTH_95
+from calibration.static.posterior import PRIOR_HALF_WIDTH
 
-from calibration.dynamics.masses_and_damping import TOTAL_MASS
-from calibration.errors import PosteriorError
-from calibration.static.posterior import GaussianPrior
-
-NAMES = ("young_modulus_factor", "servo_mass", "pitot_mass", "damping_alpha", "damping_beta")
-"""The quantities of the joint posterior: e [1], each servo [kg], the pitot tube [kg], [1/s], [s]."""
+TOTAL_MASS = 0.472
+"""Weighed mass of two servos and the pitot tube [kg] (Kapteyn et al. 2021, eqs. (19) and (20))."""
 
 DEFAULT_MODEL_ERROR = (0.01, 0.05)
 """Relative standard deviations of the model's first two flapwise frequencies about the wing's [1]."""
+
+_OURS = "our choice"
+_PRIORS = {
+    "young_modulus_factor": (
+        "1",
+        1.0,
+        PRIOR_HALF_WIDTH / HALF_WIDTH_95,
+        "the paper",
+        "factor on Young's modulus of the skin, e",
+    ),
+    "servo_mass": ("kg", TOTAL_MASS / 3.0, 0.05, _OURS, "mass of each servo"),
+    "pitot_mass": ("kg", TOTAL_MASS / 3.0, 0.10, _OURS, "mass of the pitot tube"),
+    "damping_alpha": ("1/s", 0.0, 3.0, _OURS, "mass-proportional Rayleigh damping, alpha"),
+    "damping_beta": ("s", 0.0, 1.5e-3, _OURS, "stiffness-proportional Rayleigh damping, beta"),
+}
+_DAMPING_RANGES = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
 
 
 class WeighedMass(NamedTuple):
@@ -41,73 +51,26 @@ class ModelError(NamedTuple):
     frequency: tuple[float, float] = DEFAULT_MODEL_ERROR
 
 
-@dataclass(frozen=True)
-class JointPrior:
-    """Independent Gaussian priors of the five quantities, cut off where the wing or its model ends.
+def wing_priors(
+    validity: Mapping[str, tuple[float, float]], **stated: tuple[float, float]
+) -> tuple[ParameterPrior, ...]:
+    """Return the priors of e, masses and damping for a model of this validity, in the order of `STATE`.
 
-    e and the masses are confined to the range of the model, the Rayleigh coefficients to positive values.
+    e is the paper's N(1, (0.05 / 1.96)^2). The others are weak: of the masses a third of the weighed total
+    each, with standard deviations of 50 and 100 g, which under the weighed total leave 30 g of uncertainty to
+    a servo; of the damping half Gaussians from zero, of scales 3 1/s and 1.5e-3 s, which alone would damp
+    mode 1 by 4 % and mode 2 by 14 %, twice what was measured. e and the masses are confined to the range of
+    the model.
 
-    Attributes
+    Parameters
     ----------
-    young_modulus_factor : GaussianPrior
-        e; the paper's N(1, (0.05 / 1.96)^2).
-    servo_mass, pitot_mass : GaussianPrior
-        Weak: a third of the weighed total each, with standard deviations of 50 and 100 g. Under the weighed
-        total they leave 30 g of uncertainty to a servo.
-    damping_alpha, damping_beta : GaussianPrior
-        Weak: half Gaussians from zero, of scales 3 1/s and 1.5e-3 s; these alone would damp mode 1 by 4 %
-        and mode 2 by 14 %, twice what was measured.
+    validity : mapping of str to (float, float)
+        Range of e and the masses.
+    **stated : (float, float)
+        Mean and standard deviation by name, in the place of these.
     """
-
-    young_modulus_factor: GaussianPrior = field(default_factory=GaussianPrior)
-    servo_mass: GaussianPrior = field(default_factory=lambda: GaussianPrior(TOTAL_MASS / 3.0, 0.05))
-    pitot_mass: GaussianPrior = field(default_factory=lambda: GaussianPrior(TOTAL_MASS / 3.0, 0.10))
-    damping_alpha: GaussianPrior = field(default_factory=lambda: GaussianPrior(0.0, 3.0))
-    damping_beta: GaussianPrior = field(default_factory=lambda: GaussianPrior(0.0, 1.5e-3))
-
-    @property
-    def marginals(self) -> tuple[GaussianPrior, ...]:
-        """The five Gaussians in the order of `NAMES`."""
-        return tuple(getattr(self, name) for name in NAMES)
-
-    def limits(self, validity: Mapping[str, tuple[float, float]]) -> NDArray[np.float64]:
-        """Return the (5, 2) limits of the quantities for a model of this validity."""
-        confined = [validity[name] for name in NAMES[:3]]
-        return np.array([*confined, (0.0, math.inf), (0.0, math.inf)])
-
-    def log_mass_inside(self, limits: NDArray[np.float64]) -> float:
-        """Return the log probability that the Gaussians give to the region within the limits.
-
-        Raises
-        ------
-        PosteriorError
-            If less than 1e-6 of a Gaussian lies there.
-        """
-        total = 0.0
-        for name, prior, (lower, upper) in zip(NAMES, self.marginals, limits.tolist(), strict=True):
-            inside = float(np.diff(_cumulative(prior, np.array([lower, upper])))[0])
-            if not inside > 1e-6:
-                raise PosteriorError(
-                    f"the prior of {name}, {prior.mean:g} ± {prior.standard_deviation:g}, lies outside "
-                    f"{lower:g} to {upper:g}, where the model holds; choose another prior or a wider model."
-                )
-            total += math.log(inside)
-        return total
-
-    def samples(
-        self, validity: Mapping[str, tuple[float, float]], generator: np.random.Generator, count: int
-    ) -> NDArray[np.float64]:
-        """Draw (count, 5) independent samples of `NAMES` in SI units, within the limits."""
-        limits = self.limits(validity)
-        self.log_mass_inside(limits)
-        probability = generator.random((count, len(NAMES)))
-        drawn = np.empty_like(probability)
-        for place, prior in enumerate(self.marginals):
-            lower, upper = _cumulative(prior, limits[place])
-            standard = ndtri(lower + (upper - lower) * probability[:, place])
-            drawn[:, place] = np.clip(prior.mean + prior.standard_deviation * standard, *limits[place])
-        return drawn
-
-
-def _cumulative(prior: GaussianPrior, value: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(ndtr((value - prior.mean) / prior.standard_deviation))
+    ranges = {**validity, **_DAMPING_RANGES}
+    return tuple(
+        ParameterPrior(name, unit, *stated.get(name, (mean, deviation)), *ranges[name], stated_by, title)
+        for name, (unit, mean, deviation, stated_by, title) in _PRIORS.items()
+    )

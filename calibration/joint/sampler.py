@@ -1,4 +1,4 @@
-"""Laplace's approximation and importance sampling of a smooth density of a few quantities."""
+"""Importance sampling of a smooth density of a few quantities."""
 
 import math
 from collections.abc import Callable
@@ -16,19 +16,9 @@ LogDensity = Callable[[FloatArray], FloatArray]
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student-t proposals: tails heavier than those of the posterior, which are cut-off Gaussians."""
 
-_NEWTON_STEPS = 50
-_DIFFERENCE = 1e-2  # step of the central differences, in rough standard deviations
 _TEMPERED_SHARE = 0.1
 _MOST_ROUNDS = 60
 _INFLATION = 1.15  # of the proposal's covariance over the posterior's
-
-
-class Laplace(NamedTuple):
-    """Mode (D,) and covariance (D, D) from second derivatives; `regular` is False at a cut-off."""
-
-    mode: FloatArray
-    covariance: FloatArray
-    regular: bool
 
 
 class StudentT(NamedTuple):
@@ -52,69 +42,20 @@ class StudentT(NamedTuple):
         return self.centre + standard @ factor.T, np.asarray(log_density)
 
 
-def laplace(log_density: LogDensity, start: FloatArray, scale: FloatArray) -> Laplace:
-    """Find the mode by Newton's method, and the Gaussian that fits there.
-
-    Parameters
-    ----------
-    log_density : callable
-        The density.
-    start : (D,) array
-        Where the search begins.
-    scale : (D,) array
-        Rough standard deviations: units of the search, and where the covariance is cut off if the mode lies
-        at the end of the region.
-    """
-    here = start
-    value = float(log_density(here[None, :])[0])
-    for _ in range(_NEWTON_STEPS):
-        slope, curvature = _derivatives(log_density, here, scale)
-        if not np.all(np.isfinite(curvature)):
-            return Laplace(here, np.diag(scale**2), False)  # at the end of the region
-        eigenvalue, direction = np.linalg.eigh(-curvature)
-        # Uphill also where the density is not yet concave, and not farther than three units.
-        step = direction @ ((direction.T @ slope) / np.maximum(np.abs(eigenvalue), 1e-3))
-        step *= min(1.0, 3.0 / max(float(np.linalg.norm(step)), 1e-300))
-        trials = here + scale * step * 0.5 ** np.arange(12.0)[:, None]
-        values = log_density(trials)
-        best = int(np.argmax(values))
-        if not values[best] > value:
-            break
-        gained, here, value = float(values[best]) - value, trials[best], float(values[best])
-        if gained < 1e-9:
-            break
-    curvature = _derivatives(log_density, here, scale)[1]
-    if np.all(np.isfinite(curvature)) and np.all(np.linalg.eigvalsh(-curvature) > 0.0):
-        return Laplace(here, np.linalg.inv(-curvature) * np.outer(scale, scale), True)
-    return Laplace(here, np.diag(scale**2), False)
-
-
-def _derivatives(
-    log_density: LogDensity, centre: FloatArray, scale: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return first (D,) and second (D, D) central differences in units of `scale`."""
-    size = centre.size
-    unit = _DIFFERENCE * np.eye(size)
-    signs = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
-    shifts = [a * unit[i] + b * unit[j] for i in range(size) for j in range(size) for a, b in signs]
-    values = log_density(centre + scale * np.array([*unit, *-unit, *shifts]))
-    if not np.all(np.isfinite(values)):
-        return np.full(size, np.nan), np.full((size, size), np.nan)
-    slope = (values[:size] - values[size : 2 * size]) / (2.0 * _DIFFERENCE)
-    corner = values[2 * size :].reshape(size, size, 4)
-    return slope, (corner @ np.array([1.0, -1.0, -1.0, 1.0])) / (4.0 * _DIFFERENCE**2)
-
-
 def adapted_proposal(
-    log_density: LogDensity, start: Laplace, generator: np.random.Generator, *, rounds: int, count: int
+    log_density: LogDensity,
+    start: StudentT,
+    generator: np.random.Generator,
+    *,
+    rounds: int,
+    count: int,
 ) -> StudentT:
     """Return a proposal whose centre and scale follow the density, by rounds of weighted draws.
 
-    Where the draws of a round say too little of the density (its mode may lie at the end of the region, where
-    Laplace's approximation is none), their weights are tempered, w^g with g < 1, so that a tenth of them
-    counts; the next round then begins closer.
+    Where the draws of a round say too little of the density, their weights are tempered, w^g with g < 1, so
+    that a tenth of them counts; the next round then begins closer.
     """
-    centre, covariance = start.mode, start.covariance
+    centre, covariance = start
     least = _TEMPERED_SHARE * count
     good = 0
     for _ in range(_MOST_ROUNDS):

@@ -86,8 +86,6 @@ class ScalarPosterior:
         Ascending values of the unknown.
     density : (N,) array
         Density there, not negative; it is scaled to integrate to one.
-    unit : str
-        Unit of `grid` ("1" if dimensionless).
     mean, standard_deviation : float
         Of this density, unless given (a particle filter gives those of its particles).
 
@@ -99,7 +97,6 @@ class ScalarPosterior:
 
     grid: NDArray[np.float64]
     density: NDArray[np.float64]
-    unit: str = "1"
     mean: float = math.nan
     standard_deviation: float = math.nan
     _cumulative: NDArray[np.float64] = field(init=False, repr=False)

@@ -1,6 +1,7 @@
 """How well one stiffness explains the measured pairs, run by run."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,7 +18,7 @@ NOTICEABLE_SCORE = 2.0
 
 @dataclass(frozen=True)
 class RunFit:
-    """One loading run against the calibrated stiffness, and on its own.
+    """One loading run against the calibrated stiffness.
 
     Attributes
     ----------
@@ -27,17 +28,12 @@ class RunFit:
         Number of its pairs.
     offset, offset_standard_deviation : float
         Mean of x - f / k over the run at the calibrated stiffness k, and its standard deviation [m].
-    line_intercept, line_stiffness : float or None
-        Least-squares line x = intercept + f / stiffness through the run alone [m], [N/m]; None if its
-        loads are all equal.
     """
 
     run: int
     count: int
     offset: float
     offset_standard_deviation: float
-    line_intercept: float | None
-    line_stiffness: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +85,11 @@ def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
     standardised = residual * stiffness / scatter
     chi_square = float(np.sum(standardised**2))
     degrees = data.count - 1
-    runs = tuple(_fit_run(data, index, stiffness, scatter) for index in data.run_indices)
+    runs = []
+    for index in data.run_indices:
+        of_run = residual[data.run == index]
+        error = scatter / stiffness / math.sqrt(of_run.size)
+        runs.append(RunFit(index, of_run.size, float(of_run.mean()), error))
     return FitQuality(
         stiffness=stiffness,
         displacement_residual=residual,
@@ -97,32 +97,13 @@ def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
         chi_square=chi_square,
         degrees_of_freedom=degrees,
         tail_probability=float(gammaincc(0.5 * degrees, 0.5 * chi_square)) if degrees else math.nan,
-        runs=runs,
+        runs=tuple(runs),
         remarks=tuple(_remarks(data, standardised, runs)),
     )
 
 
-def _fit_run(data: LoadDisplacementData, index: int, stiffness: float, scatter: float) -> RunFit:
-    of_run = data.run == index
-    load, displacement = data.load[of_run], data.displacement[of_run]
-    intercept = line_stiffness = None
-    if np.ptp(load) > 0.0:
-        centred = load - load.mean()
-        flexibility = float(np.dot(centred, displacement) / np.dot(centred, centred))
-        intercept = float(displacement.mean() - flexibility * load.mean())
-        line_stiffness = 1.0 / flexibility if flexibility > 0.0 else None
-    return RunFit(
-        run=index,
-        count=int(load.size),
-        offset=float(np.mean(displacement - load / stiffness)),
-        offset_standard_deviation=scatter / stiffness / math.sqrt(load.size),
-        line_intercept=intercept,
-        line_stiffness=line_stiffness,
-    )
-
-
 def _remarks(
-    data: LoadDisplacementData, standardised: NDArray[np.float64], runs: tuple[RunFit, ...]
+    data: LoadDisplacementData, standardised: NDArray[np.float64], runs: Sequence[RunFit]
 ) -> list[str]:
     remarks = []
     for first, second in pairwise(runs):

@@ -1,17 +1,16 @@
-"""What of the measurements the calibrated wing does not meet, and by how much."""
+"""What of the measurements the calibrated wing does not meet, a sentence each."""
 
-import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, AmplitudePoint, amplitude_dependence
+from calibration.result.record import Calibration
+from calibration.result.text import with_deviation
 from calibration.static.experiments import published_measurements
+from calibration.static.quality import FitQuality
 
-from .steps import Update
-from .table_1 import SHOWN, printed
-from .three_steps import WingCalibration
+from .lab_data import LabData
 
 NOTICEABLE = 2.0
 """Standard deviations from which a difference is pointed out."""
@@ -23,87 +22,40 @@ AUTHORS_SECOND_FREQUENCY = 28.613
 """Mean of the authors' model's second flapwise frequency after their calibration [Hz] (step 3)."""
 
 
-class Miss(NamedTuple):
-    """A measured quantity of interest beside the calibrated model.
-
-    Attributes
-    ----------
-    name : str
-        Quantity of interest.
-    measured, model : (float, float)
-        Mean and standard deviation, SI.
-    relative : float
-        Model over measured, less one [1].
-    score : float
-        Difference over the standard deviations of both, added in quadrature [1].
-    """
-
-    name: str
-    measured: tuple[float, float]
-    model: tuple[float, float]
-    relative: float
-    score: float
-
-    @property
-    def noticeable(self) -> bool:
-        """Whether the difference is more than chance, or that of a frequency more than two percent."""
-        far = self.name.startswith("frequency") and abs(self.relative) > NOTICEABLE_FREQUENCY
-        return abs(self.score) > NOTICEABLE or far
-
-
-def misses(calibration: WingCalibration) -> tuple[Miss, ...]:
-    """Return every measured quantity of interest beside the calibrated model."""
-    result = calibration.result
-    return tuple(
-        _miss(update)
-        for step in (result.step(2), result.step(3))
-        for update in step.quantities
-        if update.measured is not None
-    )
-
-
-def _miss(update: Update) -> Miss:
-    measured, spread = update.measured or 0.0, update.measured_standard_deviation or 0.0
-    difference = update.posterior_mean - measured
-    return Miss(
-        update.name,
-        (measured, spread),
-        (update.posterior_mean, update.posterior_standard_deviation),
-        difference / measured,
-        difference / math.hypot(spread, update.posterior_standard_deviation),
-    )
-
-
-def disagreements(calibration: WingCalibration) -> list[str]:
+def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> list[str]:
     """Return sentences on what disagrees with the data; empty where nothing does."""
     found = []
-    for miss in misses(calibration):
-        if miss.noticeable:
-            shown = SHOWN[miss.name]
-            authors = ""
-            if miss.name == "frequency_2" and _is_the_papers_wing(calibration):
-                authors = (
-                    f" The authors' own model, too, has {AUTHORS_SECOND_FREQUENCY:.2f} Hz after its "
-                    "calibration, 4.5 % below what they measured."
-                )
-            found.append(
-                f"{shown.title}: measured {printed(miss.name, *miss.measured)} "
-                f"{shown.unit}, calibrated model {printed(miss.name, *miss.model)} {shown.unit}, "
-                f"{_percent(miss.relative)} off ({abs(miss.score):.1f} standard deviations).{authors}"
+    the_papers = lab.pairs.sha256 == published_measurements().sha256
+    figures = {figure.name: figure for figure in result.figures}
+    for reading in result.readings:
+        name, figure = reading.name, figures[reading.name]
+        relative = result.mean(name) / reading.value - 1.0
+        far = name.startswith("frequency") and abs(relative) > NOTICEABLE_FREQUENCY
+        if not far and abs(result.score(reading)) <= NOTICEABLE:
+            continue
+        unit = "" if figure.unit == "1" else f" {figure.unit}"
+        model = with_deviation(result.mean(name), result.standard_deviation(name))
+        found.append(
+            f"{figure.title[0].upper()}{figure.title[1:]}: measured "
+            f"{with_deviation(reading.value, reading.deviation)}{unit}, calibrated model {model}{unit}, "
+            f"{_percent(relative)} off ({abs(result.score(reading)):.1f} standard deviations)."
+        )
+        if name == "frequency_2" and the_papers:
+            found[-1] += (
+                f" The authors' own model, too, has {AUTHORS_SECOND_FREQUENCY:.2f} Hz after its calibration, "
+                "4.5 % below what they measured."
             )
-    found += calibration.static.quality.remarks
-    found += _of_the_ring_down(calibration)
-    return found
+    return found + list(quality.remarks) + _of_the_ring_down(lab, the_papers=the_papers)
 
 
-def _of_the_ring_down(calibration: WingCalibration) -> list[str]:
-    trials = calibration.lab.trials
+def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
+    trials = lab.trials
     if trials is None:
         return []
     found = []
     second = trials.damping_ratio(1).mean
     published = PUBLISHED_DAMPING_RATIOS[1]
-    if _is_the_papers_wing(calibration) and abs(second / published - 1.0) > 0.1:
+    if the_papers and abs(second / published - 1.0) > 0.1:
         found.append(
             f"The damping ratio of the second mode is {100 * second:.2f} % in these records and "
             f"{100 * published:.2f} % in the paper ({_percent(second / published - 1.0)}); it depends on "
@@ -127,10 +79,6 @@ def _of_the_ring_down(calibration: WingCalibration) -> list[str]:
                 f"{damping[1]:.1f} % at {1e3 * _amplitude(small):.2g} mV. The linear model has one frequency."
             )
     return found
-
-
-def _is_the_papers_wing(calibration: WingCalibration) -> bool:
-    return calibration.lab.pairs.sha256 == published_measurements().sha256
 
 
 def _amplitude(points: Sequence[AmplitudePoint]) -> float:

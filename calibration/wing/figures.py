@@ -1,4 +1,4 @@
-"""Figures of the calibration of a wing as a whole: correlations, quantities of interest, mode shapes."""
+"""Mode shapes of a calibrated wing."""
 
 from collections.abc import Sequence
 
@@ -6,94 +6,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from scipy.stats import gaussian_kde
 
-from calibration.static.experiments import HALF_WIDTH_95
 from fe.reduction.fields import WingFields
 from fe.runtime.reduced import Modes
-from reporting.figures import (
-    BAND_OPACITY,
-    LEVELS,
-    OBSERVED,
-    PAST,
-    REFERENCE,
-    new_figure,
-    panel_label,
-    publication_style,
-)
-
-from .result import CalibrationResult, measured_quantities
-from .table_1 import SHOWN
+from reporting.figures import LEVELS, new_figure, publication_style
 
 Float = NDArray[np.float64]
 
-AXIS_TITLES = {
-    "young_modulus_factor": "$e$",
-    "servo_mass": "servo (g)",
-    "pitot_mass": "pitot tube (g)",
-    "damping_alpha": r"$\alpha$ (1/s)",
-    "damping_beta": r"$\beta$ (ms)",
-    "tip_stiffness": "tip stiffness (N/mm)",
-    "frequency_1": "$f_1$ (Hz)",
-    "frequency_2": "$f_2$ (Hz)",
-    "damping_ratio_1": r"$\zeta_1$ (%)",
-    "damping_ratio_2": r"$\zeta_2$ (%)",
-}
 _FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
-
-
-def quantities_figure(result: CalibrationResult) -> Figure:
-    """Draw stiffness, frequencies and damping ratios before and after, with what was measured."""
-    measured = measured_quantities(result.modal)
-    stiffness = result.step(2).quantities[0]
-    if stiffness.measured is not None and stiffness.measured_standard_deviation is not None:
-        measured["tip_stiffness"] = stiffness.measured, stiffness.measured_standard_deviation
-    names = ("tip_stiffness", "frequency_1", "frequency_2", "damping_ratio_1", "damping_ratio_2")
-    with publication_style():
-        figure = new_figure(height=3.6)
-        grid = figure.add_gridspec(
-            2, 3, wspace=0.14, hspace=0.62, left=0.02, right=0.985, bottom=0.12, top=0.93
-        )
-        places = (grid[0, 0], grid[0, 1], grid[0, 2], grid[1, 1], grid[1, 2])
-        for label, name, place in zip("abcde", names, places, strict=True):
-            axes = figure.add_subplot(place)
-            _draw_quantity(axes, result, name, measured[name])
-            panel_label(axes, label, "")
-        handles = figure.axes[0].get_legend_handles_labels()
-        figure.legend(*handles, loc="upper left", bbox_to_anchor=(0.03, 0.42))
-    return figure
-
-
-def _draw_quantity(axes: Axes, result: CalibrationResult, name: str, measured: tuple[float, float]) -> None:
-    scale = SHOWN[name].scale
-    prior, posterior = result.draws_of(name, prior=True) * scale, result.draws_of(name) * scale
-    value, half = measured[0] * scale, HALF_WIDTH_95 * measured[1] * scale
-    spread = max(float(posterior.std()), 1e-6 * abs(float(posterior.mean())))
-    low = max(min(float(posterior.mean()) - 4.5 * spread, value - 1.6 * half), 0.0)
-    high = max(float(posterior.mean()) + 4.5 * spread, value + 1.6 * half)
-    grid = np.linspace(low, high, 301)
-    axes.axvspan(
-        value - half, value + half, color=OBSERVED, alpha=BAND_OPACITY, lw=0.0, label="measured, 95 %"
-    )
-    axes.axvline(value, color=OBSERVED, lw=0.9)
-    before = gaussian_kde(prior)(grid)
-    after = gaussian_kde(posterior)(grid) if posterior.std() > 1e-9 * abs(posterior.mean()) else None
-    top = float(before.max())
-    if after is not None:
-        top = float(after.max())
-        axes.fill_between(grid, after, color=PAST, alpha=BAND_OPACITY, lw=0.0)
-        axes.plot(grid, after, color=PAST, lw=1.3, label="after the calibration")
-    else:
-        axes.axvline(float(posterior.mean()), color=PAST, lw=1.3, label="after the calibration")
-    axes.plot(grid, before, color=REFERENCE, lw=1.2, ls="--", label="before")
-    axes.set_xlim(low, high)
-    axes.set_ylim(0.0, 1.12 * top)
-    axes.set_yticks([])
-    axes.spines["left"].set_visible(False)
-    axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.set_xlabel(AXIS_TITLES[name], parse_math=True)
 
 
 def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Figure:

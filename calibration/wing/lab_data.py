@@ -5,15 +5,14 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from calibration.dynamics.extremes import refine_by_extremes
-from calibration.dynamics.masses_and_damping import DynamicCalibration
-from calibration.dynamics.published import RESULTS_FILE, read_published_results
 from calibration.dynamics.records import STEP_FOLDER, find_records, read_records
 from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import RingDownTrials, fit_trials
 from calibration.errors import ExperimentFileError
 from calibration.geometry import GEOMETRY_FILE, GeometryCalibration, published_lengths, read_lengths
-from calibration.joint import WeighedMass
+from calibration.joint.prior import WeighedMass
 from calibration.lab_folder import places_of
+from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
 from calibration.static.experiments import (
     MEASUREMENTS_FILE,
     LoadDisplacementData,
@@ -50,7 +49,7 @@ class LabData:
         Weighed mass of two servos and the pitot tube.
     trials : RingDownTrials or None
         Step 3, fitted; None where the published frequencies and damping ratios stand in.
-    authors : DynamicCalibration or None
+    authors : PaperSamples or None
         The authors' own results of step 3, to be drawn beside ours.
     origins : tuple of StepOrigin
         Where the figures of each step come from.
@@ -62,7 +61,7 @@ class LabData:
     pairs: LoadDisplacementData
     total_mass: WeighedMass
     trials: RingDownTrials | None
-    authors: DynamicCalibration | None
+    authors: PaperSamples | None
     origins: tuple[StepOrigin, ...]
     input_hashes: dict[str, str]
 
@@ -181,7 +180,7 @@ def _weighed(path: Path) -> WeighedMass | None:
     return None if file is None else read_weighed_mass(file.parents[1])
 
 
-def _authors(path: Path) -> DynamicCalibration | None:
+def _authors(path: Path) -> PaperSamples | None:
     places = places_of(path, STEP_FOLDER / RESULTS_FILE)
     file = next((place for place in places if place.is_file()), None)
     return None if file is None else read_published_results(file)

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from calibration.errors import CalibrationError
-from calibration.wing.result import STATE
-from calibration.wing.result_file import load_calibration
+from calibration.joint.prior import wing_priors
+from calibration.result.file import load_calibration
+from calibration.result.record import STATE
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import ModelParameter
 from discrepancy.models.structural import StructuralModel
@@ -28,7 +29,6 @@ SHIPPED_PRIOR = {
 }
 """Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e of the
 paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
-DAMPING_LIMITS = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
 
 
 class WingModel(StructuralModel):
@@ -42,7 +42,7 @@ class WingModel(StructuralModel):
         For people.
     prior : mapping of str to (float, float)
         Mean and standard deviation of the calibrated parameters, by the names of
-        `calibration.wing.result.STATE`.
+        `calibration.result.record.STATE`.
 
     Notes
     -----
@@ -56,9 +56,9 @@ class WingModel(StructuralModel):
         self.wing = PatchedWing(arrays)
         prior = prior or SHIPPED_PRIOR
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
-        limits = {key: (low, high) for key, (low, high) in box.items()} | DAMPING_LIMITS
         parameters = tuple(
-            ModelParameter(item.name, *prior[item.name], item.unit, *limits[item.name]) for item in STATE
+            ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
+            for item in wing_priors(box, **prior)
         )
         super().__init__(WingStructure(self.wing), name, parameters)
 
@@ -92,11 +92,8 @@ class WingModel(StructuralModel):
             If the calibration cannot be read, or its wing not be modelled.
         """
         try:
-            result = load_calibration(Path(path))
-            prior = {
-                item.name: (float(np.mean(column)), float(np.std(column)))
-                for item, column in zip(STATE, result.samples.T, strict=True)
-            }
-            return cls(patch_arrays(result.design, progress), result.asset, prior)
+            result = load_calibration(path)
+            prior = {name: (result.mean(name), float(np.std(result.draws_of(name)))) for name in STATE}
+            return cls(patch_arrays(result.wing_design, progress), result.asset, prior)
         except (FiniteElementError, CalibrationError, OSError) as cause:
             raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause

@@ -4,9 +4,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
 
-from calibration.parameters.result import ChannelFit, ParameterCalibration, ParameterPrior
+from calibration.result.record import Calibration, ChannelFit, ParameterPrior, prior_samples
 from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, ModelError
@@ -32,7 +31,7 @@ def calibrate_parameters(
     samples: int = SAMPLES,
     seed: int = 0,
     progress: Progress | None = None,
-) -> ParameterCalibration:
+) -> Calibration:
     """Return the posterior of a model's parameters under a campaign, nothing being missing of the model.
 
     Trials that the campaign marks as held out are not fitted; their residuals are told.
@@ -78,7 +77,7 @@ def calibrate_parameters(
         posterior = parameter_posterior(problem, samples, seed)
     gate = absolute_gate(problem, posterior.optima[0])
     hashes = {"campaign": campaign.data_hash, "model": choice.source_hash}
-    return ParameterCalibration(
+    return Calibration(
         asset=campaign.name if asset is None else asset,
         model=model.name,
         model_hash=choice.source_hash,
@@ -127,18 +126,6 @@ def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPri
             "mean, deviation, low and high in its file."
         )
     return tuple(found)
-
-
-def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> FloatArray:
-    """Return samples (count, P) of the priors, cut off at the ranges, one from each of as many strata."""
-    generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
-    columns = []
-    for prior in priors:
-        low, high = (ndtr((end - prior.mean) / prior.deviation) for end in (prior.low, prior.high))
-        strata = generator.permutation((np.arange(count) + generator.random(count)) / count)
-        u = ndtri(low + (high - low) * strata)
-        columns.append(np.clip(prior.mean + prior.deviation * u, prior.low, prior.high))
-    return np.column_stack(columns)
 
 
 def _channels(problem: Problem, posterior: ParameterPosterior) -> tuple[ChannelFit, ...]:

@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import truncnorm
 
-from calibration.parameters.result import ParameterPrior
-from calibration.samples.moments import correlation
+from calibration.result.record import ParameterPrior, correlation
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.observability import LEFT
 from discrepancy.parameters.posterior import ParameterPosterior

@@ -8,7 +8,7 @@ from scipy.interpolate import Akima1DInterpolator
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
-from calibration.parameters.result import Procedure
+from calibration.result.record import Procedure
 from discrepancy.errors import FitError, ModelError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem

@@ -15,8 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.reading import load_calibration
-from calibration.wing.result import CalibrationResult
+from calibration.result.file import load_calibration
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.models.interface import Model
@@ -219,7 +218,7 @@ def is_calibrated_wing(folder: Path) -> bool:
     if not file.is_file():
         return False
     try:
-        return isinstance(load_calibration(file), CalibrationResult)
+        return load_calibration(file).design is not None
     except CalibrationError:  # said where it is used
         return True
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.dynamics.published import RESULTS_FILE, read_published_results
 from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.paper.procedure import RESULTS_FILE, read_published_results
 from calibration.published_strains import FILE_NAME, read_published_strains
 
 FloatArray = NDArray[np.float64]
@@ -179,20 +179,21 @@ def read_targets(data: Path | str) -> Targets:
         raise ExperimentDataError(f"{strain_file} holds {strain.shape[2]} gauges; at least 17 are expected.")
     slope = strain_slopes(library.young_modulus_factor, library.strain_per_draw[:, 0, 0, control])
     published = read_published_results(results_file)
-    fitted = np.arange(len(published.servo_mass)) % 2 == 0
+    factor, servo, pitot = published.samples.T[:3]
+    fitted = np.arange(len(servo)) % 2 == 0
     if fitted.sum() < MODAL_TERMS + 1:
         raise ExperimentDataError(
             f"{results_file} holds {len(fitted)} rows; at least {2 * MODAL_TERMS + 2} are needed for slopes."
         )
-    rows = published.young_modulus_factor, published.pitot_mass, published.frequency
+    rows = factor, pitot, published.frequency
     level, frequency_slope, mass_slope = frequency_slopes(*(column[fitted] for column in rows))
     every = frequency_slopes(*rows)
     return Targets(
         strain=strain,
         strain_slope=slope,
-        young_modulus_factor=published.young_modulus_factor,
-        servo_mass=published.servo_mass,
-        pitot_mass=published.pitot_mass,
+        young_modulus_factor=factor,
+        servo_mass=servo,
+        pitot_mass=pitot,
         frequency=published.frequency,
         fitted_row=fitted,
         frequency_at_one=level,

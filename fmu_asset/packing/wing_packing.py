@@ -16,7 +16,7 @@ from .structure_fmu import FmuOptions, build_fmu
 
 
 class Tailoring(Protocol):
-    """What an FMU takes of the calibration of a wing; `calibration.wing.wing_record` makes it."""
+    """What an FMU takes of the calibration of a wing; `calibration.result.plain` makes it."""
 
     @property
     def state(self) -> DigitalState:

@@ -53,7 +53,7 @@ def test_posterior_lies_between_and_is_narrower(
     low, high = sorted((length.designed, length.measured))
     assert low - 1e-12 <= length.posterior.mean <= high + 1e-12
     assert length.posterior.standard_deviation <= min(tolerance, reading) / 1.96 * (1.0 + 1e-12)
-    assert 0.0 <= length.uncertainty_reduction < 1.0
+    assert length.posterior.standard_deviation <= length.prior.standard_deviation
 
 
 def test_the_published_file_gives_the_published_figures() -> None:

@@ -14,7 +14,7 @@ from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import published_lengths, read_lengths
-from calibration.joint import WeighedMass
+from calibration.joint.prior import WeighedMass
 from calibration.static.experiments import published_measurements, read_measurements
 from calibration.virtual_wing import (
     RECORDED_GAUGE,

@@ -51,9 +51,7 @@ def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert simulate(monkeypatch, tmp_path / "again", *given) == 0
     for file in sorted(path for path in out.rglob("*") if path.is_file()):
         assert file.read_bytes() == (tmp_path / "again" / file.relative_to(out)).read_bytes()
-    # the readers of the command line take it
-    assert call(monkeypatch, "calibrate", "static", "--data", out) == 0
-    assert call(monkeypatch, "calibrate", "geometry", "--data", out) == 0
+    # a reader of the command line takes it
     assert call(monkeypatch, "calibrate", "ringdown", "--data", out, "--fitted") == 0
 
 

@@ -21,11 +21,11 @@ from fmpy import read_model_description
 from fmpy.validation import validate_fmu
 
 from calibration.geometry import published_lengths
-from calibration.joint import WeighedMass
+from calibration.joint.prior import WeighedMass
+from calibration.result.file import load_calibration
+from calibration.result.record import STATE, Calibration
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
 from calibration.wing.laboratory import write_lab_folder
-from calibration.wing.result import STATE, CalibrationResult
-from calibration.wing.result_file import load_calibration
 from fe.full.operators import assemble
 from fe.full.statics import solve_static
 from fe.reduction.model_cache import reduced_model
@@ -65,7 +65,7 @@ class Tailored:
     lab: Path
 
     @cached_property
-    def calibrated(self) -> tuple[Path, CalibrationResult, str]:
+    def calibrated(self) -> tuple[Path, Calibration, str]:
         """Where its calibration was left, what it found, and what it said; the soft one has a report."""
         out = self.lab.with_name("out")
         with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as said:
@@ -80,7 +80,7 @@ class Tailored:
         return self.calibrated[0]
 
     @property
-    def result(self) -> CalibrationResult:
+    def result(self) -> Calibration:
         return self.calibrated[1]
 
 
@@ -108,8 +108,8 @@ def test_the_truth_lies_in_the_posterior(wings: dict[str, Tailored], wing: Reduc
     assert made.result.asset == name
     assert made.result.design_hash == wing.design_hash  # published lengths: nothing was built anew
     for entry in STATE:
-        off = made.result.mean(entry.name) - getattr(made.truth, entry.name)
-        assert abs(off) < 4.0 * made.result.standard_deviation(entry.name), (name, entry.name)
+        off = made.result.mean(entry) - getattr(made.truth, entry)
+        assert abs(off) < 4.0 * made.result.standard_deviation(entry), (name, entry)
     mass = 2.0 * made.result.samples[:, 1] + made.result.samples[:, 2]
     weighed = 2.0 * made.truth.servo_mass + made.truth.pitot_mass
     np.testing.assert_allclose(mass, weighed, atol=6e-3)
@@ -123,18 +123,44 @@ def test_wings_are_told_apart(wings: dict[str, Tailored]) -> None:
     assert stiff.mean("damping_ratio_2") > soft.mean("damping_ratio_2")
 
 
+def test_the_published_figures_give_table_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    assert call(monkeypatch, "calibrate") == 0
+    rows = {line.split("  ")[0].strip(): line for line in capsys.readouterr().out.splitlines() if "±" in line}
+    table = {name: re.findall(r"[−+]?[\d.]+", line.replace(name, "", 1)) for name, line in rows.items()}
+    assert table["modulus factor e"][4:8] == ["1.0073", "0.0103", "1.0073", "0.0103"]  # procedure and paper
+    for name, near in (
+        ("servo mass, g", 1.0),
+        ("pitot mass, g", 2.0),
+        ("alpha, 1/s", 0.01),
+        ("beta, ms", 0.01),
+    ):
+        assert float(table[name][4]) == pytest.approx(float(table[name][6]), abs=near)
+    for name, length in (
+        ("semi-span, mm", "1828.00"),
+        ("root chord, mm", "433.00"),
+        ("tip chord, mm", "260.00"),
+    ):
+        assert table[name][6] == length
+
+
 def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
     made = wings["soft"]
     names = {path.relative_to(made.out).as_posix() for path in made.out.rglob("*") if path.is_file()}
-    figures = ("load_test", "masses", "modes", "posterior", "quantities", "residuals", "ring_down")
+    figures = (
+        "load_test", "modes", "posterior", "prior_and_posterior", "procedure", "readings", "residuals",
+        "ring_down",
+    )  # fmt: skip
     assert names == {
         "calibration.nc", "report.html", "table_1.csv", "wing.vtu", "modes.vtu",
         *(f"figures/{name}.{kind}" for name in figures for kind in ("svg", "png")),
     }  # fmt: skip
     page = (made.out / "report.html").read_text(encoding="utf-8")
     assert "Calibration of soft" in page
-    assert "What disagrees with the data" in page
-    assert "http" not in page.replace("http://www.w3.org", "")  # nothing is fetched
+    assert "This calibration beside Table 1 of the paper" in page
+    assert not re.search(r"https?://", page.replace("http://www.w3.org", ""))  # nothing is fetched
     assert str(made.out) not in page
     for word in (
         "Step 1: step1/geometry_data.csv read",
@@ -143,14 +169,15 @@ def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
         "Report:",
     ):
         assert word in made.calibrated[2]
-    assert [step.number for step in made.result.steps] == [1, 2, 3, 3]
-    for step in made.result.steps:
-        assert step.reward.posterior_error is not None
-        assert 0.0 < step.reward.uncertainty_reduction < 1.0
-    joint, paper = made.result.steps[2:]
-    assert joint.reward.information_gain is not None
-    assert joint.reward.information_gain > 0.0
-    assert paper.reward.information_gain is None
+    result = made.result
+    assert [reading.experiment for reading in result.readings] == [
+        *["planform"] * 3, "load test", "weighing", *["ring-down"] * 4,
+    ]  # fmt: skip
+    for experiment in ("load test", "weighing", "ring-down"):
+        assert result.error(experiment, prior=True) - 0.2 < result.error(experiment) <= 0.0
+    assert result.information is not None
+    assert result.information > 5.0
+    assert result.mean("semi_span") == pytest.approx(1.828005, abs=1e-6)
 
 
 @pytest.mark.long
@@ -356,7 +383,7 @@ def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(
     assert lines[0] == "Step 1: not measured; published lengths (Kapteyn et al. 2021, Table 1)."
     assert lines[1] == "Step 2: step2/load_displacement_measurements.csv read, 8 pairs."
     assert lines[2].startswith("Step 3: published frequencies and damping ratios")
-    assert lines[3] == "UAV wing, paper, 100 samples"
+    assert "modulus factor e" in captured.out
     assert "No space is left on the disk" in captured.err
     assert [path.name for path in tmp_path.iterdir()] == ["lab"]
 
@@ -372,7 +399,7 @@ def test_records_may_be_left_aside(
     out = capsys.readouterr().out
     assert "Nothing was written" in out.splitlines()[-1]
     assert "Step 3: records left aside as asked; published" in out
-    assert re.search(r"f1 +5\.649\s", out)
+    assert re.search(r"frequency_1 +Hz +5\.649 ±", out)
 
 
 def measured_planform(folder: Path, semi_span: float) -> Path:
@@ -402,8 +429,7 @@ def test_the_model_follows_the_measured_planform(
     assert result.mean_state().geometry.semi_span == 1.8181
     model = reduced_model(result.design)
     assert model.design_hash == result.design_hash
-    (stiffness,) = result.step(2).quantities
-    assert stiffness.prior_mean == pytest.approx(model.tip_stiffness(1.0), rel=1e-3)
+    assert result.prior_moments("tip_stiffness")[0] == pytest.approx(model.tip_stiffness(1.0), rel=1e-3)
     # against the full model of the wing as drawn, by the beam's k ~ 1 / L^3
     drawn = solve_static(assemble(load_design(coarse)), 1.0, load_factor=0.0, tip_force=1.0)
     expected = (1.828 / 1.8181) ** 3 / drawn.load_point_displacement
@@ -539,8 +565,8 @@ def test_other_refusals(
         (["--measured"], "--measured needs --data", 2),
         (["--fitted"], "--fitted needs --data", 2),
         (["--procedure", "other"], "other", 2),
-        (["--seed", "1", "geometry"], "options go behind the command", 2),
-        (["--data", tmp_path, "static"], "options go behind the command", 2),
+        (["--seed", "1", "simulate"], "options go behind the command", 2),
+        (["--data", tmp_path, "ringdown"], "options go behind the command", 2),
     ):
         assert call(monkeypatch, "calibrate", *arguments) == code, arguments
         error = capsys.readouterr().err

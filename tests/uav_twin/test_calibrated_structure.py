@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from calibration.parameters.result import ParameterCalibration
-from calibration.reading import load_calibration
+from calibration.result.file import load_calibration
 from fe.full.statics import Factorisation
 from fe.structure.operators import load_and_assemble
 from fmu_asset.archive.fmu_file import packed_design_hash
@@ -94,7 +93,6 @@ def mission(**calibration: object) -> LoadedScenario:
 
 def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated: Path) -> None:
     found = load_calibration(calibrated)
-    assert isinstance(found, ParameterCalibration)
     assert abs(found.mean("e") - TRUTH["e"]) < 3.0 * found.standard_deviation("e") < 0.03
     assert found.explained is True
     assert any("does not tell pump" in sentence for sentence in found.findings)
@@ -103,7 +101,6 @@ def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated: Path) -> No
 def test_the_twin_flies_with_it(calibrated: Path, tmp_path: Path) -> None:
     """Its draws are those of the file; what flies stands at the means; the mass follows the modulus."""
     found = load_calibration(calibrated)
-    assert isinstance(found, ParameterCalibration)
     said: list[str] = []
     folder = new_run(
         mission(), tmp_path / "run", Overrides(calibration=calibrated), progress=_Noted(said)

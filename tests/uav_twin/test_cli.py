@@ -121,7 +121,7 @@ def test_errors_of_the_packages_are_one_sentence_and_1(
         (["fmu", "info", str(broken)], "broken.toml"),
         (["fmu", "check", str(tmp_path / "no.fmu")], "no.fmu"),
         (["wing", "--design", str(tmp_path / "no.toml")], "no.toml"),
-        (["calibrate", "static", "--data", str(tmp_path / "no.csv")], "no.csv"),
+        (["calibrate", "ringdown", "--data", str(tmp_path / "no.csv")], "no.csv"),
     ):
         assert call(monkeypatch, *arguments) == 1
         error = capsys.readouterr().err
@@ -154,13 +154,6 @@ def test_ctrl_c_says_how_to_go_on(
     )
     assert code == 130
     assert f"--resume {out}" in capsys.readouterr().err
-
-
-def test_calibrate_static(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(monkeypatch, "calibrate", "static") == 0
-    text = capsys.readouterr().out
-    assert "e, exact, mean" in text
-    assert "1.0073" in text or "1.007" in text
 
 
 def test_the_master_script_is_the_same_command(tmp_path: Path, library_file: Path) -> None:

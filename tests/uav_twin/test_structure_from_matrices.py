@@ -10,8 +10,7 @@ import pytest
 import xarray as xr
 from fmpy.validation import validate_fmu
 
-from calibration.parameters.result import ParameterCalibration
-from calibration.reading import load_calibration
+from calibration.result.file import load_calibration
 from fe.reduction.structure_errors import measured_errors
 from reporting.toml_file import parse_toml
 from tests import command_line
@@ -202,7 +201,6 @@ def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(file: Path, 
     done = command_line.command("calibrate", "campaign", lab, *words)
     assert done.returncode == 0, done.stderr
     found = load_calibration(tmp_path / "out" / "calibration.nc")
-    assert isinstance(found, ParameterCalibration)
     assert abs(found.mean("e") - 0.96) < 3.0 * found.standard_deviation("e") < 0.01
     words = ("--model", file, "--out", tmp_path / "verdict", "--no-report", "--json")
     done = command_line.command("discrepancy", "run", lab, *words)

@@ -268,11 +268,11 @@ class CoupledSource(SeveralSource):
         if component.design is None:
             return _given_fmu(component, target.parent)
         if component.design == CALIBRATED_DESIGN_NAME:
-            from calibration.wing.result_file import load_calibration
-            from calibration.wing.wing_record import tailoring
+            from calibration.result.file import load_calibration
+            from calibration.result.plain import tailoring
 
             wing = load_calibration(Path(self._scenario.calibration.file or ""))
-            pack_wing(wing.design, target, tailoring=tailoring(wing), replace=True, progress=progress)
+            pack_wing(wing.wing_design, target, tailoring=tailoring(wing), replace=True, progress=progress)
         else:
             design = load_design(component.design_path)
             pack_wing(design, target, replace=True, progress=progress)

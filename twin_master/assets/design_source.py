@@ -32,7 +32,7 @@ from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, BeliefSection
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
 
 if TYPE_CHECKING:
-    from calibration.wing.result import CalibrationResult
+    from calibration.result.record import Calibration
     from fe.runtime.reduced import ReducedModel
     from fe.wing.design import WingDesign
     from fmu_asset.door.binding import Binding
@@ -128,7 +128,7 @@ class _Wing:
         hashed = {"calibration": CALIBRATION_COPY, "patch": PATCH_COPY, "model_patch": MODEL_PATCH_COPY}
         return {name: hash_file(folder / copy) for name, copy in hashed.items() if copy in self.places}
 
-    def calibration(self) -> "CalibrationResult | None":
+    def calibration(self) -> "Calibration | None":
         """Return the calibration that the wing is tailored to; None for a design of its own.
 
         Raises
@@ -138,7 +138,7 @@ class _Wing:
         """
         if self._section.design != CALIBRATED_DESIGN_NAME:
             return None
-        from calibration.wing.result_file import load_calibration
+        from calibration.result.file import load_calibration
 
         if CALIBRATION_COPY not in self.places:
             raise MissionInputError("the design of a calibration is asked for, and there is no such file.")
@@ -156,7 +156,7 @@ class _Wing:
 
         calibration = self.calibration()
         if calibration is not None:
-            return calibration.design
+            return calibration.wing_design
         return load_design(self.places[self._section.copies()["design"]])
 
     @property
@@ -239,7 +239,7 @@ class WingFmuSource(FmuSource):
         self._wing = reduced_model(self._design, progress=progress)
         tailored = None
         if calibration is not None:
-            from calibration.wing.wing_record import tailoring  # takes a second to load
+            from calibration.result.plain import tailoring  # takes a second to load
 
             tailored = tailoring(calibration)
         with progress.stage("Packing the FMU"):

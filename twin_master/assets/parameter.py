@@ -14,7 +14,7 @@ from twin_master.scenario.schema import Calibration
 from twin_master.seeds import generator, seed_sequence
 
 if TYPE_CHECKING:
-    from calibration.parameters.result import ParameterCalibration
+    from calibration.result.record import Calibration as Calibrated
     from fe.runtime.reduced import ReducedModel
 
 Float = NDArray[np.float64]
@@ -107,32 +107,54 @@ def draw_parameter(
             "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
             "let the twin believe a `design`, or set `calibration.curve` to `published`."
         )
-    # A scenario can be read without any of this, and it takes a while to load.
-    from calibration.static.kept import static_record
-    from calibration.static.posterior import ScalarPosterior
-    from reporting.record_json import record_of
+    return _draws_of_load_test(calibration, seed, model if calibration.curve == "design" else None)
 
-    sequence = seed_sequence(seed, "calibration")
-    own = model if calibration.curve == "design" else None
-    record = static_record(own, int(sequence.generate_state(1)[0]))
-    found = record["exact"] if calibration.method == "exact" else record["particle"]["posterior"]
-    posterior = record_of(ScalarPosterior, found)
+
+def _draws_of_load_test(calibration: Calibration, seed: int, model: "ReducedModel | None") -> ParameterDraws:
+    """Return draws of e from the published load test, on the stiffness of a model or the published line."""
+    # A scenario can be read without any of this, and it takes a while to load.
+    from calibration.paper.load_test import push_forward
+    from calibration.paper.particle_filter import particle_filter
+    from calibration.static.errors_in_variables import exact_posterior
+    from calibration.static.experiments import published_measurements
+    from calibration.static.posterior import GaussianPrior
+    from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of
+    from reporting.record_json import plain
+
+    sequence, pairs = seed_sequence(seed, "calibration"), published_measurements()
+    curve = PUBLISHED_LINE if model is None else stiffness_curve_of(model)
+    if calibration.method == "exact":
+        posterior = exact_posterior(pairs, curve=curve)
+    else:
+        posterior = particle_filter(pairs, seed=int(sequence.generate_state(1)[0]), curve=curve).posterior
+    stiffness = push_forward(posterior, curve)
     return ParameterDraws(
         name=calibration.parameter,
         values=posterior.samples(sequence, calibration.draws, stratified=True),
         mean=posterior.mean,
         standard_deviation=posterior.standard_deviation,
-        source=(
-            f"static test of the wing, {calibration.method.replace('_', ' ')}, "
-            f"{record['stiffness_curve']['name']}"
-        ),
-        record=record,
+        source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {curve.name}",
+        record={
+            "parameter": calibration.parameter,
+            "prior": plain(GaussianPrior()),
+            "posterior": plain(posterior),
+            "tip_stiffness": {
+                "unit": "N/m",
+                "mean": stiffness.mean,
+                "standard_deviation": stiffness.standard_deviation,
+            },
+            "data": {
+                "source": pairs.source,
+                "load": pairs.load.tolist(),
+                "displacement": pairs.displacement.tolist(),
+            },
+        },
     )
 
 
 def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
-    from calibration.parameters.result import ParameterCalibration
-    from calibration.reading import load_calibration, run_record
+    from calibration.result.file import load_calibration
+    from calibration.result.plain import run_record
 
     name = calibration.parameter
     found = load_calibration(Path(calibration.file or ""))
@@ -142,9 +164,9 @@ def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
         values=values,
         mean=found.mean(name),
         standard_deviation=found.standard_deviation(name),
-        source=f"calibration of {found.asset}, {found.procedure}, {len(found.calibrated.samples)} samples",
+        source=f"calibration of {found.asset}, {found.procedure}, {len(found.samples)} samples",
         record=run_record(found, name),
-        others=found.given(name, values) if isinstance(found, ParameterCalibration) else {},
+        others=found.given(name, values) if found.design is None else {},
     )
 
 
@@ -158,7 +180,7 @@ def read_calibration(calibration: Calibration) -> None:
     """
     if calibration.file is None:
         return
-    from calibration.reading import load_calibration
+    from calibration.result.file import load_calibration
 
     load_calibration(Path(calibration.file)).draws_of(calibration.parameter)
 
@@ -226,11 +248,10 @@ def check_calibration(
 def is_of_parameters(file: Path | str) -> bool:
     """Return whether a file is the calibration of a model's parameters from a campaign; a wing's is not."""
     from calibration.errors import CalibrationRecordError
-    from calibration.parameters.result import ParameterCalibration
-    from calibration.reading import load_calibration
+    from calibration.result.file import load_calibration
 
     try:
-        return isinstance(load_calibration(file), ParameterCalibration)
+        return load_calibration(file).design is None
     except CalibrationRecordError:  # said where the file is used
         return False
 
@@ -241,12 +262,11 @@ def calibrated_means(calibration: Calibration) -> dict[str, float]:
     return {} if found is None else {prior.name: found.mean(prior.name) for prior in found.priors}
 
 
-def _parameters_in(calibration: Calibration) -> "ParameterCalibration | None":
+def _parameters_in(calibration: Calibration) -> "Calibrated | None":
     """Return the calibration from a campaign that a scenario names; None if it names none."""
     if calibration.file is None:
         return None
-    from calibration.parameters.result import ParameterCalibration
-    from calibration.reading import load_calibration
+    from calibration.result.file import load_calibration
 
     found = load_calibration(Path(calibration.file))
-    return found if isinstance(found, ParameterCalibration) else None
+    return found if found.design is None else None

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from calibration.wing.result import QUANTITIES
 from reporting import figures as style
 from reporting.words import parameter_title
 from twin_master.report.data import RunRecord
@@ -93,7 +92,6 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
     if true_value is None and (packed or ("campaign" in kept and not record.config.get("watched"))):
         # what is flown starts at the mean of the calibration
         true_value = _table(_table(kept, "state"), record.parameter_name).get("mean")
-    exact = _table(kept, "exact") or _table(kept, "posterior")
     data = _table(kept, "data")
     return CalibrationView(
         parameter=record.parameter_name,
@@ -101,9 +99,11 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
         draws=draws,
         true_value=float(true_value) if isinstance(true_value, int | float) else None,
         prior=_moments(_table(kept, "prior")),
-        posterior=_arrays(exact, "grid", "density"),
-        pairs=_arrays(data, "load_N", "displacement_m"),
-        stiffness=_moments(_table(kept, "tip_stiffness_exact") or _table(kept, "tip_stiffness")),
+        posterior=_arrays(_table(kept, "posterior"), "grid", "density"),
+        pairs=_arrays(data, "load", "displacement"),
+        stiffness=_moments(
+            _table(kept, "tip_stiffness") or _table(_table(kept, "quantities"), "tip_stiffness")
+        ),
         wing=str(kept.get("asset") or ""),
         campaign=str(kept.get("campaign") or ""),
         moments=_moments(_table(_table(kept, "state"), record.parameter_name)),
@@ -123,7 +123,7 @@ def _figure_names(kept: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
     names = _table(kept, "correlation").get("names")
     return [
         ("state", [str(name) for name in names] if isinstance(names, list) else []),
-        ("quantities", [figure.name for figure in QUANTITIES]),
+        ("quantities", list(_table(kept, "quantities"))),
     ]
 
 

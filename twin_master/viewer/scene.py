@@ -183,9 +183,7 @@ def _design(folder: Path) -> WingDesign | None:
         if (folder / copy).is_file():
             return load_design(folder / copy)
     if (folder / CALIBRATION_COPY).is_file():
-        from calibration.reading import load_calibration
-        from calibration.wing.result import CalibrationResult
+        from calibration.result.file import load_calibration
 
-        found = load_calibration(folder / CALIBRATION_COPY)
-        return found.design if isinstance(found, CalibrationResult) else None
+        return load_calibration(folder / CALIBRATION_COPY).design
     return None

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
-from calibration.joint import modal_measurement, published_modal_measurement
-from calibration.joint.measurement import _mean
+from calibration.joint.measurement import _mean, modal_measurement, published_modal_measurement
 
 REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 TIME = np.arange(0.0, 6.4, 1.0 / 250.0)

@@ -14,8 +14,8 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
-from calibration.wing.result import CalibrationResult
-from calibration.wing.result_file import save_calibration
+from calibration.result.file import save_calibration
+from calibration.result.record import Calibration
 from discrepancy.campaign.records import Campaign, Hold, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Model
@@ -397,7 +397,7 @@ def test_sensors_are_passed_over_and_answers_are_repeatable(model: WingModel, co
 
 
 def test_the_posterior_of_a_calibration_is_the_prior(
-    make_calibration: Callable[..., CalibrationResult],
+    make_calibration: Callable[..., Calibration],
     coarse_patch_arrays: PatchArrays,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -406,12 +406,12 @@ def test_the_posterior_of_a_calibration_is_the_prior(
     design = load_design().changed(mesh={"refinement": 0.25})
     cache_folder().mkdir()
     coarse_patch_arrays.save(entry("patches", design.hash, None))
-    result = replace(make_calibration(), design=design)
+    result = replace(make_calibration(), design=design, design_hash=design.hash)
     save_calibration(result, tmp_path / "wing.nc")
     model = WingModel.of_calibration(tmp_path / "wing.nc")
     assert model.name == result.asset
-    assert [item.mean for item in model.parameters] == pytest.approx(result.samples.mean(axis=0))
-    assert [item.deviation for item in model.parameters] == pytest.approx(result.samples.std(axis=0))
+    assert [item.mean for item in model.parameters] == pytest.approx(result.samples.mean(axis=0)[:5])
+    assert [item.deviation for item in model.parameters] == pytest.approx(result.samples.std(axis=0)[:5])
     with pytest.raises(ModelError, match="cannot be used"):
         WingModel.of_calibration(tmp_path / "absent.nc")
     with pytest.raises(ModelError, match="cannot be read"):

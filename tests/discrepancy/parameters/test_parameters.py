@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationRecordError
-from calibration.parameters.result import ParameterCalibration
-from calibration.parameters.result_file import load_parameters, result_bytes
-from calibration.reading import load_calibration
-from calibration.samples.file import FILE_NAME
-from calibration.static.stiffness import calibrate_static, published_measurements, stiffness_curve_of
+from calibration.result.file import FILE_NAME, load_calibration, result_bytes
+from calibration.result.record import Calibration
+from calibration.static.errors_in_variables import exact_posterior
+from calibration.static.experiments import published_measurements
+from calibration.static.stiffness_curve import stiffness_curve_of
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Quantity, Trial
 from discrepancy.errors import CampaignDataError, ModelError
@@ -108,7 +108,7 @@ PRIORS = ((1.0, 0.2, -3.0, 5.0), (0.5, 0.3, -3.0, 4.0))
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[ParameterCalibration, Float]:
+def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Calibration, Float]:
     """A calibration whose posterior is Gaussian, and the readings."""
     noise = NOISE * np.random.default_rng(3).standard_normal(len(FORCE))
     values = line(FORCE, np.array([1.1, 0.7])) + noise
@@ -117,7 +117,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[ParameterCalibration
 
 
 def test_a_linear_model_has_the_posterior_of_the_closed_form(
-    told: tuple[ParameterCalibration, Float],
+    told: tuple[Calibration, Float],
 ) -> None:
     found, values = told
     design = np.column_stack([FORCE / 10.0, (FORCE / 40.0) ** 2])
@@ -135,16 +135,13 @@ def test_a_linear_model_has_the_posterior_of_the_closed_form(
     assert found.channels[0].before > 5.0 > 1.5 > found.channels[0].after
 
 
-def test_the_file_holds_all_of_it_and_refuses_damage(
-    told: tuple[ParameterCalibration, Float], tmp_path: Path
-) -> None:
+def test_the_file_holds_all_of_it_and_refuses_damage(told: tuple[Calibration, Float], tmp_path: Path) -> None:
     found, _ = told
     content = result_bytes(found)
     assert content == result_bytes(found)
     path = tmp_path / FILE_NAME
     path.write_bytes(content)
     again = load_calibration(path)
-    assert isinstance(again, ParameterCalibration)
     np.testing.assert_array_equal(again.samples, found.samples)
     assert result_bytes(again) == content
     assert again.priors == found.priors
@@ -154,10 +151,10 @@ def test_the_file_holds_all_of_it_and_refuses_damage(
     damaged[at] ^= 1
     path.write_bytes(bytes(damaged))
     with pytest.raises(CalibrationRecordError, match=r"damaged .*hash"):
-        load_parameters(path)
+        load_calibration(path)
 
 
-def test_what_is_drawn_together_stays_together(told: tuple[ParameterCalibration, Float]) -> None:
+def test_what_is_drawn_together_stays_together(told: tuple[Calibration, Float]) -> None:
     found, _ = told
     given = found.given("p1", found.mean("p1") + np.array([-0.01, 0.0, 0.01]))["p2"]
     slope = np.cov(found.samples, rowvar=False)[0, 1] / found.samples[:, 0].var()
@@ -383,7 +380,7 @@ def test_the_published_load_test_gives_the_posterior_of_the_wings_own_calibratio
     That S grows with e is left out, which is worth 0.03 deviations.
     """
     pairs, model = published_measurements(), reduced_model()
-    exact = calibrate_static(stiffness_curve_of(model), seed=0).exact
+    exact = exact_posterior(pairs, curve=stiffness_curve_of(model))
     stiffness = float(model.tip_stiffness(exact.mean))
     noise = np.hypot(pairs.displacement_standard_deviation, pairs.load_standard_deviation / stiffness)
     rows = zip(pairs.load.tolist(), pairs.displacement.tolist(), strict=True)

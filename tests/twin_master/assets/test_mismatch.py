@@ -16,8 +16,8 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.wing.result import CalibrationResult
-from calibration.wing.result_file import load_calibration, save_calibration
+from calibration.result.file import load_calibration, save_calibration
+from calibration.result.record import Calibration
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from reporting.progress import SilentProgress
@@ -109,8 +109,8 @@ def resolved(library: Path, path: Path | str = "model_mismatch") -> Scenario:
 
 
 @pytest.mark.long
-def test_the_twin_may_believe_a_calibrated_wing(
-    library_file: Path, tmp_path: Path, make_calibration: Callable[..., CalibrationResult]
+def test_the_twin_may_believe_a_plain_record(
+    library_file: Path, tmp_path: Path, make_calibration: Callable[..., Calibration]
 ) -> None:
     file = save_calibration(make_calibration(), tmp_path / "wing.nc")
     overrides = Overrides(strain_library=library_file, calibration=file)

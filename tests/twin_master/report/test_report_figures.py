@@ -9,8 +9,8 @@ import pytest
 import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.wing.result import CalibrationResult
-from calibration.wing.wing_record import run_record
+from calibration.result.plain import run_record
+from calibration.result.record import Calibration
 from reporting.figures import to_svg
 from tests.twin_master.report.drawn import line, panel
 from twin_master.report import belief as report_belief
@@ -244,9 +244,9 @@ def test_calibration_shows_draws_posterior_and_measurements(
     grid = np.linspace(0.9, 1.1, 101)
     kept = {
         "prior": {"mean": 1.0, "standard_deviation": 0.0255},
-        "exact": {"grid": list(grid), "density": list(np.exp(-0.5 * ((grid - 1.007) / 0.01) ** 2))},
-        "data": {"load_N": [2.5, 5.0, 7.5], "displacement_m": [0.004, 0.008, 0.011]},
-        "tip_stiffness_exact": {"mean": 681.1, "standard_deviation": 6.0, "unit": "N/m"},
+        "posterior": {"grid": list(grid), "density": list(np.exp(-0.5 * ((grid - 1.007) / 0.01) ** 2))},
+        "data": {"load": [2.5, 5.0, 7.5], "displacement": [0.004, 0.008, 0.011]},
+        "tip_stiffness": {"mean": 681.1, "standard_deviation": 6.0, "unit": "N/m"},
     }
     view = report_calibration.calibration_view(replace(record, calibration=kept))
     assert view is not None
@@ -262,8 +262,8 @@ def test_calibration_shows_draws_posterior_and_measurements(
     assert np.trapezoid(prior[:, 1], prior[:, 0]) == pytest.approx(1.0, rel=1e-4)
     for broken in (
         {"prior": 3},
-        {"exact": {"grid": [1.0]}},
-        {"data": {"load_N": [1.0], "displacement_m": []}},
+        {"posterior": {"grid": [1.0]}},
+        {"data": {"load": [1.0], "displacement": []}},
     ):
         assert report_calibration.calibration_view(replace(record, calibration=broken)) is not None
     fixed = replace(record, parameter_draws=np.ones(5))
@@ -271,7 +271,7 @@ def test_calibration_shows_draws_posterior_and_measurements(
 
 
 def test_a_calibration_file_shows_its_wing(
-    record: report_data.RunRecord, make_calibration: Callable[..., CalibrationResult]
+    record: report_data.RunRecord, make_calibration: Callable[..., Calibration]
 ) -> None:
     wing = make_calibration(young_modulus_factor=1.05)
     kept = json.loads(to_json(run_record(wing, "young_modulus_factor")))
@@ -287,7 +287,7 @@ def test_a_calibration_file_shows_its_wing(
     view = report_calibration.calibration_view(flown)
     assert view is not None
     assert view.true_value == wing.mean("young_modulus_factor")  # the FMU starts at the mean
-    assert [figure.unit for figure in view.figures][:6] == ["1", "kg", "kg", "1/s", "s", "N/m"]
+    assert [figure.unit for figure in view.figures][:5] == ["1", "kg", "kg", "1/s", "s"]
     servo = view.figures[1]
     assert (servo.mean, servo.standard_deviation) == pytest.approx(
         (wing.mean("servo_mass"), wing.standard_deviation("servo_mass"))

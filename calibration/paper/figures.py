@@ -1,0 +1,226 @@
+"""Figures of calibration step 2: the panels of Kapteyn et al. 2021, Fig. 5, and what they leave open."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calibration.paper.load_test import StaticCalibration
+from calibration.paper.table_1 import PAPER_MEAN, PAPER_STANDARD_DEVIATION
+from calibration.static.experiments import HALF_WIDTH_95
+from calibration.static.posterior import ScalarPosterior
+from reporting.figures import (
+    BAND_OPACITY,
+    OBSERVED,
+    PAST,
+    PRESENT,
+    REFERENCE,
+    new_figure,
+    panel_label,
+    publication_style,
+)
+
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+_RUN_LINES = ("-", "--", "-.", ":")
+
+
+def calibration_figure(result: StaticCalibration) -> Figure:
+    """Draw the three panels of Fig. 5: measurements and bands, densities of e, densities of the stiffness."""
+    with publication_style():
+        figure = new_figure(height=4.4)
+        grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0), wspace=0.22, hspace=0.48)
+        figure.subplots_adjust(left=0.062, right=0.985, bottom=0.095, top=0.94)
+        _draw_loads(figure.add_subplot(grid[:, 0]), result)
+        _draw_factor(figure.add_subplot(grid[0, 1]), result)
+        _draw_stiffness(figure.add_subplot(grid[1, 1]), result)
+    return figure
+
+
+def residual_figure(result: StaticCalibration) -> Figure:
+    """Draw the residuals run by run, and the posterior under other assumptions."""
+    with publication_style():
+        figure = new_figure(height=2.6)
+        grid = figure.add_gridspec(1, 2, width_ratios=(1.0, 0.9), wspace=0.45)
+        figure.subplots_adjust(left=0.075, right=0.985, bottom=0.165, top=0.90)
+        _draw_residuals(figure.add_subplot(grid[0, 0]), result)
+        _draw_alternatives(figure.add_subplot(grid[0, 1]), result)
+    return figure
+
+
+def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
+    data = result.data
+    reach = 1.12 * float(data.displacement.max())
+    displacement = np.array([0.0, reach])
+    for posterior, colour, name, opacity in (
+        (result.tip_stiffness_prior, REFERENCE, "prior", 0.35),
+        (result.tip_stiffness_exact, PAST, "posterior", 0.35),
+    ):
+        lower, upper = posterior.interval(0.95)
+        axes.fill_between(
+            displacement * 1e3,
+            lower * displacement,
+            upper * displacement,
+            color=colour,
+            alpha=opacity,
+            lw=0.0,
+            label=f"{name}, 95 % band",
+        )
+    axes.plot(
+        displacement * 1e3, result.tip_stiffness_prior.mean * displacement, color=REFERENCE, lw=1.0, ls="--"
+    )
+    axes.plot(displacement * 1e3, result.tip_stiffness_exact.mean * displacement, color=PAST, lw=1.2)
+    for number, index in enumerate(data.run_indices):
+        of_run = data.run == index
+        axes.errorbar(
+            data.displacement[of_run] * 1e3,
+            data.load[of_run],
+            xerr=HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3,
+            yerr=HALF_WIDTH_95 * data.load_standard_deviation,
+            **_of_run(number),
+            label=f"measured, run {index + 1}",
+            zorder=3 + number,
+        )
+    axes.set_xlim(0.0, reach * 1e3)
+    axes.set_ylim(0.0, 1.12 * float(data.load.max()))
+    axes.set_xlabel("tip displacement $x$ (mm)", parse_math=True)
+    axes.set_ylabel("tip load $f$ (N)", parse_math=True)
+    axes.legend(loc="upper left", handlelength=1.5)
+    panel_label(axes, "a", "Load and displacement")
+
+
+def _of_run(number: int) -> dict[str, Any]:
+    """Return how the pairs of a loading run are marked."""
+    return {
+        "fmt": _MARKERS[number % len(_MARKERS)],
+        "color": OBSERVED,
+        "mfc": "white" if number % 2 else OBSERVED,
+        "ms": 3.6,
+        "mew": 0.9,
+        "elinewidth": 0.8,
+        "capsize": 1.8,
+    }
+
+
+def _draw_factor(axes: Axes, result: StaticCalibration) -> None:
+    particle, prior = result.particle, result.prior
+    for pair in range(result.data.count):
+        run = result.data.run_indices.index(int(result.data.run[pair]))
+        axes.plot(
+            particle.likelihood_grid, particle.likelihood[pair], color=OBSERVED, lw=0.7,
+            ls=_RUN_LINES[run % len(_RUN_LINES)], label="likelihood of one pair" if pair == 0 else None,
+        )  # fmt: skip
+    grid = np.linspace(-8.0, 8.0, 2001) * prior.standard_deviation + prior.mean
+    before = ScalarPosterior(grid, prior.density(grid))
+    _draw_densities(axes, before, result.exact, particle.posterior)
+    axes.axvline(PAPER_MEAN, color=REFERENCE, lw=0.7, ls=":", label="mean in the paper")
+    axes.set_xlabel("Young's modulus factor $e$", parse_math=True)
+    axes.set_ylabel("probability density")
+    axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
+    panel_label(axes, "b", "Prior, likelihoods, posterior")
+
+
+def _draw_stiffness(axes: Axes, result: StaticCalibration) -> None:
+    posterior = result.tip_stiffness_exact
+    _draw_densities(axes, result.tip_stiffness_prior, posterior, result.tip_stiffness_particle, 1e-3)
+    axes.set_xlabel("tip stiffness $k$ (N/mm)", parse_math=True)
+    axes.set_ylabel("probability density (mm/N)")
+    axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
+    axes.text(
+        0.99,
+        0.60,
+        f"{posterior.mean * 1e-3:.4f} ± {posterior.standard_deviation * 1e-3:.4f} N/mm",
+        transform=axes.transAxes,
+        color=PAST,
+        ha="right",
+        fontsize=6.8,
+    )
+    panel_label(axes, "c", "Quantity of interest")
+
+
+def _draw_densities(
+    axes: Axes, prior: ScalarPosterior, exact: ScalarPosterior, particle: ScalarPosterior, scale: float = 1.0
+) -> None:
+    """Draw prior, exact posterior with its 95 % interval, and the posterior of particles as a histogram."""
+    lower, upper = exact.interval(0.95)
+    inside = (exact.grid >= lower) & (exact.grid <= upper)
+    axes.fill_between(
+        exact.grid[inside] * scale, exact.density[inside] / scale,
+        color=PAST, alpha=BAND_OPACITY, lw=0.0, label="95 % interval",
+    )  # fmt: skip
+    axes.plot(prior.grid * scale, prior.density / scale, color=REFERENCE, lw=1.8, label="prior")
+    axes.plot(exact.grid * scale, exact.density / scale, color=PAST, lw=1.6, label="posterior, exact")
+    edges = particle.mean + particle.standard_deviation * np.linspace(-4.0, 4.0, 33)
+    density = np.diff(particle.cumulative(edges)) / np.diff(edges)
+    axes.stairs(density / scale, edges * scale, color=PRESENT, lw=0.9, label="posterior, particles")
+    reach = 3.6 * prior.standard_deviation
+    axes.set_xlim((prior.mean - reach) * scale, (prior.mean + reach) * scale)
+    axes.set_ylim(0.0, 1.12 * float(exact.density.max()) / scale)
+
+
+def _draw_residuals(axes: Axes, result: StaticCalibration) -> None:
+    data, quality = result.data, result.quality
+    half_width = HALF_WIDTH_95 * np.hypot(
+        data.displacement_standard_deviation, data.load_standard_deviation / quality.stiffness
+    )
+    shift = 0.008 * float(data.load.max())
+    axes.axhline(0.0, color=PAST, lw=1.0)
+    for number, (index, run) in enumerate(zip(data.run_indices, quality.runs, strict=True)):
+        of_run = data.run == index
+        side = shift * (2 * number - len(quality.runs) + 1)
+        line = axes.errorbar(
+            data.load[of_run] + side,
+            quality.displacement_residual[of_run] * 1e3,
+            yerr=half_width * 1e3,
+            **_of_run(number),
+            label=f"run {index + 1} ({run.offset * 1e3:+.2f} mm)".replace("-", "−"),
+        )
+        line.lines[0].set_zorder(3 + number)
+        axes.axhline(run.offset * 1e3, color=OBSERVED, lw=0.8, ls=_RUN_LINES[1 + number % 3])
+    limit = 1.75 * float(np.max(np.abs(quality.displacement_residual))) * 1e3 + 0.25
+    axes.set_ylim(-limit, 1.3 * limit)
+    axes.set_xlabel("tip load $f$ (N)", parse_math=True)
+    axes.set_ylabel("$x - f/k$ (mm)", parse_math=True)
+    axes.legend(loc="upper center", ncols=2, fontsize=6.8, handletextpad=0.3, borderaxespad=0.0)
+    panel_label(axes, "a", "Residuals of the two runs" if len(quality.runs) == 2 else "Residuals")
+
+
+def _short_name(assumption: str) -> str:
+    for beginning, short in (
+        ("prior flat", "flat in load"),
+        ("density", "ratio"),
+        ("a zero", "zero offsets"),
+    ):
+        if assumption.startswith(beginning):
+            return short
+    return assumption
+
+
+def _draw_alternatives(axes: Axes, result: StaticCalibration) -> None:
+    rows = [
+        ("paper", PAPER_MEAN, PAPER_STANDARD_DEVIATION, REFERENCE),
+        ("particle filter", result.particle.mean, result.particle.standard_deviation, PRESENT),
+        ("exact", result.exact.mean, result.exact.standard_deviation, PAST),
+    ]
+    rows += [
+        (f"exact, {_short_name(alternative.name)}", alternative.mean, alternative.standard_deviation, PAST)
+        for alternative in result.alternatives
+    ]
+    for row, (_, mean, deviation, colour) in enumerate(rows):
+        axes.errorbar(
+            mean,
+            row,
+            xerr=HALF_WIDTH_95 * deviation,
+            fmt="o",
+            color=colour,
+            ms=3.8,
+            elinewidth=1.2,
+            capsize=2.2,
+        )
+    axes.axvline(PAPER_MEAN, color=REFERENCE, lw=0.7, ls=":")
+    axes.set_yticks(range(len(rows)), [row[0] for row in rows])
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.tick_params(axis="y", length=0.0)
+    axes.spines["left"].set_visible(False)
+    axes.set_xlabel("Young's modulus factor $e$ (95 %)", parse_math=True)
+    panel_label(axes, "b", "Under other assumptions")

@@ -1,0 +1,145 @@
+"""Calibration step 2 alone, as in Fig. 5 of the paper: e and the tip stiffness, exactly and by particles."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.errors import OutsideValidityError
+from calibration.paper.particle_filter import DEFAULT_PARTICLE_COUNT, ParticlePosterior, particle_filter
+from calibration.static.errors_in_variables import Measure, exact_posterior
+from calibration.static.experiments import HALF_WIDTH_95, LoadDisplacementData, published_measurements
+from calibration.static.posterior import GaussianPrior, ScalarPosterior
+from calibration.static.quality import FitQuality, assess_fit
+from calibration.static.stiffness_curve import PUBLISHED_LINE, StiffnessCurve
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """The same posterior under another assumption: its name, mean and standard deviation of e [1]."""
+
+    name: str
+    mean: float
+    standard_deviation: float
+
+
+@dataclass(frozen=True, eq=False)
+class StaticCalibration:
+    """Everything that calibration step 2 found.
+
+    Attributes
+    ----------
+    data : LoadDisplacementData
+        The measured pairs.
+    curve : StiffnessCurve
+        k(e).
+    prior : GaussianPrior
+        p(e).
+    particle : ParticlePosterior
+        p(e | pairs) by the paper's particle filter.
+    exact : ScalarPosterior
+        p(e | pairs) with errors in both variables, by quadrature.
+    tip_stiffness_prior, tip_stiffness_particle, tip_stiffness_exact : ScalarPosterior
+        p(k) and p(k | pairs), the quantity of interest of Fig. 5 [N/m].
+    alternatives : tuple of Alternative
+        The exact posterior under other assumptions; those that leave the range of the curve are missing.
+    quality : FitQuality
+        Residuals at the exact posterior mean.
+    """
+
+    data: LoadDisplacementData
+    curve: StiffnessCurve
+    prior: GaussianPrior
+    particle: ParticlePosterior
+    exact: ScalarPosterior
+    tip_stiffness_prior: ScalarPosterior
+    tip_stiffness_particle: ScalarPosterior
+    tip_stiffness_exact: ScalarPosterior
+    alternatives: tuple[Alternative, ...]
+    quality: FitQuality
+
+
+def calibrate_static(
+    curve: StiffnessCurve = PUBLISHED_LINE,
+    data: LoadDisplacementData | None = None,
+    seed: int = 0,
+    *,
+    prior: GaussianPrior | None = None,
+    particle_count: int = DEFAULT_PARTICLE_COUNT,
+) -> StaticCalibration:
+    """Find the posterior of e in both ways, and what follows from it.
+
+    Parameters
+    ----------
+    curve : StiffnessCurve
+        k(e); the published line by default, `stiffness_curve_of(model)` for a structural model.
+    data : LoadDisplacementData, optional
+        The measured pairs; the published eight by default.
+    seed : int
+        Seed of the particle filter.
+    prior : GaussianPrior, optional
+        Prior of e; the paper's by default.
+    particle_count : int
+        Particles of the filter.
+
+    Raises
+    ------
+    OutsideValidityError, DegenerateFilterError, PosteriorError
+        See `exact_posterior` and `particle_filter`.
+    """
+    data = published_measurements() if data is None else data
+    prior = prior or GaussianPrior()
+    exact = exact_posterior(data, curve=curve, prior=prior)
+    particle = particle_filter(data, seed=seed, curve=curve, prior=prior, particle_count=particle_count)
+    prior_grid = np.linspace(-8.0, 8.0, 2001) * prior.standard_deviation + prior.mean
+    stiffness = push_forward(particle.posterior, curve)
+    return StaticCalibration(
+        data=data,
+        curve=curve,
+        prior=prior,
+        particle=particle,
+        exact=exact,
+        tip_stiffness_prior=push_forward(ScalarPosterior(prior_grid, prior.density(prior_grid)), curve),
+        tip_stiffness_particle=ScalarPosterior(
+            stiffness.grid,
+            stiffness.density,
+            mean=particle.stiffness_mean,
+            standard_deviation=particle.stiffness_standard_deviation,
+        ),
+        tip_stiffness_exact=push_forward(exact, curve),
+        alternatives=_alternatives(curve, data, prior),
+        quality=assess_fit(data, float(curve.stiffness(exact.mean))),
+    )
+
+
+def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPosterior:
+    """Return the density of k(e), p(e) / (dk/de), over the part of the grid on which k is positive."""
+    stiffness = curve.stiffness(posterior.grid)
+    positive = stiffness > 0.0
+    density = posterior.density[positive] / curve.slope(posterior.grid[positive])
+    return ScalarPosterior(stiffness[positive], density)
+
+
+def _alternatives(
+    curve: StiffnessCurve, data: LoadDisplacementData, prior: GaussianPrior
+) -> tuple[Alternative, ...]:
+    """Return the posterior under other assumptions, but for those that lead out of the curve's range."""
+    half_width = HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3
+    assumptions: tuple[tuple[str, Measure, float], ...] = (
+        ("prior flat in the true load", "load", 0.0),
+        ("density of the ratio (the particle filter with unlimited samples)", "ratio", 0.0),
+        (
+            f"a zero offset of ±{half_width:.2g} mm shared by each run",
+            "displacement",
+            data.displacement_standard_deviation,
+        ),
+    )
+    found = []
+    for name, measure, offset in assumptions:
+        try:
+            posterior = exact_posterior(
+                data, curve=curve, prior=prior, measure=measure, zero_offset_standard_deviation=offset
+            )
+        except OutsideValidityError:
+            continue
+        found.append(Alternative(name, posterior.mean, posterior.standard_deviation))
+    return tuple(found)

@@ -1,0 +1,175 @@
+"""The paper's step 3: point masses and Rayleigh damping for each sample of e.
+
+Kapteyn et al. 2021, eqs. (19) and (20): the masses that bring the first two flapwise frequencies nearest to
+the measured ones, under the weighed total; eq. (25): the Rayleigh coefficients that give the two modes their
+measured damping ratios through eq. (18).
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from calibration.dynamics.records import STEP_FOLDER
+from calibration.errors import ExperimentDataError, MassConstraintError, OutsideValidityError
+from calibration.joint.inference import servo_range
+from calibration.joint.measurement import ModalMeasurement
+from calibration.joint.prior import TOTAL_MASS
+from calibration.lab_folder import LAB_ERRORS, find_lab_file
+from fe.runtime.damping import rayleigh_coefficients
+from fe.runtime.reduced import ReducedModel
+from reporting.table_file import read_table
+
+RESULTS_FILE = "massoptimizationresults.csv"
+"""The authors' masses and frequencies for each of their samples of e."""
+
+_RESULT_COLUMNS = (
+    "e_sample", "mass_servo_1", "mass_pitot", "freq_1", "freq_2", "zeta_1", "zeta_2",
+)  # fmt: skip
+
+FloatArray = NDArray[np.float64]
+
+FrequencyModel = Callable[[float, float, float], tuple[float, float]]
+"""(e, servo mass [kg], pitot mass [kg]) to the natural frequencies of the two flapwise modes [Hz]."""
+
+
+class PaperSamples(NamedTuple):
+    """Samples of e, servo and pitot mass, alpha and beta (N, 5), and the model's frequencies (N, 2)."""
+
+    samples: FloatArray
+    frequency: FloatArray
+
+
+def calibrate_dynamics(
+    model: ReducedModel,
+    young_modulus_factor: FloatArray,
+    modal: ModalMeasurement,
+    *,
+    total_mass: float = TOTAL_MASS,
+) -> PaperSamples:
+    """Calibrate masses and damping on a reduced model; its flapwise modes are followed by their shape.
+
+    Raises
+    ------
+    MassConstraintError, ExperimentDataError
+        See `fit_masses`.
+    OutsideValidityError
+        If a sample of e lies outside the range of the model.
+    """
+    lower, upper = model.validity["young_modulus_factor"]
+    outside = young_modulus_factor[~((young_modulus_factor >= lower) & (young_modulus_factor <= upper))]
+    if outside.size:
+        raise OutsideValidityError(
+            f"a sample of e is {outside[0]:g}, but the model holds for {lower:g} to {upper:g}; build one "
+            "with a wider range."
+        )
+
+    def frequencies(factor: float, servo: float, pitot: float) -> tuple[float, float]:
+        modes = model.modes(young_modulus_factor=factor, servo_mass=servo, pitot_mass=pitot)
+        first, second = modes.frequency[list(modes.followed)].tolist()
+        return first, second
+
+    return fit_masses(frequencies, young_modulus_factor, model.validity, modal, total_mass=total_mass)
+
+
+def fit_masses(
+    frequencies: FrequencyModel,
+    young_modulus_factor: FloatArray,
+    validity: Mapping[str, tuple[float, float]],
+    modal: ModalMeasurement,
+    *,
+    total_mass: float = TOTAL_MASS,
+) -> PaperSamples:
+    """Find masses under the weighed total, then damping, for each sample of e.
+
+    One mass is free: the pitot tube has what two servos leave of the total. The search, of Brent, ends at
+    1 microgram; the authors', of Nelder and Mead, ends at 1 g.
+
+    Parameters
+    ----------
+    frequencies : callable
+        Of a model.
+    young_modulus_factor : (N,) array
+        Samples of e [1].
+    validity : mapping of str to (float, float)
+        Range of the masses for which the model may be asked [kg].
+    modal : ModalMeasurement
+        What was measured.
+    total_mass : float
+        2 m_servo + m_pitot [kg].
+
+    Raises
+    ------
+    MassConstraintError
+        If no masses within the range keep the total, or the best lie at the limit of the range.
+    ExperimentDataError
+        If the damping ratios need a negative Rayleigh coefficient.
+    """
+    lower, upper = servo_range(validity, total_mass)
+    wanted = modal.frequency
+    samples, pairs = [], []
+    for factor in young_modulus_factor.tolist():
+
+        def error(mass: float, factor: float = factor) -> float:
+            first, second = frequencies(factor, mass, total_mass - 2.0 * mass)
+            return 0.5 * (abs(first / wanted[0] - 1.0) + abs(second / wanted[1] - 1.0))
+
+        servo = float(
+            minimize_scalar(error, bounds=(lower, upper), method="bounded", options={"xatol": 1e-9}).x
+        )
+        if min(servo - lower, upper - servo) < 1e-6:
+            raise MassConstraintError(
+                f"at e = {factor:g} the masses nearest to {wanted[0]:.4g} and {wanted[1]:.4g} Hz lie at the "
+                f"limit of the model, {servo:.4g} kg for a servo under a total of {total_mass:g} kg; check "
+                "the measured frequencies and the total."
+            )
+        pitot = total_mass - 2.0 * servo
+        pairs.append(frequencies(factor, servo, pitot))
+        samples.append((factor, servo, pitot, *damping_coefficients(pairs[-1], modal.damping_ratio)))
+    return PaperSamples(np.array(samples), np.array(pairs))
+
+
+def damping_coefficients(
+    frequency: tuple[float, float], damping_ratio: tuple[float, float]
+) -> tuple[float, float]:
+    """Return alpha [1/s] and beta [s] by eq. (25).
+
+    Raises
+    ------
+    ExperimentDataError
+        If a coefficient would be negative, so that some mode would gain energy.
+    """
+    alpha, beta = rayleigh_coefficients(frequency, damping_ratio)
+    if alpha < 0.0 or beta < 0.0:
+        raise ExperimentDataError(
+            f"damping ratios {damping_ratio[0]:g} at {frequency[0]:.4g} Hz and {damping_ratio[1]:g} at "
+            f"{frequency[1]:.4g} Hz need Rayleigh coefficients of {alpha:.3g} 1/s and {beta:.3g} s, but "
+            "neither may be negative; check the ring-down records."
+        )
+    return alpha, beta
+
+
+def read_published_results(path: Path) -> PaperSamples:
+    """Read the authors' masses and frequencies, and add alpha and beta by eq. (25).
+
+    Parameters
+    ----------
+    path : Path
+        The authors' calibration folder, or `massoptimizationresults.csv` itself.
+
+    Raises
+    ------
+    ExperimentFileError
+        If the file is missing, empty, lacks a column, or has a cell that is no number.
+    ExperimentDataError
+        If a value is not positive and finite.
+    """
+    table = read_table(find_lab_file(Path(path), STEP_FOLDER / RESULTS_FILE), LAB_ERRORS)
+    columns = np.array([table.positive_numbers(name, "the authors' step 3") for name in _RESULT_COLUMNS])
+    first, second = columns[5:, 0].tolist()
+    pairs = columns[3:5].T
+    damping = [damping_coefficients((f1, f2), (first, second)) for f1, f2 in pairs.tolist()]
+    return PaperSamples(np.column_stack([columns[:3].T, damping]), pairs)

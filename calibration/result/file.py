@@ -1,0 +1,231 @@
+"""The file of a calibration: NetCDF-4 in the layout of ArviZ, sufficient by itself.
+
+Groups `posterior` and `prior` hold samples of each figure by (chain, draw) with its unit, `observed_data`
+readings that are more than one number; the root's attributes hold priors, readings, residuals, findings,
+provenance and, of a wing, its tailored design.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError, CalibrationRecordError
+from calibration.result.record import (
+    FROM_CAMPAIGN,
+    FROM_LABORATORY,
+    CalibratedFigure,
+    Calibration,
+    ChannelFit,
+    ParameterPrior,
+    Reading,
+)
+from fe.runtime.errors import InvalidDesignError
+from fe.wing.design import parse_design
+from reporting.errors import DamagedFileError, FileNotWrittenError
+from reporting.files import atomic_write_bytes
+from reporting.netcdf import read_groups
+from reporting.record_json import record_of
+
+FILE_NAME = "calibration.nc"
+SCHEMA = "uav-twin calibration 2"
+"""Value of the attribute `schema` of the root."""
+
+_HASH = "content_sha256"
+_LISTS = {
+    "priors": ParameterPrior,
+    "quantities": CalibratedFigure,
+    "readings": Reading,
+    "channels": ChannelFit,
+}
+"""Fields of a calibration that are records, kept as JSON."""
+
+Groups = Mapping[str, xr.Dataset]
+Root = Mapping[str, Any]
+
+
+def save_calibration(calibration: Calibration, path: Path | str) -> Path:
+    """Write a calibration, whole or not at all; equal calibrations give equal bytes.
+
+    Raises
+    ------
+    reporting.errors.FileNotWrittenError
+        If the file cannot be written.
+    """
+    return atomic_write_bytes(Path(path), result_bytes(calibration))
+
+
+def result_bytes(calibration: Calibration) -> bytes:
+    """Return the content of the file of a calibration."""
+    groups = {
+        "prior": _samples(calibration, calibration.prior_samples, "prior sample"),
+        "posterior": _samples(calibration, calibration.samples, "posterior sample"),
+        "observed_data": calibration.measured,
+    }
+    design = calibration.design
+    root = {
+        "schema": SCHEMA,
+        "title": f"Calibration of {calibration.asset}",
+        **{name: getattr(calibration, name) for name in _WORDS},
+        "seed": calibration.seed,
+        **{name: _json([asdict(item) for item in getattr(calibration, name)]) for name in _LISTS},
+        "explained": _json(calibration.explained),
+        "findings": _json(list(calibration.findings)),
+        "provenance": _json(dict(calibration.provenance)),
+        "design": _json(None if design is None else design.model_dump(mode="json")),
+    }
+    attributes = {**root, _HASH: _content_hash(groups, root)}
+    tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **groups})
+    return bytes(tree.to_netcdf(engine="h5netcdf"))
+
+
+_WORDS = ("asset", "model", "model_hash", "design_hash", "procedure", "source")
+
+
+def _samples(calibration: Calibration, values: NDArray[np.float64], what: str) -> xr.Dataset:
+    return xr.Dataset(
+        {
+            figure.name: (
+                ("chain", "draw"),
+                column[None],
+                {"units": figure.unit, "long_name": f"{what} of {figure.title}"},
+            )
+            for figure, column in zip(calibration.figures, values.T, strict=True)
+        }
+    )
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """Read the calibration of a wing, or of the parameters of any model.
+
+    Raises
+    ------
+    CalibrationRecordError
+        If the file is missing, damaged, cut off, of another kind or of another schema; one sentence.
+    """
+    path = Path(path)
+    groups, root = _read(path)
+    came = root.get("schema")
+    if came != SCHEMA:
+        raise CalibrationRecordError(
+            f"{path} is {'of the schema ' + repr(str(came)) if came else 'no calibration file'}, but "
+            f"{SCHEMA!r} is needed; calibrate again with this version."
+        )
+    try:
+        if root[_HASH] != _content_hash(groups, root):
+            raise CalibrationRecordError("its content does not match its hash")
+        return _calibration(groups, root)
+    except (CalibrationError, InvalidDesignError) as error:
+        reason = str(error).rstrip(".")
+    except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
+        reason = f"{type(error).__name__}: {error}"
+    raise CalibrationRecordError(f"{path} is damaged ({reason}); calibrate again.")
+
+
+def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
+    """Look at the place where a calibration of `asset` is to be written, before the work begins.
+
+    Raises
+    ------
+    FileNotWrittenError
+        If it is no folder, or holds the calibration of another asset or of another kind. A file that is no
+        calibration of either kind may be replaced.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
+    kept = folder / FILE_NAME
+    try:
+        found = load_calibration(kept)
+    except CalibrationRecordError:
+        return  # there is none, or what cannot be read is of no use to anyone
+    if found.asset != asset:
+        raise FileNotWrittenError(
+            f"{kept} is the calibration of {found.asset}, not of {asset}: choose another --out, one for each "
+            "asset."
+        )
+    if (found.design is not None) != wing:
+        kept_one, wanted = (FROM_CAMPAIGN, FROM_LABORATORY) if wing else (FROM_LABORATORY, FROM_CAMPAIGN)
+        raise FileNotWrittenError(
+            f"{kept} is the calibration of {asset} {kept_one}, and one {wanted} was asked for: choose "
+            "another --out, one for each kind of calibration."
+        )
+
+
+def _calibration(groups: Groups, root: Root) -> Calibration:
+    design = json.loads(root["design"])
+    lists: dict[str, Any] = {
+        name: tuple(record_of(kind, item) for item in json.loads(root[name])) for name, kind in _LISTS.items()
+    }
+    names = [item.name for item in (*lists["priors"], *lists["quantities"])]
+    samples, prior = (
+        np.column_stack([groups[group][name].values[0] for name in names]) for group in ("posterior", "prior")
+    )
+    found = Calibration(
+        **{name: root[name] for name in _WORDS},
+        **lists,
+        seed=int(root["seed"]),
+        samples=samples,
+        prior_samples=prior,
+        explained=json.loads(root["explained"]),
+        findings=tuple(json.loads(root["findings"])),
+        provenance=json.loads(root["provenance"]),
+        measured=groups["observed_data"],
+        design=None if design is None else parse_design(design, "the design in it"),
+    )
+    if found.design is not None and found.design.hash != found.design_hash:
+        raise CalibrationRecordError("its design does not match its hash")
+    return found
+
+
+def _read(path: Path) -> tuple[Groups, Root]:
+    if not path.is_file():
+        raise CalibrationRecordError(
+            f"{path} is {'no file' if path.exists() else 'not there'}; give the {FILE_NAME} that "
+            "`uav-twin calibrate --out DIR` leaves."
+        )
+    try:
+        tree = _tree(path, hashlib.sha256(path.read_bytes()).digest())
+    except DamagedFileError as error:
+        raise CalibrationRecordError(
+            f"{path} is damaged or no calibration file: it cannot be read as NetCDF; calibrate again."
+        ) from error
+    groups = {name: tree[name].to_dataset() for name in tree.children}
+    return groups, {str(name): value for name, value in tree.attrs.items()}
+
+
+@lru_cache(maxsize=8)
+def _tree(path: Path, content: bytes) -> xr.DataTree:
+    """Read a file of a content (its hash) once: a run asks for the same calibration some twenty times."""
+    return read_groups(path)
+
+
+def _json(content: object) -> str:
+    """Return plain data as JSON, the same text for the same data."""
+    return json.dumps(content, sort_keys=True, ensure_ascii=False)
+
+
+def _content_hash(groups: Groups, root: Root) -> str:
+    """Return a hash of all values and attributes, so that a flipped bit does not pass as a calibration."""
+    digest = hashlib.sha256()
+    for name in sorted(set(root) - {_HASH}):
+        digest.update(f"{name}\0{root[name]}\0".encode())
+    for group in sorted(groups):
+        dataset = groups[group]
+        for name in sorted(str(name) for name in dataset.variables):
+            values = dataset.variables[name].values
+            kind = "f" if values.dtype.kind == "f" else "i" if values.dtype.kind in "iu" else "s"
+            digest.update(f"{group}/{name}\0{values.shape}\0{kind}\0".encode())
+            if kind == "s":
+                digest.update("\0".join(str(value) for value in values.ravel()).encode())
+            else:
+                digest.update(np.ascontiguousarray(values, "<f8" if kind == "f" else "<i8").tobytes())
+            attributes = dataset[name].attrs
+            digest.update(_json({key: str(attributes[key]) for key in attributes}).encode())
+    return digest.hexdigest()

@@ -1,0 +1,127 @@
+"""A calibration as plain data, ready for JSON: for runs of a twin and for FMUs."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.result.file import SCHEMA, result_bytes
+from calibration.result.record import STATE, CalibratedFigure, Calibration, moments
+from fe.runtime.state import DigitalState
+from reporting.provenance import hash_bytes
+
+RESOURCE_NAME = "calibration.json"
+"""The file among the FMU's resources that says what the wing was calibrated with."""
+
+_GRID_POINTS = 401
+
+
+@dataclass(frozen=True)
+class WingTailoring:
+    """What an FMU takes of the calibration of a wing.
+
+    Attributes
+    ----------
+    state : DigitalState
+        Means of the samples of e, masses and damping.
+    note : str
+        Name of the wing and the standard deviations, for the description.
+    resources : dict of str to bytes
+        `RESOURCE_NAME`: the figures with intervals and correlations.
+    """
+
+    state: DigitalState
+    note: str
+    resources: Mapping[str, bytes]
+
+
+def tailoring(calibration: Calibration) -> WingTailoring:
+    """Return what the FMU of a calibrated wing carries; equal input gives equal bytes."""
+    text = json.dumps(
+        plain_record(calibration), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False
+    )
+    record = {RESOURCE_NAME: f"{text}\n".encode()}
+    return WingTailoring(calibration.mean_state(), description(calibration), record)
+
+
+def description(calibration: Calibration) -> str:
+    """Return one sentence with the name of the wing and its figures, mean and standard deviation."""
+    figures = ", ".join(
+        f"{name} {calibration.mean(name):.6g} +- {calibration.standard_deviation(name):.3g}"
+        + ("" if figure.unit == "1" else f" {figure.unit}")
+        for figure in calibration.figures
+        if (name := figure.name) in STATE
+    )
+    return f"Calibrated for the wing '{calibration.asset}' (mean +- standard deviation): {figures}."
+
+
+def plain_record(calibration: Calibration) -> dict[str, Any]:
+    """Return the figures of a calibration with intervals, and the correlation of its parameters."""
+    count = len(calibration.priors)
+    wing = calibration.design is not None
+    return {
+        "schema": SCHEMA,
+        **{
+            name: getattr(calibration, name)
+            for name in ("asset", "procedure", "seed", "model", "design_hash")
+        },
+        "samples": len(calibration.samples),
+        "calibration_sha256": hash_bytes(result_bytes(calibration)),
+        "laboratory" if wing else "campaign": calibration.source,
+        "findings": list(calibration.findings),
+        "state": _figures(calibration, calibration.figures[:count]),
+        "quantities": _figures(calibration, calibration.quantities),
+        "correlation": {
+            "names": [prior.name for prior in calibration.priors],
+            "matrix": calibration.correlation.tolist(),
+        },
+    }
+
+
+def run_record(calibration: Calibration, parameter: str) -> dict[str, Any]:
+    """Return what `calibration.json` of a run folder holds, with the parameter that the twin draws."""
+    mean, deviation = calibration.prior_moments(parameter)
+    prior: dict[str, Any] = {"mean": mean, "standard_deviation": deviation}
+    for item in calibration.priors:
+        if item.name == parameter:
+            prior = {
+                "mean": item.mean,
+                "standard_deviation": item.deviation,
+                "range": [item.low, item.high],
+            }
+    measured = calibration.measured
+    return {
+        **plain_record(calibration),
+        "parameter": parameter,
+        "prior": prior,
+        "posterior": _density(calibration.draws_of(parameter)),
+        "data": {str(name): measured[name].values.tolist() for name in measured},
+    }
+
+
+def _figures(calibration: Calibration, figures: tuple[CalibratedFigure, ...]) -> dict[str, Any]:
+    found = {}
+    for figure in figures:
+        mean, deviation = moments(calibration.draws_of(figure.name))
+        found[figure.name] = {
+            "title": figure.title,
+            "unit": figure.unit,
+            "mean": mean,
+            "standard_deviation": deviation,
+            "interval_95": list(calibration.interval(figure.name, 0.95)),
+        }
+    return found
+
+
+def _density(values: NDArray[np.float64]) -> dict[str, list[float]]:
+    """Return a Gaussian kernel density of samples; nothing if they do not vary."""
+    spread = float(values.std())
+    if spread <= 1e-12 * abs(float(values.mean())):
+        return {}
+    from scipy.stats import gaussian_kde  # takes a second to load
+
+    grid = np.linspace(values.min() - spread, values.max() + spread, _GRID_POINTS)
+    return {"grid": grid.tolist(), "density": gaussian_kde(values)(grid).tolist()}

@@ -1,0 +1,133 @@
+"""Calibration step 3: masses with a closed solution, the authors' table, our model beside it, bad input."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.errors import (
+    ExperimentDataError,
+    ExperimentFileError,
+    MassConstraintError,
+    OutsideValidityError,
+)
+from calibration.joint.measurement import published_modal_measurement
+from calibration.joint.prior import TOTAL_MASS
+from calibration.paper.procedure import (
+    calibrate_dynamics,
+    damping_coefficients,
+    fit_masses,
+    read_published_results,
+)
+from fe.runtime.damping import rayleigh_damping_ratio
+
+REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
+MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
+MODAL = published_modal_measurement()
+
+
+def line_model(factor: float, servo: float, pitot: float) -> tuple[float, float]:
+    """Frequencies of a wing whose logarithms are linear, with the reference model's slopes [Hz]."""
+    assert pitot == pytest.approx(TOTAL_MASS - 2.0 * servo)
+    first = 5.632 * factor**0.4114 * math.exp(-0.5075 * (pitot - 0.1345))
+    second = 28.544 * factor**0.3244 * math.exp(-0.2925 * (pitot - 0.1345))
+    return first, second
+
+
+@given(factor=st.floats(0.97, 1.05))
+def test_masses_of_a_closed_solution(factor: float) -> None:
+    result = fit_masses(line_model, np.array([factor]), MASSES, MODAL)
+    # The first frequency answers more strongly, so the error of (19), (20) is least where it is met exactly.
+    pitot = 0.1345 + math.log(5.632 * factor**0.4114 / 5.6492) / 0.5075
+    assert result.samples[0, 2] == pytest.approx(pitot, abs=1e-6)
+    assert 2.0 * result.samples[0, 1] + result.samples[0, 2] == pytest.approx(0.472, abs=1e-15)
+    assert result.frequency[0, 0] == pytest.approx(5.6492, rel=1e-6)
+
+
+@given(
+    first=st.floats(2.0, 10.0),
+    factor=st.floats(2.0, 9.0),
+    alpha=st.floats(0.01, 10.0),
+    beta=st.floats(1e-5, 1e-2),
+)
+def test_damping_coefficients_undo_the_damping_ratios(
+    first: float, factor: float, alpha: float, beta: float
+) -> None:
+    frequency = first, first * factor
+    ratio = rayleigh_damping_ratio(alpha, beta, frequency)
+    found = damping_coefficients(frequency, (float(ratio[0]), float(ratio[1])))
+    assert found == pytest.approx((alpha, beta), rel=1e-6, abs=1e-9)
+
+
+def test_the_authors_table_gives_their_figures() -> None:
+    if not REFERENCE.is_dir():
+        pytest.skip("the reference data are not beside the project")
+    result = read_published_results(REFERENCE)
+    assert result.samples.shape == (100, 5)
+    mean, deviation = result.samples.mean(axis=0), result.samples.std(axis=0, ddof=1)
+    assert mean[1:3] == pytest.approx([0.1691, 0.1337], abs=5e-5)
+    assert deviation[1:3] == pytest.approx([0.0039, 0.0077], abs=5e-5)
+    assert mean[3] == pytest.approx(1.030, abs=5e-4)
+    assert mean[4] == pytest.approx(7.66e-4, abs=5e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_our_wing_on_the_published_targets() -> None:
+    if not REFERENCE.is_dir():
+        pytest.skip("the reference data are not beside the project")
+    from fe.reduction.model_cache import reduced_model
+
+    authors = read_published_results(REFERENCE)
+    ours = calibrate_dynamics(reduced_model(), authors.samples[:, 0], MODAL)
+    mean, deviation = ours.samples.mean(axis=0), ours.samples.std(axis=0, ddof=1)
+    assert mean[1] == pytest.approx(authors.samples[:, 1].mean(), abs=1e-3)
+    assert deviation[1] == pytest.approx(0.0039, abs=2e-4)
+    assert mean[3] == pytest.approx(1.030, rel=0.01)
+    assert mean[4] == pytest.approx(7.66e-4, rel=0.01)
+    assert ours.frequency[:, 0] == pytest.approx(np.full(100, 5.6492), rel=1e-6)
+    with pytest.raises(OutsideValidityError, match=r"sample of e is 1\.5"):
+        calibrate_dynamics(reduced_model(), np.array([1.0, 1.5]), MODAL)
+
+
+def test_refusals() -> None:
+    one = np.ones(1)
+    with pytest.raises(MassConstraintError, match="cannot weigh 2 kg"):
+        fit_masses(line_model, one, MASSES, MODAL, total_mass=2.0)
+    with pytest.raises(MassConstraintError, match="cannot weigh nan"):
+        fit_masses(line_model, one, MASSES, MODAL, total_mass=math.nan)
+    with pytest.raises(MassConstraintError, match="at the limit of the model"):
+        fit_masses(line_model, one, MASSES, replace(MODAL, frequency=(7.0, 29.9)))
+    with pytest.raises(ExperimentDataError, match="neither may be negative"):
+        fit_masses(line_model, one, MASSES, replace(MODAL, damping_ratio=(0.02, 0.5)))
+
+
+def test_bad_files(tmp_path: Path) -> None:
+    file = tmp_path / "e.csv"
+    header = "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_pitot,freq_1,freq_2\n"
+    for text, error, words in (
+        (header, ExperimentFileError, "no rows"),
+        (
+            header.replace("freq_2\n", "f\n") + "1,5.6,29.9,.03,.07,.17,.1,5.6,28.6\n",
+            ExperimentFileError,
+            "no column 'freq_2'",
+        ),
+        (
+            header + "1,5.6,29.9,.03,.07,.17,,5.6,28.6\n",
+            ExperimentFileError,
+            "'mass_pitot' must hold a number, and nothing",
+        ),
+    ):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(error, match=words):
+            read_published_results(file)
+    with pytest.raises(ExperimentFileError, match="does not hold"):
+        read_published_results(tmp_path)
+    with pytest.raises(ExperimentFileError, match="does not exist"):
+        read_published_results(tmp_path / "nothing")
