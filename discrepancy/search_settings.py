@@ -144,6 +144,8 @@ class SearchSettings:
     slim: float = 0.01
     """Share of the missing force below which a further effect or a shape of its own is no part of a name;
     three times it where they were fitted, as any freedom gains there."""
+    nearly_all: float = 0.9
+    """Share of the missing force from which on laws are named without an error of readings beside them."""
     force_rival: float = 10.0
     """Log evidence within which another effect is no worse along the missing force, whose motion is taken as
     known: unless trials that were not fitted tell them apart."""

@@ -60,6 +60,8 @@ class Court(Generic[H]):
         """Return why a hypothesis is no name; empty where nothing speaks against it."""
         if not any(self.acts(term) for term in item.candidate.terms):
             return "it describes readings, causes nothing and leaves more than noise"
+        if item.candidate.is_family and len(item.candidate.terms) > 1:
+            return "beside another law a shape of its own imitates nearly anything"
         least = SEARCH.least_end
         inside = self.share(item, held_out=False)
         if _is_little(inside, least):

@@ -88,6 +88,9 @@ def _named(problem: Problem, found: Search) -> tuple[Verdict, Search, CandidateF
     if may_name and _stands_for_parameters(problem, found, verdict):
         return _strained(problem, found, verdict), found, found.none
     if stands and len(verdict.effects) > 1:
+        alone = _without_readings(problem, found, verdict, fit)
+        if alone is not None:
+            return alone
         verdict, _, fit = without_sliver(problem, found, verdict, fit)
         return verdict, found, fit
     misfits = any(
@@ -101,6 +104,21 @@ def _named(problem: Problem, found: Search) -> tuple[Verdict, Search, CandidateF
     if found.force is not None:
         return judged_in_part(problem, found, verdict)
     return judged_in_part(problem, found, verdict)
+
+
+def _without_readings(
+    problem: Problem, found: Search, verdict: Verdict, fit: CandidateFit
+) -> tuple[Verdict, Search, CandidateFit] | None:
+    """Return the verdict that names laws in part, without an error of readings that was named beside them.
+
+    Where laws are nearly all of the missing force, such an error takes up what is left, whatever it is.
+    """
+    acts = [acts_within(term.effect, problem.setting) for term in fit.candidate.terms]
+    if found.force is None or all(acts) or not any(acts):
+        return None
+    other = judged_in_part(problem, found, verdict)
+    in_part, share = other[0].kind is VerdictKind.NAMED_IN_PART, other[0].explained
+    return other if in_part and share is not None and share.value > SEARCH.nearly_all else None
 
 
 def _all_small(problem: Problem, found: Search, verdict: Verdict, fit: CandidateFit) -> bool:
