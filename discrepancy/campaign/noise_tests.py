@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import chdtr, chdtrc, fdtr, fdtrc, gammaincc
 
-FloatArray = NDArray[np.float64]
+from discrepancy.campaign.records import FloatArray
 
 SHORTEST_SERIES = 32
 """Fewest samples of a series whose whiteness is tested."""

@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.campaign.sampling import is_even
 from fe.runtime.modal_system import ModalSystem
-
-FloatArray = NDArray[np.float64]
 
 
 def free_motion(

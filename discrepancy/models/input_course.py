@@ -6,14 +6,11 @@ from math import isfinite, pi
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PPoly
 
-from discrepancy.campaign.records import Hold, Trial
+from discrepancy.campaign.records import FloatArray, Hold, Trial
 from discrepancy.models.memory import Memory
 from fe.runtime.expression import Expression
-
-FloatArray = NDArray[np.float64]
 
 KEPT_COURSES, KEPT_TIMES = 64, 24
 """Records whose courses are kept, and times at which each of them is: a search asks for the same ones."""

@@ -1,18 +1,15 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Release, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from fe.runtime.patch import ModelPatch, Primitive
 from reporting.words import counted
-
-FloatArray = NDArray[np.float64]
 
 DEFAULT_PLACE = "tip_load"
 """What a campaign says when it does not say where the force acts; a model with one input takes that one."""
@@ -276,18 +273,23 @@ def check_parameters(what: str, parameters: Sequence[ModelParameter], values: Fl
         raise ModelError(f"{what} has {counted(len(parameters), 'parameter')}, but {values.size} came.")
 
 
-def check_outputs(
-    what: str, quantities: Mapping[str, Quantity], outputs: Sequence[tuple[str, Quantity]]
-) -> None:
-    """Refuse outputs that a model, `what`, does not have, and such as a channel cannot measure."""
+def check_outputs(what: str, model: Model, outputs: Outputs, known: Iterable[str]) -> None:
+    """Refuse outputs that a model, `what`, does not have beside those `known`, or no channel can measure."""
     for output, quantity in outputs:
-        own = quantities.get(output)
+        own = model.output_quantity(output)
         if own is None:
-            raise ModelError(f"{what} has no output {output!r}; it has {', '.join(quantities)}.")
+            raise ModelError(f"{what} has no output {output!r}; it has {', '.join(known)}.")
         if not quantity.shows(own):
             raise ModelError(
                 f"{what}: the output {output!r} is a {own.value}, but a channel measures {quantity.value}."
             )
+
+
+def release_of(trial: Trial) -> Release:
+    """Return how a ring-down began; raises `ModelError` where it does not say it."""
+    if trial.release is None:
+        raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
+    return trial.release
 
 
 def check_no_inputs(trial: Trial, what: str) -> None:

@@ -6,10 +6,9 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from discrepancy.campaign.records import Hold, Quantity, RecordedInput, Start, Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.input_course import Course, Drive, FormulaCourse, acting_force
 from discrepancy.models.interface import DEFAULT_PLACE, Conditions
@@ -22,8 +21,6 @@ from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.second_order_motion import Motion
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import PointMass, PortLoad, Primitive, RootCompliance, course_of
-
-FloatArray = NDArray[np.float64]
 
 MOST_MODES = 8
 """Modes that move of a structure on springs; the others follow without inertia."""

@@ -7,15 +7,10 @@ to act is in the model's own response; s is what a missing force adds to it.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Hold, Trial
+from discrepancy.campaign.records import FloatArray, Hold, Trial
 from discrepancy.models.input_course import Course
-from discrepancy.models.interface import Model
-from discrepancy.models.wrapped import innermost
 from fe.runtime.patch import ModelPatch
-
-FloatArray = NDArray[np.float64]
 
 NO_PATCH = ModelPatch()
 
@@ -49,58 +44,6 @@ class PortedSystem:
     through: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class OutputRows:
-    """What outputs show: rows of q, q', q'' (C, M) each, and what they show of a port's force (P, C)."""
-
-    displacement: FloatArray
-    speed: FloatArray
-    acceleration: FloatArray
-    force: FloatArray
-
-
-def modal_system(
-    matrices: tuple[FloatArray, FloatArray, FloatArray],
-    ports: dict[str, tuple[FloatArray, FloatArray]],
-    shown: OutputRows,
-    moving: int,
-) -> PortedSystem:
-    """Return the linear system of M q'' + D q' + K q = -sum_p acts_p g_p.
-
-    Parameters
-    ----------
-    matrices : tuple of (M, M) ndarray
-        M, D and K in modal coordinates.
-    ports : dict of str to ((M,) ndarray, (M,) ndarray)
-        Row by which each port moves, and row along which its force acts.
-    shown : OutputRows
-        Of the outputs.
-    moving : int
-        The first coordinates; of the others, which are states, only the speeds are kept.
-    """
-    mass, damping, stiffness = matrices
-    count = len(mass)
-    sees, acts = (np.array([rows[k] for rows in ports.values()]).reshape(len(ports), count) for k in (0, 1))
-    by_stiffness, by_damping = np.linalg.solve(mass, stiffness), np.linalg.solve(mass, damping)
-    push = np.linalg.solve(mass, acts.T).T
-    generator = np.zeros((moving + count, moving + count))
-    generator[:moving, moving : 2 * moving] = np.eye(moving)
-    generator[moving:, :moving] = -by_stiffness[:, :moving]
-    generator[moving:, moving:] = -by_damping
-    outputs = np.hstack(
-        (
-            (shown.displacement - shown.acceleration @ by_stiffness)[:, :moving],
-            shown.speed - shown.acceleration @ by_damping,
-        )
-    )
-    none = np.zeros((len(sees), count))
-    held, speeds = np.hstack((sees[:, :moving], none)), np.hstack((none[:, :moving], sees))
-    return PortedSystem(
-        generator, tuple(ports), np.hstack((none[:, :moving], push)), held, speeds, outputs,
-        push @ shown.acceleration.T - shown.force,
-    )  # fmt: skip
-
-
 def refined(trial: Trial, parts: int) -> Trial:
     """Return a trial with stamps that are `parts` times denser, its inputs as they are between samples."""
     count = len(trial.time)
@@ -125,14 +68,3 @@ def refined(trial: Trial, parts: int) -> Trial:
         health=dense(trial.health), health_deviation=dense(trial.health_deviation),
         inputs=tuple(replace(item, values=held(item.values, item.hold)) for item in trial.inputs),
     )  # fmt: skip
-
-
-def shows_ports(model: Model) -> bool:
-    """Whether a model tells how its ports move (`ported` and `port_motion`)."""
-    return hasattr(innermost(model), "ported")
-
-
-def apart(model: Model) -> tuple[Model, ModelPatch]:
-    """Return a model without laws at its ports, and these at the prior means."""
-    found: tuple[Model, ModelPatch] = model.apart() if hasattr(model, "apart") else (model, NO_PATCH)
-    return found

@@ -6,12 +6,10 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Quantity, Start
+from discrepancy.campaign.records import FloatArray, Quantity, Start
 from discrepancy.models.input_course import Course, Drive, FormulaCourse
 
-FloatArray = NDArray[np.float64]
 Load = tuple[FloatArray, Course | FormulaCourse]
 """Row (N,) along which a load acts, and its course."""
 

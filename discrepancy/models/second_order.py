@@ -7,9 +7,8 @@ it for a `Motion`, which says what outputs show. Between the stamps the linear p
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Hold, Quantity, Release, Start
+from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start
 from discrepancy.campaign.sampling import is_even
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
@@ -22,8 +21,6 @@ from discrepancy.models.second_order_motion import Motion
 from discrepancy.models.stepwise import Begin, Boundaries, advance, exact_steps, exponentials, substeps
 from discrepancy.models.stepwise_kernel import Steps
 from fe.runtime.motion import Laws, ModalMotion, simulate
-
-FloatArray = NDArray[np.float64]
 
 LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point less than this share of the most moving one is scaled by the share."""

@@ -5,15 +5,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Quantity
+from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.rig_records import Acting, Shown, shown_rows
 from fe.runtime.motion import Laws
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

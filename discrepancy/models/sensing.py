@@ -4,9 +4,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
 from discrepancy.models.interface import Conditions, Model, Response
 from discrepancy.models.wrapped import built_in_sensors
@@ -20,8 +19,6 @@ from fe.runtime.sensors import (
     needs_components,
     uses_sensors,
 )
-
-FloatArray = NDArray[np.float64]
 
 __all__ = ["observe", "observe_response", "record_of", "uses_sensors"]
 

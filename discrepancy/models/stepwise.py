@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.models.compiled_motion import compiled_steps
 from discrepancy.models.memory import Memory
 from discrepancy.models.stepwise_kernel import Steps, Structure
@@ -20,7 +21,6 @@ from fe.runtime.modal_system import ModalSystem, exact_step
 from fe.runtime.motion import FASTEST_PHASE, SLOWEST_PHASE, Laws, ModalMotion, port_flexibility
 from fe.runtime.motion_arrays import Samples, State
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 

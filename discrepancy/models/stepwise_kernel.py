@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from fe.runtime.flexible_ports import begin_flexible, carry_flexible
 from fe.runtime.motion_arrays import SPEED, Acting, Before, Course, Linear, Ports, Samples, State
 from fe.runtime.motion_kernel import (
@@ -23,7 +24,6 @@ from fe.runtime.motion_kernel import (
     second_half,
 )
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 

@@ -20,8 +20,8 @@ from calibration.wing.result import CalibrationResult
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.models.interface import Model
-from discrepancy.models.patched import PatchedModel
 from discrepancy.models.wing import WingModel
+from discrepancy.models.wrapped import PatchedModel
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.packing.patched_runtime import output_channels

@@ -26,9 +26,8 @@ from discrepancy.model_choice import load_model
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.patched import PatchedModel
-from discrepancy.models.ported import apart, refined
-from discrepancy.models.wrapped import has_law
+from discrepancy.models.ported import refined
+from discrepancy.models.wrapped import PatchedModel, apart, has_law
 from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.report.text import force_sentence
 from discrepancy.search.strategy import Search

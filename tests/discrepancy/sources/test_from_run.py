@@ -25,8 +25,8 @@ from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import choice_of_run, choose_model
 from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.memo import MemoModel
 from discrepancy.models.sensing import observe
+from discrepancy.models.wrapped import MemoModel
 from discrepancy.sources.from_run import RunPlan, held_out_turns, run_campaign, run_model
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
