@@ -21,7 +21,7 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course
+from discrepancy.models.acting import Course
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.sensing import observe

@@ -18,7 +18,7 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.models.ported import PortedSystem
+from discrepancy.models.interface import PortedSystem
 from discrepancy.models.wrapped import shows_ports
 from discrepancy.verdict import GapWindow, Moment
 

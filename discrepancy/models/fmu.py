@@ -14,8 +14,10 @@ from discrepancy.models.fmu_ports import SAFE_TURN
 from discrepancy.models.fmu_runs import FmuRuns, Run, State
 from discrepancy.models.fmu_trials import FmuPatch, FmuTrials, sampled
 from discrepancy.models.interface import (
+    NO_PATCH,
     Conditions,
     Outputs,
+    PortedSystem,
     PortScale,
     Response,
     Scales,
@@ -28,7 +30,6 @@ from discrepancy.models.interface import (
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.patch_parts import laws_at, sorted_patch
 from discrepancy.models.port_system import PortSystem
-from discrepancy.models.ported import NO_PATCH, PortedSystem
 from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import (
     INTERNAL_FORCES,

@@ -9,10 +9,10 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.acting import Course, acting_force
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Run, State
-from discrepancy.models.input_course import Course, acting_force
 from discrepancy.models.interface import DEFAULT_PLACE, Conditions, Response, release_of
 from discrepancy.models.patch_parts import LoadChange
 from fe.runtime.motion import NO_LAWS, Laws

@@ -192,8 +192,41 @@ class Response:
     shear: FloatArray | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class PortedSystem:
+    """A model in motion as a linear system with ports: what a force that nobody knows of does to readings.
+
+    s' = A s - sum_p b_p g_p, y = C s - sum_p e_p g_p, in the coordinates s = (q, q') of the modes. What is
+    known to act is in the model's own response; s is what a missing force adds to it.
+
+    Attributes
+    ----------
+    generator : (n, n) ndarray
+        A [1/s].
+    ports : tuple of str
+        Names, P of them.
+    actions : (P, n) ndarray
+        b of each port: what takes its force from the state.
+    positions, speeds : (P, n) ndarray
+        Rows by which a port moves. A port of a state moves at the speed that the state is.
+    outputs : (C, n) ndarray
+        Rows of the outputs.
+    through : (P, C) ndarray
+        e of each port: what an output shows of its force at once.
+    """
+
+    generator: FloatArray
+    ports: tuple[str, ...]
+    actions: FloatArray
+    positions: FloatArray
+    speeds: FloatArray
+    outputs: FloatArray
+    through: FloatArray
+
+
 Outputs = tuple[tuple[str, Quantity], ...]
 """Outputs, and the quantity wanted of each."""
+NO_PATCH = ModelPatch()
 
 
 class Model(Protocol):

@@ -18,9 +18,9 @@ from scipy.linalg.lapack import dpotrs
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
+from discrepancy.models.acting import Acting, Shown
 from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.ported import PortedSystem
-from discrepancy.models.rig_records import Acting, Shown
+from discrepancy.models.interface import PortedSystem
 from discrepancy.models.stepwise import CoupledModes
 from fe.runtime.errors import SolutionError
 from fe.runtime.motion import NO_LAWS, Laws, StaticSolution, static_solution

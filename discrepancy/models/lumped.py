@@ -9,8 +9,10 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import (
+    NO_PATCH,
     Conditions,
     Outputs,
+    PortedSystem,
     Response,
     Scales,
     check_lumped,
@@ -24,7 +26,6 @@ from discrepancy.models.lumped_scales import lumped_scales, state_sizes
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.patch_parts import LoadChange, SortedPatch, laws_at, sorted_patch
-from discrepancy.models.ported import NO_PATCH, PortedSystem
 from fe.runtime.laws import LAWS
 from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.patch import (

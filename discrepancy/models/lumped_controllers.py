@@ -8,10 +8,9 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Hold, RecordedInput, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course
+from discrepancy.models.acting import Course, Load, Shown
 from discrepancy.models.lumped_file import GAINS
 from discrepancy.models.lumped_sections import ControllerSection
-from discrepancy.models.rig_records import Load, Shown
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
+from discrepancy.models.acting import order_of
 from discrepancy.models.lumped_sections import (
     ControllerSection,
     CouplingSection,
@@ -28,7 +29,6 @@ from discrepancy.models.lumped_sections import (
     ScaledParameter,
 )
 from discrepancy.models.model_file import ModelDescription, Positive, check_unique
-from discrepancy.models.rig_records import order_of
 from fe.runtime.patch import ModelPatch
 from reporting.section import checked
 from reporting.toml_file import read_toml

@@ -10,15 +10,22 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course, Drive, FormulaCourse, acting_force
+from discrepancy.models.acting import (
+    Acting,
+    Course,
+    Drive,
+    FormulaCourse,
+    Load,
+    Shown,
+    acting_force,
+    order_of,
+)
 from discrepancy.models.interface import DEFAULT_PLACE, Conditions
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
 from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.patch_parts import LoadChange
-from discrepancy.models.rig_records import Acting, Load, Shown, order_of
-from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.second_order_motion import Motion
+from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import PointMass, PortLoad, Primitive, RootCompliance, course_of
 

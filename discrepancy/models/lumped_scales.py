@@ -8,7 +8,7 @@ from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, 
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, PortScale, Scales, campaign_sizes
 from discrepancy.models.lumped_rig import LumpedRig
-from discrepancy.models.second_order_motion import Motion
+from discrepancy.models.second_order import Motion
 
 
 def state_sizes(lumped: LumpedRig, campaign: Campaign, trial: Trial, conditions: Conditions) -> FloatArray:

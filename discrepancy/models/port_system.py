@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import expm, logm
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.models.ported import PortedSystem
+from discrepancy.models.interface import PortedSystem
 
 MOST_STATES = 40
 """Largest order of a linear system that is made from records."""

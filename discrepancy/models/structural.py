@@ -8,11 +8,13 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course, acting_force
+from discrepancy.models.acting import Course, acting_force
 from discrepancy.models.interface import (
+    NO_PATCH,
     Conditions,
     ModelParameter,
     Outputs,
+    PortedSystem,
     PortScale,
     Response,
     Scales,
@@ -26,9 +28,7 @@ from discrepancy.models.interface import (
 from discrepancy.models.linear_system import solved
 from discrepancy.models.memory import Memory
 from discrepancy.models.patch_parts import LoadChange
-from discrepancy.models.ported import NO_PATCH, PortedSystem
-from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.second_order_motion import Motion
+from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import (

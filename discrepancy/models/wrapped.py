@@ -9,9 +9,17 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Conditions, Model, ModelParameter, Outputs, Response, Scales
+from discrepancy.models.interface import (
+    NO_PATCH,
+    Conditions,
+    Model,
+    ModelParameter,
+    Outputs,
+    PortedSystem,
+    Response,
+    Scales,
+)
 from discrepancy.models.memory import Memory
-from discrepancy.models.ported import NO_PATCH, PortedSystem
 from fe.runtime.patch import SENSORS, ModelPatch, PortForce, Primitive
 
 KEPT = 400
@@ -136,7 +144,7 @@ class PatchedModel(WrappedModel):
     def ported(
         self, trial: Trial, outputs: Outputs, parameters: FloatArray, patch: ModelPatch = NO_PATCH
     ) -> PortedSystem:
-        """Return the system by which outputs see missing forces, see `discrepancy.models.ported`.
+        """Return the system by which outputs see missing forces, see `PortedSystem`.
 
         Raises
         ------

@@ -12,10 +12,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from discrepancy.campaign.records import Quantity, Release
+from discrepancy.models.acting import Course
 from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.input_course import Course
-from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.second_order_motion import Motion
+from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.laws.micro_slip import slip_displacements
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import ModalMotion, laws_of, simulate

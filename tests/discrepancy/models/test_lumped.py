@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course
+from discrepancy.models.acting import Course
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped

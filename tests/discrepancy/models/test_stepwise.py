@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
+from discrepancy.models.acting import Course
 from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.input_course import Course
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.second_order import SecondOrderSystem
