@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline, PPoly
 
-from discrepancy.campaign.records import FloatArray, Hold, Quantity, Start, Trial
+from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start, Trial
 from discrepancy.models.memory import Memory
 from fe.runtime.expression import Expression
 
@@ -210,9 +210,13 @@ class Acting:
     drives : sequence of Drive
         Prescribed motions, in the order of `LinearSystem.drives`.
     begins : Start
-        How it began.
-    initial : (L,) ndarray
+        How it began, where it was not released.
+    initial : (L,) or (R, 2) ndarray
         State at the first stamp, where it is unknown: displacements and speeds of the modes, then the states.
+        Of a release as in `Conditions`; rows beyond the modes are passed over.
+    release : tuple of ((n,) ndarray, Release), optional
+        How a structure was let go, and the row of the release point: row . u is its displacement, and the
+        holding force acts along it.
     clock : tuple of float
         Rate and zero of the samples beside the inputs.
     references : mapping of str to sequence of Load
@@ -227,6 +231,7 @@ class Acting:
     initial: FloatArray = field(default_factory=lambda: np.zeros(0))
     clock: tuple[float, float] = (0.0, 0.0)
     references: Mapping[str, Sequence[Load]] = field(default_factory=dict)
+    release: tuple[FloatArray, Release] | None = None
 
     @property
     def sampled(self) -> FloatArray:

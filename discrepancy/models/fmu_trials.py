@@ -13,7 +13,7 @@ from discrepancy.models.acting import Course, acting_force
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Run, State
-from discrepancy.models.interface import DEFAULT_PLACE, Conditions, Response, release_of
+from discrepancy.models.interface import Conditions, Response, place_among, release_of
 from discrepancy.models.patch_parts import LoadChange
 from fe.runtime.motion import NO_LAWS, Laws
 
@@ -131,8 +131,9 @@ class FmuTrials:
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""
         inputs = self._description.inputs
         moments = ((inputs.bending_moment, patch.load.along_span), (inputs.torque, patch.load.along_chord))
+        place = place_among([*self._forces], trial.load_place, f"the FMU model {self._name!r}")
         return [
-            (self._input_of(trial), 1.0),
+            (self._forces[place], 1.0),
             *((self._runs.variable(name), lever) for name, lever in moments if name is not None and lever),
         ]
 
@@ -199,19 +200,6 @@ class FmuTrials:
             parameters[key] = float(value)
         parameters |= dict(settings)
         return State(tuple(sorted(parameters.items())), tuple(sorted(inputs.items())))
-
-    def _input_of(self, trial: Trial) -> str:
-        place = trial.load_place
-        if place == DEFAULT_PLACE and place not in self._forces and len(self._forces) == 1:
-            return next(iter(self._forces.values()))
-        if not isinstance(place, str) or place not in self._forces:
-            known = ", ".join(self._forces) or "none"
-            said = "says no load_place" if place == DEFAULT_PLACE else f"is loaded at {place!r}"
-            raise ModelError(
-                f"The trial {trial.name!r} {said}, and the FMU model {self._name!r} takes forces at {known}: "
-                + ("name one of these as its load_place." if self._forces else "name an input in [inputs].")
-            )
-        return self._forces[place]
 
 
 def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Sequence[int]) -> Response:

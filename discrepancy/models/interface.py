@@ -11,6 +11,7 @@ from discrepancy.errors import ModelError
 from fe.runtime.patch import ModelPatch, Primitive
 from reporting.words import counted
 
+Place = str | tuple[float, float]
 DEFAULT_PLACE = "tip_load"
 """What a campaign says when it does not say where the force acts; a model with one input takes that one."""
 
@@ -316,6 +317,23 @@ def check_outputs(what: str, model: Model, outputs: Outputs, known: Iterable[str
             raise ModelError(
                 f"{what}: the output {output!r} is a {own.value}, but a channel measures {quantity.value}."
             )
+
+
+def place_among(places: Sequence[str], place: Place, what: str) -> str:
+    """Return the load place of a model, `what`, that a trial means: the only one where it says none.
+
+    Raises
+    ------
+    ModelError
+        If there is no such place, or none is named of several.
+    """
+    if place == DEFAULT_PLACE and place not in places and len(places) == 1:
+        return places[0]
+    if not isinstance(place, str) or place not in places:
+        said = "no load_place is said" if place == DEFAULT_PLACE else f"the load place is {place!r}"
+        known = f"forces at {', '.join(places)}: name one of these" if places else "no force"
+        raise ModelError(f"In a trial {said}, and {what} takes {known}.")
+    return place
 
 
 def release_of(trial: Trial) -> Release:

@@ -20,7 +20,7 @@ from discrepancy.models.acting import (
     acting_force,
     order_of,
 )
-from discrepancy.models.interface import DEFAULT_PLACE, Conditions
+from discrepancy.models.interface import Conditions, Place, place_among, release_of
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
 from discrepancy.models.lumped_sections import InputSection
@@ -196,7 +196,11 @@ class LumpedRig:
             If the trial records an input that the model does not have or that is of another quantity.
         """
         if trial.kind is TrialKind.RINGDOWN:
-            return Acting(trial.time, self._constant, clock=conditions.clock), ()
+            row, initial = self.moved_row(self.input_at(trial.load_place)), conditions.initial
+            release = (row, release_of(trial))
+            return Acting(
+                trial.time, self._constant, initial=initial, clock=conditions.clock, release=release
+            ), ()
         recorded = self.recorded(trial)
         loads, drives, references = list[Load](), dict[str, Drive](), dict[str, Sequence[Load]]()
         offsets = (*conditions.offset, *(0.0,) * len(recorded))
@@ -241,17 +245,11 @@ class LumpedRig:
         item = self.input_at(trial.load_place)
         return (RecordedInput(item.name, item.quantity, trial.force, trial.hold),)
 
-    def input_at(self, place: str | tuple[float, float]) -> InputSection:
+    def input_at(self, place: Place) -> InputSection:
         """Return the input of a load place; raises `ModelError` if there is none."""
         forces = [name for name, item in self._inputs.items() if not item.quantity.moving]
-        if place == DEFAULT_PLACE and place not in self._inputs and len(forces) == 1:
-            place = forces[0]
-        if not isinstance(place, str) or place not in self._inputs:
-            raise ModelError(
-                f"The load place {place!r} is not an input of the lumped model {self.description.name!r}; it "
-                f"has {', '.join(self._inputs) or 'none'}."
-            )
-        return self._inputs[place]
+        known = [*self._inputs] if place in self._inputs else forces
+        return self._inputs[place_among(known, place, f"the lumped model {self.description.name!r}")]
 
     def moved_row(self, item: InputSection, change: LoadChange = UNCHANGED) -> FloatArray:
         """Return the row (n + m,) along which an input acts, where its place has been moved to."""
@@ -299,17 +297,10 @@ class LumpedRig:
         ModelError
             If it cannot begin so, or what acts is not the model's.
         """
-        acting, drives = self.acting(trial, conditions, change)
-        system = self.system(drives)
         if trial.kind is TrialKind.RINGDOWN:
             self._check_released(trial, at_ports)
-            row = self.moved_row(self.input_at(trial.load_place))
-            assert trial.release is not None  # it has been checked
-            motion = system.ringdown(
-                row, trial.release, conditions.initial, trial.time, laws, clock=conditions.clock,
-                refinement=refinement,
-            )  # fmt: skip
-            return motion, drives
+        acting, drives = self.acting(trial, conditions, change)
+        system = self.system(drives)
         if at_ports:
             pushed = [self._at_port(item, system) for item in at_ports]
             acting = replace(acting, loads=[*acting.loads, *pushed])
@@ -333,8 +324,6 @@ class LumpedRig:
             raise ModelError(
                 f'The trial {trial.name!r} is a ring-down, {why}; say kind = "driven" and begins = "unknown".'
             )
-        if trial.release is None:
-            raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
 
     def _at_port(self, load: PortLoad, system: SecondOrderSystem) -> Load:
         """Return the row and the course of a load at a port."""

@@ -8,10 +8,10 @@ from scipy.linalg import inv
 
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import DEFAULT_PLACE, ModelParameter, Outputs, check_outputs
+from discrepancy.models.interface import ModelParameter, Outputs, Place, check_outputs, place_among
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.structural import Moving, Place, State, StructuralModel
+from discrepancy.models.structural import Moving, State, StructuralModel
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, ModelPatch, Primitive
 from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum
 from fe.runtime.state import Losses
@@ -160,13 +160,8 @@ class StructureModel(StructuralModel):
         ModelError
             If there is no such force, or none is named of several.
         """
-        if place == DEFAULT_PLACE and place not in self.forces and len(self.forces) < 2:
-            place = self.reference
-        if place not in (*self.forces, self.reference):
-            raise ModelError(
-                f"The load place {place!r} is no force of {self.name}; it has {', '.join(self.forces)}."
-            )
-        return self._load(parameters, **{str(place): 1.0})
+        place = place_among(self.forces or (self.reference,), place, self.name)
+        return self._load(parameters, **{place: 1.0})
 
     def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
         """Return the loads (2, n) of the load factor and of its square, which is zero."""

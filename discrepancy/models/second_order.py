@@ -168,11 +168,25 @@ class SecondOrderSystem(LinearSystem):
     def motion(self, acting: Acting, laws: Laws, refinement: int = 1) -> Motion:
         """Return the motion of a trial; a record that the clock makes begin late is followed from its begin.
 
+        Before a release from rest the shape is held. A release that is not from rest is continued backwards
+        without internal forces where its clock asks for times before zero.
+
+        Parameters
+        ----------
+        acting : Acting
+            What acts.
+        laws : Laws
+            Internal forces.
+        refinement : int
+            Steps are this many times smaller.
+
         Raises
         ------
         ModelError
-            If it begins at rest where there is none.
+            If it begins at rest where there is none, or the release point cannot be moved.
         """
+        if acting.release is not None:
+            return self._let_go(*acting.release, acting, laws, refinement)
         times, first = acting.sampled, float(acting.time[0])
         begin = self._first(acting, laws)
         found = self._followed(acting, laws, first, times, begin, refinement)
@@ -180,69 +194,13 @@ class SecondOrderSystem(LinearSystem):
             self._rest_on_drives(found, begin.v, laws)
         return Motion(self, acting, times, found.q, found.v, found.port_forces, found.lagged, laws)
 
-    def forced(
-        self,
-        input_row: FloatArray,
-        course: Course,
-        time: FloatArray,
-        laws: Laws,
-        *,
-        clock: tuple[float, float] = (0.0, 0.0),
-        refinement: int = 1,
+    def _let_go(
+        self, row: FloatArray, release: Release, acting: Acting, laws: Laws, refinement: int
     ) -> Motion:
-        """Return the motion at `time` (N,) from rest under the course of a force [N] along a row (n,).
-
-        The record of the force is taken as right; with a clock error the samples of the motion are taken at
-        (1 + rate) t + zero, and the force is read there from its record. Parameters as in `ringdown`.
-        """
-        acting = Acting(time, np.zeros(len(self.mass)), [(input_row, course)], clock=clock)
-        return self.motion(acting, laws, refinement)
-
-    def ringdown(
-        self,
-        release_row: FloatArray,
-        release: Release,
-        initial: FloatArray,
-        time: FloatArray,
-        laws: Laws,
-        *,
-        clock: tuple[float, float] = (0.0, 0.0),
-        refinement: int = 1,
-    ) -> Motion:
-        """Return the motion of a structure that springs hold after a release.
-
-        Parameters
-        ----------
-        release_row : (n,) ndarray
-            The release point: row . u is its displacement, and the holding force acts along it.
-        release : Release
-            How it began.
-        initial : (R, 2) ndarray
-            As in `Conditions`; rows beyond the modes are passed over.
-        time : (N,) ndarray
-            Stamps of the samples [s], strictly increasing.
-        laws : Laws
-            Internal forces.
-        clock : tuple of float
-            Rate and zero: a sample stamped t shows the motion at (1 + rate) t + zero.
-        refinement : int
-            Steps are this many times smaller.
-
-        Returns
-        -------
-        Motion
-            Before a release from rest the shape is held. A record that does not begin at rest is continued
-            backwards without internal forces where its clock asks for times before zero.
-
-        Raises
-        ------
-        ModelError
-            If the release point cannot be moved, or the static state has no solution.
-        """
-        acting = Acting(time, np.zeros(len(self.mass)), begins=Start.UNKNOWN, clock=clock)
+        """Return the motion of a structure that springs hold after a release at a row (n,)."""
         times, acts = acting.sampled, laws.act_at(0.0)
         loaded = laws.only(acts) if laws.spans else laws
-        begin, holding = self._released(release_row, release, initial, loaded)
+        begin, holding = self._released(row, release, acting.initial, loaded)
         q, v, memory = begin
         if memory is not None and laws.spans:
             begin = begin._replace(memory=laws.filled(memory, acts))

@@ -2,18 +2,20 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course, acting_force
+from discrepancy.models.acting import Acting, Course, acting_force
 from discrepancy.models.interface import (
     NO_PATCH,
     Conditions,
     ModelParameter,
     Outputs,
+    Place,
     PortedSystem,
     PortScale,
     Response,
@@ -43,8 +45,6 @@ from fe.runtime.patch import (
     Primitive,
 )
 from fe.runtime.state import Losses
-
-Place = str | tuple[float, float]
 
 
 class State(NamedTuple):
@@ -325,13 +325,13 @@ class StructuralModel(ABC):
         basis, system = moved
         loads = patch.of(*LOADS) if trial.kind is TrialKind.FORCED else NO_PATCH
         row = self.force_row(trial.load_place, conditions.parameters, loads) @ basis
+        acting = Acting(trial.time, np.zeros(len(row)), clock=conditions.clock)
         if trial.kind is TrialKind.RINGDOWN:
-            return system.ringdown(
-                row, release_of(trial), conditions.initial, trial.time, laws, clock=conditions.clock,
-                refinement=refinement,
-            )  # fmt: skip
-        course = Course.of(trial.time, _amounts(trial, loads)[:, 0], trial.hold)
-        return system.forced(row, course, trial.time, laws, clock=conditions.clock, refinement=refinement)
+            acting = replace(acting, release=(row, release_of(trial)), initial=conditions.initial)
+        else:
+            course = Course.of(trial.time, _amounts(trial, loads)[:, 0], trial.hold)
+            acting = replace(acting, loads=[(row, course)])
+        return system.motion(acting, laws, refinement)
 
     # ------------------------------------------------------------ ports
 
@@ -367,7 +367,7 @@ class StructuralModel(ABC):
             unit = rows @ static.solve(self._units(trial, values, NO_PATCH).T)
             return np.asarray(_amounts(trial, NO_PATCH) @ unit.T)
         if trial.kind is TrialKind.FORCED:
-            motion = moved.system.forced(row @ moved.basis, Course.of_force(trial), trial.time, NO_LAWS)
+            motion = self._motion(moved, trial, Conditions(values), NO_PATCH)
             return motion.values(rows @ moved.basis)
         shape = static.solve(row)
         size = trial.release.displacement if trial.release is not None else 0.0

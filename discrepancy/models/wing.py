@@ -12,10 +12,10 @@ from calibration.wing.result import STATE
 from calibration.wing.result_file import load_calibration
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import ModelParameter, Outputs, PortScale, check_outputs
+from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale, check_outputs
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.structural import Moving, Place, State, StructuralModel
+from discrepancy.models.structural import Moving, State, StructuralModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import (
