@@ -198,16 +198,13 @@ class Cantilever:
         outputs: tuple[tuple[str, Quantity], ...],
         patch: ModelPatch,
         conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
     ) -> Response:
         """Return the response of a trial."""
         rows = np.array(
             [SKIN * curvature_row(GAUGES[name]) if name in GAUGES else TIP for name, _ in outputs]
         )
-        values, rates, torque = _motion(trial, rows, patch, conditions, refinement)
-        if not components:
+        values, rates, torque = _motion(trial, rows, patch, conditions)
+        if not conditions.components:
             return Response(values, rates)
         gauge = np.array([name in GAUGES for name, _ in outputs])
         shear = np.outer(torque, gauge) * 2.0 * SKIN / TORSIONAL_STIFFNESS
@@ -215,7 +212,7 @@ class Cantilever:
 
 
 def _motion(
-    trial: Trial, rows: FloatArray, patch: ModelPatch, conditions: Conditions, refinement: int = 1
+    trial: Trial, rows: FloatArray, patch: ModelPatch, conditions: Conditions
 ) -> tuple[FloatArray, FloatArray | None, FloatArray]:
     """Return values and rates (N, C) of rows (C, n), and the torque (N,) of the load."""
     structural = patch.of(PointMass, RootCompliance, LocalStiffnessLoss)
@@ -242,7 +239,7 @@ def _motion(
             acting = replace(acting, release=(TIP, release_of(trial)), initial=conditions.initial)
         else:
             acting = replace(acting, loads=[(row, Course.of(trial.time, force, trial.hold))])
-        motion = system.motion(acting, laws, refinement)
+        motion = system.motion(acting, laws, conditions.refinement)
         response = motion.response(rows, [Quantity.DISPLACEMENT] * len(rows))
         return response.values, response.rates, behind * force
     loads = np.outer(force, row)

@@ -188,16 +188,7 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ response
 
-    def respond(
-        self,
-        trial: Trial,
-        outputs: Outputs,
-        patch: ModelPatch,
-        conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
-    ) -> Response:
+    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial, see `Model.respond`; `transverse` and `shear` are never known.
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
@@ -212,7 +203,7 @@ class FmuModel(DescribedModel):
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
             return Response(self._at_rest_values(trial, conditions, parts)[:, columns])
-        values, step = self._moving(trial, conditions, parts, refinement, columns)
+        values, step = self._moving(trial, conditions, parts, columns)
         rate, zero = conditions.clock
         quantities = self.runs.quantities
         derivatives = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
@@ -223,7 +214,6 @@ class FmuModel(DescribedModel):
         trial: Trial,
         conditions: Conditions,
         patch: FmuPatch,
-        refinement: int = 1,
         columns: Sequence[int] = (),
     ) -> tuple[FloatArray, float]:
         """Return all outputs (K, C) on the grid of the communication step [s], and the step."""
@@ -232,8 +222,8 @@ class FmuModel(DescribedModel):
             return self._trials.run(trial, conditions, patch, self.motion, refined)
 
         if len(patch.laws):
-            return self.motion.with_laws(patch.laws, excite, trial, refinement, columns)
-        run = excite(refinement)
+            return self.motion.with_laws(patch.laws, excite, trial, conditions.refinement, columns)
+        run = excite(conditions.refinement)
         return self.motion.free(run), run.step
 
     # ------------------------------------------------------------ ports

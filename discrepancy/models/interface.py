@@ -156,6 +156,10 @@ class Conditions:
         Stiffness losses z1, z2 of each row (dynamic trials: row 0 holds for all).
     offset : tuple of float
         Constants that the recorded inputs of a driven trial lack, in their order [SI]; empty: none.
+    components : bool
+        Whether `transverse` and `shear` are wanted.
+    refinement : int
+        Time steps are this many times smaller than usual, to check the integration.
     """
 
     parameters: FloatArray
@@ -163,12 +167,15 @@ class Conditions:
     clock: tuple[float, float] = (0.0, 0.0)
     health: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
     offset: tuple[float, ...] = ()
+    components: bool = False
+    refinement: int = 1
 
     @property
     def key(self) -> tuple[object, ...]:
         """All of it as a value that can be looked up."""
         return (
             self.parameters.tobytes(), self.initial.tobytes(), self.clock, self.health.tobytes(), self.offset,
+            self.components, self.refinement,
         )  # fmt: skip
 
 
@@ -256,16 +263,7 @@ class Model(Protocol):
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
 
-    def respond(
-        self,
-        trial: Trial,
-        outputs: Outputs,
-        patch: ModelPatch,
-        conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
-    ) -> Response:
+    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial; sensor primitives in `patch` are ignored here.
 
         Parameters
@@ -279,10 +277,6 @@ class Model(Protocol):
             Changes of structure, internal forces and loads.
         conditions : Conditions
             The rest.
-        components : bool
-            Whether `transverse` and `shear` are wanted.
-        refinement : int
-            Time steps are this many times smaller than usual, to check the integration.
 
         Returns
         -------

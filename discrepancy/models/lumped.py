@@ -108,16 +108,7 @@ class LumpedModel(DescribedModel):
 
     # ------------------------------------------------------------ response
 
-    def respond(
-        self,
-        trial: Trial,
-        outputs: Outputs,
-        patch: ModelPatch,
-        conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
-    ) -> Response:
+    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial, see `Model.respond`; `transverse` and `shear` are never known.
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
@@ -134,7 +125,7 @@ class LumpedModel(DescribedModel):
                 )
             return self._static(trial, outputs, structure, laws, change, conditions)
         rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
-        motion, drives = rig.moved(trial, conditions, laws, change, loads, refinement)
+        motion, drives = rig.moved(trial, conditions, laws, change, loads)
         return motion.seen(rig.shown(outputs, drives, motion.acting.references))
 
     def _static(

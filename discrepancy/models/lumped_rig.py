@@ -286,7 +286,6 @@ class LumpedRig:
         laws: Laws,
         change: LoadChange = UNCHANGED,
         at_ports: Sequence[PortLoad] = (),
-        refinement: int = 1,
         *,
         still: bool = False,
     ) -> tuple[Motion, tuple[str, ...]]:
@@ -307,7 +306,7 @@ class LumpedRig:
         if still:
             acting = replace(acting, begins=Start.STILL)
         try:
-            return system.motion(acting, laws, refinement), drives
+            return system.motion(acting, laws, conditions.refinement), drives
         except ModelError as cause:
             name = self.description.name
             raise ModelError(f"The trial {trial.name!r} of {name!r}: {cause}") from cause

@@ -191,16 +191,7 @@ class StructuralModel(ABC):
 
     # ------------------------------------------------------------ response
 
-    def respond(
-        self,
-        trial: Trial,
-        outputs: Outputs,
-        patch: ModelPatch,
-        conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
-    ) -> Response:
+    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial, see `Model.respond`.
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero. In a
@@ -214,12 +205,12 @@ class StructuralModel(ABC):
                 raise ModelError(f"{self.name} cannot carry the primitive {item.kind!r}.")
         try:
             losses, forces = patch.of(LocalStiffnessLoss), patch.of(*INTERNAL_FORCES)
-            blocks = [self.output_rows(outputs, n, losses) for n in range(3 if components else 1)]
+            blocks = [self.output_rows(outputs, n, losses) for n in range(3 if conditions.components else 1)]
             laws = laws_of(self.at_ports(forces), self.port_rows) if len(forces) else NO_LAWS
             if not trial.is_dynamic:
                 return self._at_rest(trial, outputs, blocks, patch, conditions, laws)
             moved = self._moved(trial, conditions, patch, laws.ports)
-            motion = self._motion(moved, trial, conditions, patch, laws, refinement)
+            motion = self._motion(moved, trial, conditions, patch, laws)
             response = motion.response(blocks[0] @ moved.basis, [quantity for _, quantity in outputs])
             if (always := self.always(conditions.parameters)) is not None:
                 still = self.stiffness(State(conditions.parameters, self._losses(trial, conditions)[0]))
@@ -319,7 +310,6 @@ class StructuralModel(ABC):
         conditions: Conditions,
         patch: ModelPatch,
         laws: Laws = NO_LAWS,
-        refinement: int = 1,
     ) -> Motion:
         """Return the motion in a dynamic trial."""
         basis, system = moved
@@ -331,7 +321,7 @@ class StructuralModel(ABC):
         else:
             course = Course.of(trial.time, _amounts(trial, loads)[:, 0], trial.hold)
             acting = replace(acting, loads=[(row, course)])
-        return system.motion(acting, laws, refinement)
+        return system.motion(acting, laws, conditions.refinement)
 
     # ------------------------------------------------------------ ports
 

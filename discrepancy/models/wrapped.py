@@ -80,16 +80,13 @@ class MemoModel(WrappedModel):
         super().__init__(model)
         self._kept = Memory(KEPT)
 
-    def respond(
-        self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions, **how: Any
-    ) -> Response:
+    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial, kept or computed; as `Model.respond`."""
 
         def answer() -> tuple[Trial, Response]:  # the trial lives as long, so that its id stays its own
-            return trial, self.inner.respond(trial, outputs, patch, conditions, **how)
+            return trial, self.inner.respond(trial, outputs, patch, conditions)
 
-        further = (how.get("components", False), how.get("refinement", 1))
-        key = (id(trial), outputs, patch.primitives, conditions.key, further)
+        key = (id(trial), outputs, patch.primitives, conditions.key)
         return self._kept.get(key, answer)[1]
 
 
@@ -133,11 +130,9 @@ class PatchedModel(WrappedModel):
         """Sensor primitives of the inner model and of the patch."""
         return super().sensors + self.patch.of(*SENSORS)
 
-    def respond(
-        self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions, **how: Any
-    ) -> Response:
+    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial with both patches; as `Model.respond`."""
-        return self.inner.respond(trial, outputs, self.patch + patch, conditions, **how)
+        return self.inner.respond(trial, outputs, self.patch + patch, conditions)
 
     # ------------------------------------------------------------ ports, where the inner model tells of them
 

@@ -173,7 +173,7 @@ def shown(
 ) -> FloatArray:  # fmt: skip
     given = {"parameters": np.ones(len(model.parameters)), **conditions}
     return model.respond(
-        what, tuple(outputs.items()), ModelPatch(laws), Conditions(**given), refinement=refinement
+        what, tuple(outputs.items()), ModelPatch(laws), Conditions(**given, refinement=refinement)
     ).values
 
 

@@ -46,7 +46,7 @@ def trial(kind: TrialKind, time: FloatArray, **changes: Any) -> Trial:
 
 def shown(model: LumpedModel, what: Trial, *items: Primitive, refinement: int = 1) -> FloatArray:
     return model.respond(
-        what, OUTPUTS, ModelPatch(items), Conditions(np.ones(3)), refinement=refinement
+        what, OUTPUTS, ModelPatch(items), Conditions(np.ones(3), refinement=refinement)
     ).values
 
 

@@ -154,7 +154,7 @@ def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(pair: tuple[FmuModel,
         wanted = model.respond(trial, OUTPUTS, ModelPatch(), conditions).values
         for refinement in (8, 16):
             before = model.runs.step_count
-            seen = model.respond(trial, OUTPUTS, spring, conditions, refinement=refinement).values
+            seen = model.respond(trial, OUTPUTS, spring, replace(conditions, refinement=refinement)).values
             largest = np.abs(wanted).max(axis=0)
             np.testing.assert_allclose(seen / largest, wanted / largest, atol=1e-6)
     assert model.runs.step_count == before  # confirmed at the first parameters
