@@ -1,7 +1,5 @@
 """Noise records of a campaign's channels: from samples at rest, from repeated trials, or as stated."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

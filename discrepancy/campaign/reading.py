@@ -1,7 +1,5 @@
 """Reading a campaign: a folder with `campaign.toml` and tables in, a checked `Campaign` in SI units out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from math import inf

@@ -1,7 +1,5 @@
 """Writing a campaign as a folder that `campaign.reading.read_campaign` reads back to the last bit."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import asdict
 from math import isinf

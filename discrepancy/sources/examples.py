@@ -1,7 +1,5 @@
 """Small campaigns to try: simulated trials of a model, with what every test has: noise, zeros, gains."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 `docs/run_folder.md` describes the folder; it is read by its files alone.
 """
 
-from __future__ import annotations
-
 from math import inf
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 The data are not part of the package; `docs/measured_rigs.md` says where they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

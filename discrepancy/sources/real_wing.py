@@ -1,7 +1,5 @@
 """The published measurements of the real wing as a campaign: five ring-downs, and two loading runs."""
 
-from __future__ import annotations
-
 from math import inf
 from pathlib import Path
 
