@@ -131,7 +131,8 @@ class FmuTrials:
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""
         inputs = self._description.inputs
         moments = ((inputs.bending_moment, patch.load.along_span), (inputs.torque, patch.load.along_chord))
-        place = place_among([*self._forces], trial.load_place, f"the FMU model {self._name!r}")
+        what, where = f"the FMU model {self._name!r}", f"the trial {trial.name!r}"
+        place = place_among([*self._forces], trial.load_place, what, where)
         return [
             (self._forces[place], 1.0),
             *((self._runs.variable(name), lever) for name, lever in moments if name is not None and lever),

@@ -313,7 +313,7 @@ def check_outputs(what: str, model: Model, outputs: Outputs, known: Iterable[str
             )
 
 
-def place_among(places: Sequence[str], place: Place, what: str) -> str:
+def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:
     """Return the load place of a model, `what`, that a trial means: the only one where it says none.
 
     Raises
@@ -326,7 +326,7 @@ def place_among(places: Sequence[str], place: Place, what: str) -> str:
     if not isinstance(place, str) or place not in places:
         said = "no load_place is said" if place == DEFAULT_PLACE else f"the load place is {place!r}"
         known = f"forces at {', '.join(places)}: name one of these" if places else "no force"
-        raise ModelError(f"In a trial {said}, and {what} takes {known}.")
+        raise ModelError(f"In {where} {said}, and {what} takes {known}.")
     return place
 
 

@@ -434,7 +434,9 @@ def test_what_the_model_cannot_do_is_refused(rig: FmuModel) -> None:
         RINGDOWN, patch(replace(LAWS["coulomb"], port="tip"))  # type: ignore[type-var]
     )  # fmt: skip
     assert "names no load_factor" in refused(trial(TrialKind.FLIGHT, 2, load_factor=np.ones(2)))
-    assert "is loaded at 'wing tip', and the FMU model" in refused(replace(LOADS, load_place="wing tip"))
+    assert "In the trial 'a trial' the load place is 'wing tip', and the FMU model" in refused(
+        replace(LOADS, load_place="wing tip")
+    )
     assert "has no output 'x'" in refused(LOADS, outputs=(("x", Quantity.DISPLACEMENT),))
     assert "is at rest" in refused(LOADS, outputs=(("displacement", Quantity.VELOCITY),))
 
