@@ -80,10 +80,8 @@ def patch(*items: Primitive) -> ModelPatch:
 
 
 def shown(model: LumpedModel, what: Trial, *items: Primitive, **options: Any) -> FloatArray:
-    conditions = options.pop("conditions", ONES)
-    return model.respond(
-        what, options.pop("outputs", DISPLACEMENTS), patch(*items), conditions, **options
-    ).values
+    conditions, outputs = options.pop("conditions", ONES), options.pop("outputs", DISPLACEMENTS)
+    return model.respond(what, outputs, patch(*items), replace(conditions, **options)).values
 
 
 # ---------------------------------------------------------------- static
