@@ -6,6 +6,7 @@ load behind the elastic line. About the size of the wing that this project flies
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -20,9 +21,8 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course
-from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.acting import Acting, Course
+from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales, release_of
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.sensing import observe
 from fe.runtime.motion import laws_of
@@ -198,16 +198,13 @@ class Cantilever:
         outputs: tuple[tuple[str, Quantity], ...],
         patch: ModelPatch,
         conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
     ) -> Response:
         """Return the response of a trial."""
         rows = np.array(
             [SKIN * curvature_row(GAUGES[name]) if name in GAUGES else TIP for name, _ in outputs]
         )
-        values, rates, torque = _motion(trial, rows, patch, conditions, refinement)
-        if not components:
+        values, rates, torque = _motion(trial, rows, patch, conditions)
+        if not conditions.components:
             return Response(values, rates)
         gauge = np.array([name in GAUGES for name, _ in outputs])
         shear = np.outer(torque, gauge) * 2.0 * SKIN / TORSIONAL_STIFFNESS
@@ -215,7 +212,7 @@ class Cantilever:
 
 
 def _motion(
-    trial: Trial, rows: FloatArray, patch: ModelPatch, conditions: Conditions, refinement: int = 1
+    trial: Trial, rows: FloatArray, patch: ModelPatch, conditions: Conditions
 ) -> tuple[FloatArray, FloatArray | None, FloatArray]:
     """Return values and rates (N, C) of rows (C, n), and the torque (N,) of the load."""
     structural = patch.of(PointMass, RootCompliance, LocalStiffnessLoss)
@@ -237,27 +234,12 @@ def _motion(
     laws = laws_of(patch.of(*INTERNAL_FORCES), PORTS)
     if trial.is_dynamic:
         system = _system(float(modulus[0]), structural)
+        acting = Acting(trial.time, np.zeros(len(TIP)), clock=conditions.clock)
         if trial.kind is TrialKind.RINGDOWN:
-            if trial.release is None:
-                raise ModelError(f"The ring-down {trial.name!r} has no release.")
-            motion = system.ringdown(
-                TIP,
-                trial.release,
-                conditions.initial,
-                trial.time,
-                laws,
-                clock=conditions.clock,
-                refinement=refinement,
-            )
+            acting = replace(acting, release=(TIP, release_of(trial)), initial=conditions.initial)
         else:
-            motion = system.forced(
-                row,
-                Course.of(trial.time, force, trial.hold),
-                trial.time,
-                laws,
-                clock=conditions.clock,
-                refinement=refinement,
-            )
+            acting = replace(acting, loads=[(row, Course.of(trial.time, force, trial.hold))])
+        motion = system.motion(acting, laws, conditions.refinement)
         response = motion.response(rows, [Quantity.DISPLACEMENT] * len(rows))
         return response.values, response.rates, behind * force
     loads = np.outer(force, row)

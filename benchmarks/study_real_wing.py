@@ -23,7 +23,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.models.wing import WingModel
 from discrepancy.report.force_figure import missing_force_figure
-from discrepancy.sources.real_wing import SIGNAL, RecordPlan, wing_campaign
+from discrepancy.sources.real_wing import SIGNAL, wing_campaign
 from discrepancy.workflow import Investigation, investigate
 
 BEGINS = (0.8, 1.0, 1.25)
@@ -141,7 +141,7 @@ def main() -> int:
     console = Console(width=160)
     runs = []
     for begin in given.begin:
-        campaign = wing_campaign(given.data, RecordPlan(begin=begin))
+        campaign = wing_campaign(given.data, begin=begin)
         runs.append(investigate(campaign, model))
         console.print(f"From {begin:g} s, held-out trials, rms: {held_out_rms(campaign, runs[-1])}")
         report(runs[-1], table, f"all, ring-downs from {begin:g} s")

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.model_choice import load_model
+from discrepancy.models.acting import Acting
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
@@ -147,7 +148,9 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=1)
             initial = np.zeros((1, 2))
             initial[0, 0] = release.deviation * random.standard_normal()
-            moved = system.ringdown(end, release, initial, time, laws)
+            moved = system.motion(
+                Acting(time, np.zeros(len(end)), initial=initial, release=(end, release)), laws
+            )
             values = moved.response(rows, quantities).values
         else:
             values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws).values @ rows.T

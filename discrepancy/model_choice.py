@@ -14,9 +14,9 @@ from discrepancy.models.fmu_runs import binding_file
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
-from discrepancy.models.patched import PatchedModel
-from discrepancy.models.reduced_structure import structure_model
+from discrepancy.models.reduced_structure import StructureModel
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
+from discrepancy.models.wrapped import PatchedModel
 from discrepancy.sources.from_run import (
     CALIBRATION_FILE,
     DESIGN_FILE,
@@ -248,7 +248,7 @@ def _structure(path: Path, progress: Progress | None) -> ModelChoice:
     except FiniteElementError as cause:
         raise ModelError(str(cause)) from cause
     source = reduced.design_hash
-    model = structure_model(reduced)
+    model = StructureModel(reduced)
     return ModelChoice(model, ModelKind.STRUCTURE, path.name, source, path=path, design_hash=source)
 
 

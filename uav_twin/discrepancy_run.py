@@ -120,7 +120,7 @@ def _compared(
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.errors import DiscrepancyError
     from discrepancy.model_choice import choice_of_run, choose_model
-    from discrepancy.sources.from_run import RunPlan, run_campaign
+    from discrepancy.sources.from_run import run_campaign
     from twin_master.watch.snapshot import flown
 
     if from_run is None:
@@ -129,7 +129,7 @@ def _compared(
     first, last = turns
     with flown(from_run, first, last, progress) as folder:
         try:
-            data = run_campaign(folder, RunPlan(first_turn=first, last_turn=last))
+            data = run_campaign(folder, first, last)
             if model is not None:
                 return data, choose_model(model, progress)
             return data, dataclasses.replace(choice_of_run(folder), file=str(from_run.resolve()))

@@ -1,7 +1,5 @@
 """Which trials are kept for proof: whole trials or whole load levels, never samples of one record."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A laboratory's files as a campaign: what each column is, and what has still to be said."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -136,7 +134,7 @@ class Understanding:
                     f"--reference-temperature must be in degC, and {said!r} came."
                 ) from None
 
-    def with_answer(self, option: str, about: str, said: str) -> Understanding:
+    def with_answer(self, option: str, about: str, said: str) -> "Understanding":
         """Return what is understood once a question is answered."""
         given = {**self.answers.get(option, {}), about: said}
         return Understanding(self.sheets, {**self.answers, option: given}, self._quantity_of)

@@ -9,16 +9,13 @@ from functools import cached_property
 from math import ceil, inf
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from .noise_tests import ljung_box
-from .records import Channel
-
-FloatArray = NDArray[np.float64]
+from .records import Channel, FloatArray
 
 MAINS = (50.0, 60.0, 400.0)
 """Mains frequencies [Hz], of land and aircraft: an effect, and looked for in noise records."""

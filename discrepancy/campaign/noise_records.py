@@ -1,17 +1,12 @@
 """Noise records of a campaign's channels: from samples at rest, from repeated trials, or as stated."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Channel, NoiseRecord, Trial
+from discrepancy.campaign.records import Channel, FloatArray, NoiseRecord, Trial
 from discrepancy.errors import CampaignDataError
 from reporting.words import counted
-
-FloatArray = NDArray[np.float64]
 
 SAME_INPUT = 1e-6
 """Inputs of two rows are the same if they differ by less than this share of the largest in the trial."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import chdtr, chdtrc, fdtr, fdtrc, gammaincc
 
-FloatArray = NDArray[np.float64]
+from discrepancy.campaign.records import FloatArray
 
 SHORTEST_SERIES = 32
 """Fewest samples of a series whose whiteness is tested."""
@@ -179,13 +179,6 @@ def benjamini_yekutieli(p_values: FloatArray, rate: float) -> NDArray[np.bool_]:
 
     Benjamini and Yekutieli 2001, Annals of Statistics 29, 1165-1188, theorem 1.3.
     """
-    count = p_values.size
-    found = np.zeros(count, dtype=bool)
-    if count == 0:
-        return found
-    order = np.argsort(p_values)
-    harmonic = float(np.sum(1.0 / np.arange(1, count + 1)))
-    below = np.flatnonzero(p_values[order] <= rate * np.arange(1, count + 1) / (count * harmonic))
-    if below.size:
-        found[order[: below[-1] + 1]] = True
-    return found
+    if not p_values.size:
+        return np.zeros(0, dtype=bool)
+    return np.asarray(stats.false_discovery_control(p_values, method="by") <= rate)

@@ -1,7 +1,5 @@
 """Reading a campaign: a folder with `campaign.toml` and tables in, a checked `Campaign` in SI units out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from math import inf
@@ -17,6 +15,7 @@ from discrepancy.campaign.records import (
     Campaign,
     Channel,
     Event,
+    FloatArray,
     NoiseRecord,
     Quantity,
     RecordedInput,
@@ -44,8 +43,6 @@ from reporting.provenance import hash_file, hash_record
 from reporting.table_file import TextTable
 from reporting.toml_file import read_toml
 from reporting.words import be, counted
-
-FloatArray = NDArray[np.float64]
 
 CAMPAIGN_FILE = "campaign.toml"
 """Name of the file that describes a campaign, in its folder."""

@@ -1,7 +1,5 @@
 """What the reader of a campaign says of its records in time: their stamps, their begin, their noise."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from discrepancy.campaign.noise import noise_model

@@ -1,7 +1,5 @@
 """Sampling in time: strictly increasing stamps, even to a thousandth of the interval or as they came."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The schema of `campaign.toml`: what it may say, checked strictly; units are still those of the file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from keyword import iskeyword
 from typing import Annotated, Any, Literal, Self

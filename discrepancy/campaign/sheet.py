@@ -5,8 +5,6 @@ commas and groups of digits that is right in all, CleverCSV in 594 (and wrong wi
 `csv.Sniffer` in 228.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -1,7 +1,5 @@
 """Tables of a campaign: comma-separated text with one header line, in the campaign's folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from discrepancy.errors import CampaignDataError, CampaignFileError

@@ -4,8 +4,6 @@ A power of ten is applied to the decimal text of a number before it becomes bina
 in microstrain comes back to the last bit; any other factor is a fraction of integers, rounded once.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from contextlib import suppress
@@ -100,7 +98,7 @@ class Conversion(NamedTuple):
 
 
 @cache
-def _known_units() -> UnitRegistry[Any]:
+def _known_units() -> "UnitRegistry[Any]":
     """Return the units of pint in fractions of integers; pi is that of floats, and so are its multiples."""
     import pint
 

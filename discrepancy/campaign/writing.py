@@ -1,7 +1,5 @@
 """Writing a campaign as a folder that `campaign.reading.read_campaign` reads back to the last bit."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import asdict
 from math import isinf
@@ -9,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.reading import CAMPAIGN_FILE
 from discrepancy.campaign.records import (
     USUAL_REGIONS,
     Campaign,
     Channel,
+    FloatArray,
     Hold,
     RecordedInput,
     Start,
@@ -29,7 +27,6 @@ from reporting.files import atomic_write_text
 from reporting.table_file import table_text
 from reporting.toml_file import Printed, toml_text
 
-FloatArray = NDArray[np.float64]
 NOISE_FILE = "noise.csv"
 """Name of the table of samples at rest."""
 

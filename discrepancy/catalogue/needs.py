@@ -152,12 +152,10 @@ def _strain_across(needing: Needing, setting: Setting) -> str | None:
     trial = next(trial for trial in trials(setting) if any(name in names for name in trial.channels))
     channel = campaign.channels[next(name for name in trial.channels if name in names)]
     means = [campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in model.parameters]
-    conditions = Conditions(np.array(means), health=trial.health)
+    conditions = Conditions(np.array(means), health=trial.health, components=True)
     given: Response | None = None
     with suppress(ModelError):
-        given = model.respond(
-            trial, ((channel.output, channel.quantity),), ModelPatch(), conditions, components=True
-        )
+        given = model.respond(trial, ((channel.output, channel.quantity),), ModelPatch(), conditions)
     if given is None or given.transverse is None or given.shear is None:
         return f"The model {model.name!r} gives no transverse and shear strain, which a turned gauge sees."
     return None

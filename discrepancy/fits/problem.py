@@ -18,8 +18,8 @@ from discrepancy.campaign.records import Campaign, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.models.interface import Model
-from discrepancy.models.memo import MemoModel
 from discrepancy.models.sensing import observe
+from discrepancy.models.wrapped import MemoModel
 from fe.runtime.patch import ModelPatch
 
 from .candidate import Candidate

@@ -17,7 +17,7 @@ from discrepancy.fits.cholesky import finite
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.models.patched import PatchedModel
+from discrepancy.models.wrapped import PatchedModel
 from discrepancy.verdict import Experiment
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass
 

@@ -12,7 +12,7 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.fits.problem import Problem
-from discrepancy.models.ported import shows_ports
+from discrepancy.models.wrapped import shows_ports
 from discrepancy.search_settings import SEARCH
 
 from .filtered import Process

@@ -18,7 +18,7 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.models.ported import apart
+from discrepancy.models.wrapped import apart
 
 from .columns import Columns
 from .filtered import Process

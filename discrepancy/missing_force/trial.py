@@ -22,7 +22,8 @@ from discrepancy.campaign.records import Quantity, Trial
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.linearisation import PARAMETER_STEP, Point, moved
 from discrepancy.fits.problem import Problem
-from discrepancy.models.ported import PortedSystem, refined
+from discrepancy.models.acting import refined
+from discrepancy.models.interface import PortedSystem
 from fe.compilation import compiled
 
 from . import kalman_kernels as kernels

@@ -18,7 +18,8 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.models.ported import PortedSystem, shows_ports
+from discrepancy.models.interface import PortedSystem
+from discrepancy.models.wrapped import shows_ports
 from discrepancy.verdict import GapWindow, Moment
 
 from .events import GROUND, MOST_EVENTS, Events, changes, events

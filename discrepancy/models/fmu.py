@@ -5,22 +5,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu_excitation import Run, State
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_motion import FmuMotion
-from discrepancy.models.fmu_patch import NOTHING, SortedPatch, carries, sorted_patch
 from discrepancy.models.fmu_ports import SAFE_TURN
-from discrepancy.models.fmu_rest import port_flexibility, rest_with_laws
-from discrepancy.models.fmu_runs import FmuRuns
-from discrepancy.models.fmu_samples import sampled
-from discrepancy.models.fmu_trials import FmuTrials
+from discrepancy.models.fmu_runs import FmuRuns, Run, State
+from discrepancy.models.fmu_trials import FmuPatch, FmuTrials, sampled
 from discrepancy.models.interface import (
+    NO_PATCH,
     Conditions,
     Outputs,
+    PortedSystem,
     PortScale,
     Response,
     Scales,
@@ -31,13 +28,19 @@ from discrepancy.models.interface import (
     prior_mean,
 )
 from discrepancy.models.model_file import DescribedModel
+from discrepancy.models.patch_parts import laws_at, sorted_patch
 from discrepancy.models.port_system import PortSystem
-from discrepancy.models.ported import NO_PATCH, PortedSystem
 from fe.runtime.motion import NO_LAWS
-from fe.runtime.patch import ModelPatch, Primitive
+from fe.runtime.patch import (
+    INTERNAL_FORCES,
+    SENSORS,
+    LoadGain,
+    LoadPlace,
+    ModelPatch,
+    Primitive,
+    StiffnessDrift,
+)
 from fmu_asset.errors import FmuError
-
-FloatArray = NDArray[np.float64]
 
 FINER = (1, 2, 4, 8, 16)
 """Refinements of the step at which the system of the ports is looked for."""
@@ -120,7 +123,14 @@ class FmuModel(DescribedModel):
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
-        return carries(self.description, primitive)
+        description, forces = self.description, bool(self.description.inputs.forces)
+        if primitive in SENSORS or primitive.kind in description.effects:
+            return True
+        if primitive is LoadGain:
+            return forces
+        if primitive is LoadPlace:
+            return forces and description.inputs.bending_moment is not None
+        return primitive in INTERNAL_FORCES and primitive is not StiffnessDrift and bool(description.port)
 
     def stations(self) -> tuple[float, float] | None:
         """Return 0 and the length [m] if the file states one, else None."""
@@ -133,9 +143,9 @@ class FmuModel(DescribedModel):
         largest = np.zeros(len(self.ports()))
         for trial in campaign.trials:
             if trial.is_dynamic:
-                moved = self.motion.free(self._trials.run(trial, conditions, NOTHING, self.motion, 1))
+                moved = self.motion.free(self._trials.run(trial, conditions, FmuPatch(), self.motion, 1))
             else:
-                moved = self._at_rest_values(trial, replace(conditions, health=trial.health), NOTHING)
+                moved = self._at_rest_values(trial, replace(conditions, health=trial.health), FmuPatch())
             largest = np.maximum(largest, np.max(np.abs(moved[:, self.motion.ports.x]), axis=0))
         stiffness, frequency = self._stiffness(campaign, conditions)
         forces = zip(self.motion.ports.forces, stiffness, strict=True)
@@ -167,7 +177,7 @@ class FmuModel(DescribedModel):
                 return found, given or self.motion.measured_frequency(trial, state)
         still = campaign.trials[0] if campaign.trials else _any_trial(TrialKind.STATIC, 1.0)
         state = self._trials.state(still, replace(conditions, health=still.health), (), 0)
-        flexible = port_flexibility(self.motion, state)
+        flexible = self.motion.flexibility(state)
         frequency, interval = given, 0.01
         for _ in range(0 if campaign.trials or given else 3):  # until the interval suits the frequency
             trial = _any_trial(TrialKind.RINGDOWN, interval)
@@ -178,16 +188,7 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ response
 
-    def respond(
-        self,
-        trial: Trial,
-        outputs: Outputs,
-        patch: ModelPatch,
-        conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
-    ) -> Response:
+    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial, see `Model.respond`; `transverse` and `shear` are never known.
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
@@ -195,14 +196,14 @@ class FmuModel(DescribedModel):
         check_plain(trial, f"the FMU model {self.name!r}")
         check_parameters(f"The FMU model {self.name!r}", self.parameters, conditions.parameters)
         columns = self._columns(outputs)
-        parts = sorted_patch(patch, self.description)
+        parts = self._parts(patch)
         if not trial.is_dynamic:
             if any(quantity.is_rate for _, quantity in outputs):
                 raise ModelError(
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
             return Response(self._at_rest_values(trial, conditions, parts)[:, columns])
-        values, step = self._moving(trial, conditions, parts, refinement, columns)
+        values, step = self._moving(trial, conditions, parts, columns)
         rate, zero = conditions.clock
         quantities = self.runs.quantities
         derivatives = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
@@ -212,8 +213,7 @@ class FmuModel(DescribedModel):
         self,
         trial: Trial,
         conditions: Conditions,
-        patch: SortedPatch,
-        refinement: int = 1,
+        patch: FmuPatch,
         columns: Sequence[int] = (),
     ) -> tuple[FloatArray, float]:
         """Return all outputs (K, C) on the grid of the communication step [s], and the step."""
@@ -222,8 +222,8 @@ class FmuModel(DescribedModel):
             return self._trials.run(trial, conditions, patch, self.motion, refined)
 
         if len(patch.laws):
-            return self.motion.with_laws(patch.laws, excite, trial, refinement, columns)
-        run = excite(refinement)
+            return self.motion.with_laws(patch.laws, excite, trial, conditions.refinement, columns)
+        run = excite(conditions.refinement)
         return self.motion.free(run), run.step
 
     # ------------------------------------------------------------ ports
@@ -239,7 +239,7 @@ class FmuModel(DescribedModel):
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
         means = np.array([item.mean for item in self.parameters])
-        settings = sorted_patch(patch, self.description).settings
+        settings = self._parts(patch).settings
         base, found = (self._port_system(trial, values, settings) for values in (means, parameters))
         if base is None or found is None or len(base.transition) != len(found.transition):
             raise ModelError(
@@ -268,7 +268,7 @@ class FmuModel(DescribedModel):
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
     ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        parts = sorted_patch(patch, self.description)._replace(laws=NO_LAWS)
+        parts = self._parts(patch)._replace(laws=NO_LAWS)
         values, step = self._moving(trial, conditions, parts)
         rate, zero = conditions.clock
         moved = values[:, self.motion.ports.x]
@@ -278,7 +278,7 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ rest
 
-    def _at_rest_values(self, trial: Trial, conditions: Conditions, patch: SortedPatch) -> FloatArray:
+    def _at_rest_values(self, trial: Trial, conditions: Conditions, patch: FmuPatch) -> FloatArray:
         """Return all outputs (N, C) of a static trial or a flight."""
         loads = self._trials.loads_at_rest(trial, patch, conditions)
         states = [self._trials.state(trial, conditions, patch.settings, row) for row in range(len(loads))]
@@ -286,7 +286,7 @@ class FmuModel(DescribedModel):
             return np.stack(
                 [self._rest(trial, row, *held) for row, held in enumerate(zip(states, loads, strict=True))]
             )
-        return rest_with_laws(self.motion, trial.name, states, loads, patch.laws)
+        return self.motion.rest_with_laws(trial.name, states, loads, patch.laws)
 
     def _rest(self, trial: Trial, row: int, state: State, loads: dict[str, float]) -> FloatArray:
         """Return all outputs (C,) of a row; what the FMU refuses is said with its place."""
@@ -297,8 +297,27 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ parts
 
-    def _columns(self, outputs: Sequence[tuple[str, Quantity]]) -> list[int]:
-        check_outputs(f"The FMU model {self.name!r}", self.runs.quantities, outputs)
+    def _parts(self, patch: ModelPatch) -> FmuPatch:
+        """Return a patch by what is done with it; raises `ModelError` if the model cannot carry it."""
+        effects, what = self.description.effects, f"The FMU model {self.name!r}"
+        own, forces, load, _ = sorted_patch(patch, self, what, effects)
+        if load.along_chord and self.description.inputs.torque is None:
+            raise ModelError(f"{what} names no torque in [inputs], so a load cannot move along the chord.")
+        settings: dict[str, float] = {}
+        for item in own:
+            effect = f"effect.{effects[item.kind]}"
+            if f"{effect}.active" in settings:
+                raise ModelError(
+                    f"The patch has two primitives {item.kind!r}, but the FMU model {self.name!r} "
+                    f"carries one ({effect})."
+                )
+            values = {key: value for key, value in item.to_mapping().items() if key != "kind"}
+            settings |= {f"{effect}.{key}": float(value) for key, value in {"active": 1.0, **values}.items()}
+        laws = laws_at(forces, self.ports(), in_windows=False)
+        return FmuPatch(laws, tuple(sorted(settings.items())), load)
+
+    def _columns(self, outputs: Outputs) -> list[int]:
+        check_outputs(f"The FMU model {self.name!r}", self, outputs, self.quantities)
         return [self.runs.columns[output] for output, _ in outputs]
 
 

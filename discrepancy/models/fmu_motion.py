@@ -5,26 +5,24 @@ from functools import partial
 from math import ceil, log2
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from discrepancy.campaign.records import Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu_excitation import Excitation, Loads, Run, State
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_ports import LINEAR, FmuPorts
-from discrepancy.models.fmu_runs import FmuRuns, is_affine
+from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State, is_affine
+from discrepancy.models.linear_system import solved
 from discrepancy.models.port_coupling import LawStepper, coupled_motion
 from discrepancy.models.port_system import PortSystem
 from fe.runtime.motion import Laws
 from fmu_asset.door.session import FmiAsset
 
-FloatArray = NDArray[np.float64]
-
 PHASE = {TrialKind.RINGDOWN: 0.1, TrialKind.FORCED: 0.05}
 """Longest communication step without laws: radians of the first mode."""
 CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the largest motion."""
+STATIC_ITERATIONS, STATIC_TOLERANCE = 30, 1e-9
 MOST_REFINEMENT = 64
 """Steps that do not converge at this refinement are given up."""
 
@@ -73,6 +71,57 @@ class FmuMotion:
             key = ("rest", state, tuple(sorted(given.items())))
             return self._runs.remembered(key, lambda: answer([value for _, value in parts]))
         return self._superposed(("rest", state), answer, parts)
+
+    def rest_with_laws(
+        self, trial: str, states: list[State], loads: list[dict[str, float]], laws: Laws
+    ) -> FloatArray:
+        """Return the outputs (N, C) where laws follow the load path; the FMU itself is asked at the end.
+
+        Raises
+        ------
+        ModelError
+            If the law has no solution, or the FMU does not confirm it.
+        """
+        index = self._port_of(laws)
+        columns, inputs = np.array(self.ports.x)[index], [self.ports.forces[number] for number in index]
+        memory, before, found = None, np.zeros(len(laws)), list[FloatArray]()
+        for row, (state, load) in enumerate(zip(states, loads, strict=True)):
+            compliance = self.flexibility(state)[np.ix_(index, index)]
+            linear = self.rest(state, load)[columns]
+            for _ in range(STATIC_ITERATIONS):
+                solution = solved(laws, linear[None], compliance, memory, before)
+                forces, given = solution.forces[0], dict(load)
+                for at, force in zip(inputs, forces.tolist(), strict=True):
+                    given[at] = given.get(at, 0.0) - force
+                values = self.rest(state, given)
+                # where the FMU is not linear, the law is solved again about the point that was reached
+                again = values[columns] + compliance @ forces
+                change, linear = np.max(np.abs(again - linear)), again
+                if change <= STATIC_TOLERANCE * max(np.max(np.abs(again)), 1e-300):
+                    break
+            else:
+                raise ModelError(
+                    f"The law at {', '.join(dict.fromkeys(laws.ports))} and the FMU model "
+                    f"{self.description.name!r} did not agree at load level {row + 1} of {trial!r} within "
+                    f"{STATIC_ITERATIONS} iterations; the force is too strong for the FMU."
+                )
+            memory, before = solution.memory, linear
+            found.append(values)
+        return np.array(found)
+
+    def flexibility(self, state: State) -> FloatArray:
+        """Return the displacements (P, P) of the ports at rest under unit forces at each."""
+        if not self.ports.forces:  # nothing to push, and loads of zero may be outside of what the FMU takes
+            return np.zeros((0, 0))
+        zero, sizes = self.rest(state, {}), map(self.ports.size, range(len(self.ports.forces)))
+        moved = [
+            (self.rest(state, {name: size}) - zero)[self.ports.x] / size
+            for name, size in zip(self.ports.forces, sizes, strict=True)
+        ]
+        return np.array(moved).T
+
+    def _port_of(self, laws: Laws) -> list[int]:
+        return [[port.name for port in self._ports].index(name) for name in laws.ports]
 
     def _rest(self, state: State, loads: Mapping[str, float]) -> FloatArray:
         table = self.description.static
@@ -318,7 +367,7 @@ class FmuMotion:
 
     def _coupled(self, laws: Laws, run: Run, refinement: int = 1) -> FloatArray:
         free = self._refined_free(run, refinement)
-        port_of = [[port.name for port in self._ports].index(name) for name in laws.ports]
+        port_of = self._port_of(laws)
         system = self.ports.system(run.state, run.step, run.steps, refinement)
         if system is None:
             return self._stepped(laws, port_of, run, free)

@@ -4,15 +4,12 @@ from collections.abc import Callable
 from math import ceil
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.models.fmu_excitation import Excitation, Run, State
+from discrepancy.campaign.records import FloatArray
 from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.fmu_runs import FmuRuns
+from discrepancy.models.fmu_runs import Excitation, FmuRuns, Run, State
 from discrepancy.models.memory import Memory
 from discrepancy.models.port_system import PortSystem, port_system
-
-FloatArray = NDArray[np.float64]
 
 LINEAR = 1e-6
 """Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""

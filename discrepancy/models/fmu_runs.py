@@ -2,18 +2,18 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import blake2b
 from math import pi
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Quantity
+from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu_excitation import State
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.memory import Memory
 from fmu_asset.door.binding import Binding, Input, Parameter, Vector, expand, load_binding
@@ -21,8 +21,6 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuError
 from reporting.words import counted
 from scenarios import binding_files
-
-FloatArray = NDArray[np.float64]
 
 MOST_INSTANCES = 8
 """Instances (step sizes) that are open at the same time."""
@@ -32,6 +30,55 @@ REVOLUTIONS = ("1/min", "rpm", "r/min", "rev/min")
 """Units of FMUs in which an angular velocity is revolutions in a minute."""
 SETTLE_CHUNK = 200
 """Steps after which it is asked whether the motion has come to rest."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Parameters and constant inputs of a run, sorted by name; by keys of the binding and the FMU's names."""
+
+    parameters: tuple[tuple[str, float], ...]
+    inputs: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """What moves the FMU, per unit of a factor.
+
+    Attributes
+    ----------
+    kind : str
+        "displacement", "velocity": parameters of the release; "hold": a force is let go that had brought the
+        release point to the displacement; "input": an input.
+    name : str
+        The input.
+    series : (N,) ndarray
+        Its values, each held over a step.
+    begin : float
+        Its value before the motion, under which the FMU is at rest.
+    """
+
+    kind: str
+    name: str = ""
+    series: FloatArray = field(default_factory=lambda: np.zeros(0))
+    begin: float = 0.0
+
+    @property
+    def key(self) -> Hashable:
+        """What tells it from others."""
+        return self.kind, self.name, blake2b(self.series.tobytes(), digest_size=16).digest(), self.begin
+
+
+Loads = Sequence[tuple[Excitation, float]]
+"""Excitations with their factors."""
+
+
+class Run(NamedTuple):
+    """A motion that is asked of an FMU: in which state, communication step [s], how many, what excites it."""
+
+    state: State
+    step: float
+    steps: int
+    loads: Loads
 
 
 class FmuRuns:

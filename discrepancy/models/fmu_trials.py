@@ -1,21 +1,53 @@
-"""What a trial asks of an FMU: parameters and constant inputs, loads at rest, what excites a motion."""
+"""What a trial asks of an FMU: parameters, inputs, loads, what excites a motion; and its samples then."""
 
+from collections.abc import Sequence
 from math import ceil
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
-from discrepancy.campaign.records import Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu_excitation import Excitation, Run, State
+from discrepancy.models.acting import Course, acting_force
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
-from discrepancy.models.fmu_patch import SortedPatch
-from discrepancy.models.fmu_runs import FmuRuns
-from discrepancy.models.input_course import Course, acting_force
-from discrepancy.models.interface import DEFAULT_PLACE, Conditions
+from discrepancy.models.fmu_runs import Excitation, FmuRuns, Run, State
+from discrepancy.models.interface import Conditions, Response, place_among, release_of
+from discrepancy.models.patch_parts import LoadChange
+from fe.runtime.motion import NO_LAWS, Laws
 
-FloatArray = NDArray[np.float64]
+SLOPES = (
+    np.array(
+        [
+            [-25, 48, -36, 16, -3],
+            [-3, -10, 18, -6, 1],
+            [1, -8, 0, 8, -1],
+            [-1, 6, -18, 10, 3],
+            [3, -16, 36, -48, 25],
+        ]
+    )
+    / 12.0
+)
+"""Weights by which five values on an even grid give the slope at each of them, of fourth order."""
+
+
+class FmuPatch(NamedTuple):
+    """A patch by what is done with it.
+
+    Attributes
+    ----------
+    laws : Laws
+        Internal forces at ports.
+    settings : tuple of (str, float)
+        Parameters that the FMU itself has for primitives, sorted by name.
+    load : LoadChange
+        Of the recorded force.
+    """
+
+    laws: Laws = NO_LAWS
+    settings: tuple[tuple[str, float], ...] = ()
+    load: LoadChange = LoadChange()
 
 
 class FmuTrials:
@@ -41,7 +73,7 @@ class FmuTrials:
         return tuple(self._forces.values())
 
     def run(
-        self, trial: Trial, conditions: Conditions, patch: SortedPatch, motion: FmuMotion, refinement: int
+        self, trial: Trial, conditions: Conditions, patch: FmuPatch, motion: FmuMotion, refinement: int
     ) -> Run:
         """Return the run by which the FMU follows a dynamic trial."""
         step = motion.step(trial, refinement)
@@ -58,9 +90,7 @@ class FmuTrials:
     def _release(
         self, trial: Trial, conditions: Conditions, motion: FmuMotion
     ) -> list[tuple[Excitation, float]]:
-        release, way = trial.release, self._description.release
-        if release is None:
-            raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
+        release, way = release_of(trial), self._description.release
         if way is None:
             raise ModelError(
                 f"The FMU model {self._name!r} cannot ring down: state in [release] the FMU's parameter of "
@@ -84,7 +114,7 @@ class FmuTrials:
         ]
 
     def _forced(
-        self, trial: Trial, patch: SortedPatch, step: float, steps: int
+        self, trial: Trial, patch: FmuPatch, step: float, steps: int
     ) -> list[tuple[Excitation, float]]:
         begins, ends = Course.of_force(trial).ends(np.linspace(0.0, steps * step, steps + 1))
         held, first = 0.5 * (begins + ends), float(trial.force[0])
@@ -97,18 +127,18 @@ class FmuTrials:
                 loads.append((Excitation("input", variable, on, float(first != 0.0)), tare * lever))
         return loads
 
-    def _pushed(self, trial: Trial, patch: SortedPatch) -> list[tuple[str, float]]:
+    def _pushed(self, trial: Trial, patch: FmuPatch) -> list[tuple[str, float]]:
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""
         inputs = self._description.inputs
         moments = ((inputs.bending_moment, patch.load.along_span), (inputs.torque, patch.load.along_chord))
+        what, where = f"the FMU model {self._name!r}", f"the trial {trial.name!r}"
+        place = place_among([*self._forces], trial.load_place, what, where)
         return [
-            (self._input_of(trial), 1.0),
+            (self._forces[place], 1.0),
             *((self._runs.variable(name), lever) for name, lever in moments if name is not None and lever),
         ]
 
-    def loads_at_rest(
-        self, trial: Trial, patch: SortedPatch, conditions: Conditions
-    ) -> list[dict[str, float]]:
+    def loads_at_rest(self, trial: Trial, patch: FmuPatch, conditions: Conditions) -> list[dict[str, float]]:
         """Return the inputs of each row of a static trial or a flight.
 
         Raises
@@ -172,15 +202,45 @@ class FmuTrials:
         parameters |= dict(settings)
         return State(tuple(sorted(parameters.items())), tuple(sorted(inputs.items())))
 
-    def _input_of(self, trial: Trial) -> str:
-        place = trial.load_place
-        if place == DEFAULT_PLACE and place not in self._forces and len(self._forces) == 1:
-            return next(iter(self._forces.values()))
-        if not isinstance(place, str) or place not in self._forces:
-            known = ", ".join(self._forces) or "none"
-            said = "says no load_place" if place == DEFAULT_PLACE else f"is loaded at {place!r}"
-            raise ModelError(
-                f"The trial {trial.name!r} {said}, and the FMU model {self._name!r} takes forces at {known}: "
-                + ("name one of these as its load_place." if self._forces else "name an input in [inputs].")
-            )
-        return self._forces[place]
+
+def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Sequence[int]) -> Response:
+    """Return values and rates at times, from values on an even grid.
+
+    Parameters
+    ----------
+    values : (K, C) ndarray
+        Outputs at 0, `step`, 2 `step`, ...
+    step : float
+        Of the grid [s].
+    times : (N,) ndarray
+        Times of the samples [s]; before zero the first value holds.
+    derivatives : sequence of int
+        For each column, how often it is derived in the response: 0, 1 or 2.
+    """
+    before = times < 0.0
+    index = np.round(times / step)
+    on_grid = bool(np.all(np.abs(times / step - index) < 1e-6))
+    if on_grid and len(values) >= len(SLOPES) and not any(derivatives):
+        at_index = np.clip(index.astype(int), 0, len(values) - 1)
+        first = np.clip(at_index - len(SLOPES) // 2, 0, len(values) - len(SLOPES))
+        around = values[first[:, np.newaxis] + np.arange(len(SLOPES))]
+        rates = np.einsum("nk,nkc->nc", SLOPES[at_index - first] / step, around)
+        rates[before] = 0.0
+        return Response(values[at_index], rates)
+    grid = step * np.arange(len(values))
+    curve = CubicSpline(grid, values)
+    at = np.clip(times, 0.0, grid[-1])
+    shown, rates = curve(at), curve(at, 1)
+    if on_grid:
+        shown = values[np.clip(index.astype(int), 0, len(values) - 1)]
+    rates[before] = 0.0
+    for column, order in enumerate(derivatives):
+        if order > 0:
+            shown = shown if shown.flags.owndata else shown.copy()
+            # derivatives of the derivative's own spline keep the order of the first one
+            slope = curve.derivative()(grid)[:, column]
+            own = CubicSpline(grid, slope)
+            shown[:, column] = own(at, order - 1)
+            rates[:, column] = own(at, order)
+            shown[before, column] = rates[before, column] = 0.0
+    return Response(np.ascontiguousarray(shown), np.ascontiguousarray(rates))

@@ -1,19 +1,17 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Release, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from fe.runtime.patch import ModelPatch, Primitive
 from reporting.words import counted
 
-FloatArray = NDArray[np.float64]
-
+Place = str | tuple[float, float]
 DEFAULT_PLACE = "tip_load"
 """What a campaign says when it does not say where the force acts; a model with one input takes that one."""
 
@@ -158,6 +156,10 @@ class Conditions:
         Stiffness losses z1, z2 of each row (dynamic trials: row 0 holds for all).
     offset : tuple of float
         Constants that the recorded inputs of a driven trial lack, in their order [SI]; empty: none.
+    components : bool
+        Whether `transverse` and `shear` are wanted.
+    refinement : int
+        Time steps are this many times smaller than usual, to check the integration.
     """
 
     parameters: FloatArray
@@ -165,12 +167,15 @@ class Conditions:
     clock: tuple[float, float] = (0.0, 0.0)
     health: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
     offset: tuple[float, ...] = ()
+    components: bool = False
+    refinement: int = 1
 
     @property
     def key(self) -> tuple[object, ...]:
         """All of it as a value that can be looked up."""
         return (
             self.parameters.tobytes(), self.initial.tobytes(), self.clock, self.health.tobytes(), self.offset,
+            self.components, self.refinement,
         )  # fmt: skip
 
 
@@ -195,8 +200,41 @@ class Response:
     shear: FloatArray | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class PortedSystem:
+    """A model in motion as a linear system with ports: what a force that nobody knows of does to readings.
+
+    s' = A s - sum_p b_p g_p, y = C s - sum_p e_p g_p, in the coordinates s = (q, q') of the modes. What is
+    known to act is in the model's own response; s is what a missing force adds to it.
+
+    Attributes
+    ----------
+    generator : (n, n) ndarray
+        A [1/s].
+    ports : tuple of str
+        Names, P of them.
+    actions : (P, n) ndarray
+        b of each port: what takes its force from the state.
+    positions, speeds : (P, n) ndarray
+        Rows by which a port moves. A port of a state moves at the speed that the state is.
+    outputs : (C, n) ndarray
+        Rows of the outputs.
+    through : (P, C) ndarray
+        e of each port: what an output shows of its force at once.
+    """
+
+    generator: FloatArray
+    ports: tuple[str, ...]
+    actions: FloatArray
+    positions: FloatArray
+    speeds: FloatArray
+    outputs: FloatArray
+    through: FloatArray
+
+
 Outputs = tuple[tuple[str, Quantity], ...]
 """Outputs, and the quantity wanted of each."""
+NO_PATCH = ModelPatch()
 
 
 class Model(Protocol):
@@ -225,16 +263,7 @@ class Model(Protocol):
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
 
-    def respond(
-        self,
-        trial: Trial,
-        outputs: Outputs,
-        patch: ModelPatch,
-        conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
-    ) -> Response:
+    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial; sensor primitives in `patch` are ignored here.
 
         Parameters
@@ -248,10 +277,6 @@ class Model(Protocol):
             Changes of structure, internal forces and loads.
         conditions : Conditions
             The rest.
-        components : bool
-            Whether `transverse` and `shear` are wanted.
-        refinement : int
-            Time steps are this many times smaller than usual, to check the integration.
 
         Returns
         -------
@@ -276,18 +301,40 @@ def check_parameters(what: str, parameters: Sequence[ModelParameter], values: Fl
         raise ModelError(f"{what} has {counted(len(parameters), 'parameter')}, but {values.size} came.")
 
 
-def check_outputs(
-    what: str, quantities: Mapping[str, Quantity], outputs: Sequence[tuple[str, Quantity]]
-) -> None:
-    """Refuse outputs that a model, `what`, does not have, and such as a channel cannot measure."""
+def check_outputs(what: str, model: Model, outputs: Outputs, known: Iterable[str]) -> None:
+    """Refuse outputs that a model, `what`, does not have beside those `known`, or no channel can measure."""
     for output, quantity in outputs:
-        own = quantities.get(output)
+        own = model.output_quantity(output)
         if own is None:
-            raise ModelError(f"{what} has no output {output!r}; it has {', '.join(quantities)}.")
+            raise ModelError(f"{what} has no output {output!r}; it has {', '.join(known)}.")
         if not quantity.shows(own):
             raise ModelError(
                 f"{what}: the output {output!r} is a {own.value}, but a channel measures {quantity.value}."
             )
+
+
+def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:
+    """Return the load place of a model, `what`, that a trial means: the only one where it says none.
+
+    Raises
+    ------
+    ModelError
+        If there is no such place, or none is named of several.
+    """
+    if place == DEFAULT_PLACE and place not in places and len(places) == 1:
+        return places[0]
+    if not isinstance(place, str) or place not in places:
+        said = "no load_place is said" if place == DEFAULT_PLACE else f"the load place is {place!r}"
+        known = f"forces at {', '.join(places)}: name one of these" if places else "no force"
+        raise ModelError(f"In {where} {said}, and {what} takes {known}.")
+    return place
+
+
+def release_of(trial: Trial) -> Release:
+    """Return how a ring-down began; raises `ModelError` where it does not say it."""
+    if trial.release is None:
+        raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
+    return trial.release
 
 
 def check_no_inputs(trial: Trial, what: str) -> None:

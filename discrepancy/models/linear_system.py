@@ -13,19 +13,17 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, eigh, null_space
 from scipy.linalg.lapack import dpotrs
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
+from discrepancy.models.acting import Acting, Shown
 from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.ported import OutputRows, PortedSystem, modal_system
-from discrepancy.models.rig_records import Acting, Shown
+from discrepancy.models.interface import PortedSystem
 from discrepancy.models.stepwise import CoupledModes
 from fe.runtime.errors import SolutionError
 from fe.runtime.motion import NO_LAWS, Laws, StaticSolution, static_solution
-
-FloatArray = NDArray[np.float64]
 
 HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest of the system."""
@@ -331,19 +329,35 @@ class LinearSystem:
         return found
 
     def seen_by(self, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces, in shapes (N, M) of what is free."""
-        acts = np.array(list(self.acting_rows.values())).reshape(len(self.ports), len(self.mass))
-        force = np.zeros((len(self.ports), len(shown)))
+        """Return the system by which outputs see missing forces, in shapes (N, M) of what is free.
+
+        M q'' + D q' + K q = -sum_p acts_p g_p; of coordinates that are states only the speeds are kept.
+        """
+        ports, size = tuple(self.ports), len(self.mass)
+        sees, acts = (
+            np.array([rows[port] for port in ports]).reshape(len(ports), size)
+            for rows in (self.ports, self.acting_rows)
+        )
+        force = np.zeros((len(ports), len(shown)))
         for number, item in enumerate(shown):
             if item.reaction is not None:
                 force[:, number] = acts @ self.lift[:, item.reaction]
             elif self.truncated and item.order == 0:
                 force[:, number] = -acts @ self.residual(item.row)
-        ports = {name: (row @ shapes, self.acting_rows[name] @ shapes) for name, row in self.ports.items()}
-        matrices = [shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness)]
+        mass, *others = (shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness))
+        sees, acts = sees @ shapes, acts @ shapes
+        push, by_damping, by_stiffness = (np.linalg.solve(mass, item) for item in (acts.T, *others))
         position, speed, acceleration, _ = self.by_order(shown, shapes)
-        rows = OutputRows(position, speed, acceleration, force)
-        return modal_system((matrices[0], matrices[1], matrices[2]), ports, rows, self.moving)
+        count, moving, none = len(mass), self.moving, np.zeros((len(ports), len(mass)))
+        generator = np.zeros((moving + count, moving + count))
+        generator[:moving, moving : 2 * moving] = np.eye(moving)
+        generator[moving:, :moving] = -by_stiffness[:, :moving]
+        generator[moving:, moving:] = -by_damping
+        outputs = (position - acceleration @ by_stiffness)[:, :moving], speed - acceleration @ by_damping
+        return PortedSystem(
+            generator, ports, np.hstack((none[:, :moving], push.T)), np.hstack((sees[:, :moving], none)),
+            np.hstack((none[:, :moving], sees)), np.hstack(outputs), push.T @ acceleration.T - force,
+        )  # fmt: skip
 
 
 def solved(

@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import (
+    NO_PATCH,
     Conditions,
     Outputs,
+    PortedSystem,
     Response,
     Scales,
     check_lumped,
@@ -24,8 +25,7 @@ from discrepancy.models.lumped_rig import LumpedRig
 from discrepancy.models.lumped_scales import lumped_scales, state_sizes
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.patch_parts import LoadChange, laws_at, sorted_lumped
-from discrepancy.models.ported import NO_PATCH, PortedSystem
+from discrepancy.models.patch_parts import LoadChange, SortedPatch, laws_at, sorted_patch
 from fe.runtime.laws import LAWS
 from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.patch import (
@@ -41,8 +41,6 @@ from fe.runtime.patch import (
     RootCompliance,
     StiffnessDrift,
 )
-
-FloatArray = NDArray[np.float64]
 
 KEPT_RIGS = 128
 """Values of the parameters and structures that are remembered."""
@@ -110,23 +108,14 @@ class LumpedModel(DescribedModel):
 
     # ------------------------------------------------------------ response
 
-    def respond(
-        self,
-        trial: Trial,
-        outputs: Outputs,
-        patch: ModelPatch,
-        conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
-    ) -> Response:
+    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial, see `Model.respond`; `transverse` and `shear` are never known.
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
         check_lumped(trial, f"the lumped model {self.name!r}")
-        check_outputs(f"The lumped model {self.name!r}", self.quantities, outputs)
-        structure, forces, change, loads = sorted_lumped(patch.in_trial(trial.name), self)
+        check_outputs(f"The lumped model {self.name!r}", self, outputs, self.quantities)
+        structure, forces, change, loads = self._parts(patch.in_trial(trial.name))
         forces = self.description.own_laws(self._factors(conditions.parameters)) + forces
         laws = laws_at(forces, self._ports)
         if trial.kind is TrialKind.STATIC:
@@ -136,7 +125,7 @@ class LumpedModel(DescribedModel):
                 )
             return self._static(trial, outputs, structure, laws, change, conditions)
         rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
-        motion, drives = rig.moved(trial, conditions, laws, change, loads, refinement)
+        motion, drives = rig.moved(trial, conditions, laws, change, loads)
         return motion.seen(rig.shown(outputs, drives, motion.acting.references))
 
     def _static(
@@ -187,7 +176,7 @@ class LumpedModel(DescribedModel):
         self, trial: Trial, outputs: Outputs, parameters: FloatArray, patch: ModelPatch = NO_PATCH
     ) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the modes of the prior means."""
-        warm, structure = float(trial.temperature[0]), sorted_lumped(patch, self).structure
+        warm, structure = float(trial.temperature[0]), self._parts(patch).structure
         rig = self.rig(parameters, structure, warm)
         drives = rig.acting(trial, Conditions(parameters))[1]
         base = self.rig(self._mean, structure, warm).system(drives)
@@ -197,7 +186,7 @@ class LumpedModel(DescribedModel):
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
     ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        structure, _, change, loads = sorted_lumped(patch.in_trial(trial.name), self)
+        structure, _, change, loads = self._parts(patch.in_trial(trial.name))
         rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
         motion, _ = rig.moved(trial, conditions, NO_LAWS, change, loads)
         rows = np.array(list(motion.system.ports.values())).reshape(-1, rig.width)
@@ -212,6 +201,9 @@ class LumpedModel(DescribedModel):
         return LumpedModel(linear), self.description.own_laws(self._factors(self._mean))
 
     # ------------------------------------------------------------ parts
+
+    def _parts(self, patch: ModelPatch) -> SortedPatch:
+        return sorted_patch(patch, self, f"The lumped model {self.name!r}")
 
     @property
     def _mean(self) -> FloatArray:

@@ -4,17 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from discrepancy.campaign.records import Hold, RecordedInput, Trial
+from discrepancy.campaign.records import FloatArray, Hold, RecordedInput, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course
+from discrepancy.models.acting import Course, Load, Shown
 from discrepancy.models.lumped_file import GAINS
 from discrepancy.models.lumped_sections import ControllerSection
-from discrepancy.models.rig_records import Load, Shown
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

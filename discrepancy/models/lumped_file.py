@@ -7,10 +7,11 @@ from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
+from discrepancy.models.acting import order_of
 from discrepancy.models.lumped_sections import (
     ControllerSection,
     CouplingSection,
@@ -28,13 +29,10 @@ from discrepancy.models.lumped_sections import (
     ScaledParameter,
 )
 from discrepancy.models.model_file import ModelDescription, Positive, check_unique
-from discrepancy.models.rig_records import order_of
 from fe.runtime.patch import ModelPatch
 from reporting.section import checked
 from reporting.toml_file import read_toml
 from reporting.words import counted
-
-FloatArray = NDArray[np.float64]
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
 """Models that come with the package, by file name without the ending."""

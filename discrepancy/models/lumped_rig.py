@@ -6,24 +6,28 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from discrepancy.campaign.records import Hold, Quantity, RecordedInput, Start, Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course, Drive, FormulaCourse, acting_force
-from discrepancy.models.interface import DEFAULT_PLACE, Conditions
+from discrepancy.models.acting import (
+    Acting,
+    Course,
+    Drive,
+    FormulaCourse,
+    Load,
+    Shown,
+    acting_force,
+    order_of,
+)
+from discrepancy.models.interface import Conditions, Place, place_among, release_of
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
 from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.patch_parts import LoadChange
-from discrepancy.models.rig_records import Acting, Load, Shown, order_of
-from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.second_order_motion import Motion
+from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import PointMass, PortLoad, Primitive, RootCompliance, course_of
-
-FloatArray = NDArray[np.float64]
 
 MOST_MODES = 8
 """Modes that move of a structure on springs; the others follow without inertia."""
@@ -192,7 +196,11 @@ class LumpedRig:
             If the trial records an input that the model does not have or that is of another quantity.
         """
         if trial.kind is TrialKind.RINGDOWN:
-            return Acting(trial.time, self._constant, clock=conditions.clock), ()
+            row, initial = self.moved_row(self.input_at(trial.load_place)), conditions.initial
+            release = (row, release_of(trial))
+            return Acting(
+                trial.time, self._constant, initial=initial, clock=conditions.clock, release=release
+            ), ()
         recorded = self.recorded(trial)
         loads, drives, references = list[Load](), dict[str, Drive](), dict[str, Sequence[Load]]()
         offsets = (*conditions.offset, *(0.0,) * len(recorded))
@@ -237,17 +245,11 @@ class LumpedRig:
         item = self.input_at(trial.load_place)
         return (RecordedInput(item.name, item.quantity, trial.force, trial.hold),)
 
-    def input_at(self, place: str | tuple[float, float]) -> InputSection:
+    def input_at(self, place: Place) -> InputSection:
         """Return the input of a load place; raises `ModelError` if there is none."""
         forces = [name for name, item in self._inputs.items() if not item.quantity.moving]
-        if place == DEFAULT_PLACE and place not in self._inputs and len(forces) == 1:
-            place = forces[0]
-        if not isinstance(place, str) or place not in self._inputs:
-            raise ModelError(
-                f"The load place {place!r} is not an input of the lumped model {self.description.name!r}; it "
-                f"has {', '.join(self._inputs) or 'none'}."
-            )
-        return self._inputs[place]
+        known = [*self._inputs] if place in self._inputs else forces
+        return self._inputs[place_among(known, place, f"the lumped model {self.description.name!r}")]
 
     def moved_row(self, item: InputSection, change: LoadChange = UNCHANGED) -> FloatArray:
         """Return the row (n + m,) along which an input acts, where its place has been moved to."""
@@ -284,7 +286,6 @@ class LumpedRig:
         laws: Laws,
         change: LoadChange = UNCHANGED,
         at_ports: Sequence[PortLoad] = (),
-        refinement: int = 1,
         *,
         still: bool = False,
     ) -> tuple[Motion, tuple[str, ...]]:
@@ -295,24 +296,17 @@ class LumpedRig:
         ModelError
             If it cannot begin so, or what acts is not the model's.
         """
-        acting, drives = self.acting(trial, conditions, change)
-        system = self.system(drives)
         if trial.kind is TrialKind.RINGDOWN:
             self._check_released(trial, at_ports)
-            row = self.moved_row(self.input_at(trial.load_place))
-            assert trial.release is not None  # it has been checked
-            motion = system.ringdown(
-                row, trial.release, conditions.initial, trial.time, laws, clock=conditions.clock,
-                refinement=refinement,
-            )  # fmt: skip
-            return motion, drives
+        acting, drives = self.acting(trial, conditions, change)
+        system = self.system(drives)
         if at_ports:
             pushed = [self._at_port(item, system) for item in at_ports]
             acting = replace(acting, loads=[*acting.loads, *pushed])
         if still:
             acting = replace(acting, begins=Start.STILL)
         try:
-            return system.motion(acting, laws, refinement), drives
+            return system.motion(acting, laws, conditions.refinement), drives
         except ModelError as cause:
             name = self.description.name
             raise ModelError(f"The trial {trial.name!r} of {name!r}: {cause}") from cause
@@ -329,8 +323,6 @@ class LumpedRig:
             raise ModelError(
                 f'The trial {trial.name!r} is a ring-down, {why}; say kind = "driven" and begins = "unknown".'
             )
-        if trial.release is None:
-            raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
 
     def _at_port(self, load: PortLoad, system: SecondOrderSystem) -> Load:
         """Return the row and the course of a load at a port."""

@@ -3,15 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, PortScale, Scales, campaign_sizes
 from discrepancy.models.lumped_rig import LumpedRig
-from discrepancy.models.second_order_motion import Motion
-
-FloatArray = NDArray[np.float64]
+from discrepancy.models.second_order import Motion
 
 
 def state_sizes(lumped: LumpedRig, campaign: Campaign, trial: Trial, conditions: Conditions) -> FloatArray:

@@ -7,7 +7,16 @@ from discrepancy.errors import ModelError
 from discrepancy.models.interface import Model
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
-from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, LoadPlace, ModelPatch, PortLoad, Primitive
+from fe.runtime.patch import (
+    INTERNAL_FORCES,
+    SENSORS,
+    LoadGain,
+    LoadPlace,
+    ModelPatch,
+    PortForce,
+    PortLoad,
+    Primitive,
+)
 
 
 class LoadChange(NamedTuple):
@@ -38,8 +47,8 @@ class LoadChange(NamedTuple):
         return cls(gain, tare, span, chord)
 
 
-class SortedLumped(NamedTuple):
-    """Structure, internal forces, change of loads, loads at ports."""
+class SortedPatch(NamedTuple):
+    """Structure (or what the model carries itself), internal forces, change of loads, loads at ports."""
 
     structure: tuple[Primitive, ...]
     forces: ModelPatch
@@ -47,27 +56,43 @@ class SortedLumped(NamedTuple):
     loads: tuple[PortLoad, ...]
 
 
-def sorted_lumped(patch: ModelPatch, model: Model) -> SortedLumped:
+def sorted_patch(patch: ModelPatch, model: Model, what: str, own: Collection[str] = ()) -> SortedPatch:
     """Return the primitives of a patch by what they change; those of sensors are left out.
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        The patch.
+    model : Model
+        Which shall carry it.
+    what : str
+        Its name in sentences.
+    own : collection of str
+        Kinds of primitives that it carries itself, whatever they change elsewhere.
 
     Raises
     ------
     ModelError
         If the model cannot carry one of them.
     """
-    structure, forces, loads = [], [], []
+    structure, forces, changes = list[Primitive](), list[Primitive](), list[Primitive]()
+    loads = list[PortLoad]()
     for item in patch:
+        internal = isinstance(item, INTERNAL_FORCES)
         if isinstance(item, SENSORS):
             continue
-        if isinstance(item, INTERNAL_FORCES):
+        if item.kind in own:
+            structure.append(item)
+        elif not (model.supports(type(item)) or (isinstance(item, PortForce) and item.port in model.ports())):
+            port = " (it has no port)" if internal and not model.ports() else ""
+            raise ModelError(f"{what} cannot carry the primitive {item.kind!r}{port}.")
+        elif internal:
             forces.append(item)
-        elif not model.supports(type(item)):
-            raise ModelError(f"The lumped model {model.name!r} cannot carry the primitive {item.kind!r}.")
         elif isinstance(item, PortLoad):
             loads.append(item)
-        elif not isinstance(item, LoadGain | LoadPlace):
-            structure.append(item)
-    return SortedLumped(tuple(structure), ModelPatch(tuple(forces)), LoadChange.of(patch), tuple(loads))
+        else:
+            (changes if isinstance(item, LoadGain | LoadPlace) else structure).append(item)
+    return SortedPatch(tuple(structure), ModelPatch(tuple(forces)), LoadChange.of(changes), tuple(loads))
 
 
 def laws_at(forces: ModelPatch, ports: Collection[str], *, in_windows: bool = True) -> Laws:

@@ -9,16 +9,14 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.models.compiled_motion import law_functions
 from discrepancy.models.port_system import PortRows, PortSystem
 from fe.compilation import callable_when_compiled, compiled
 from fe.runtime import laws
 from fe.runtime.motion import Laws
 from fe.runtime.motion_arrays import FIRST_PARTS, IntArray, Ports
-
-FloatArray = NDArray[np.float64]
 
 # ---------------------------------------------------------------- the laws, step by step
 

@@ -6,12 +6,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm, logm
 
-from discrepancy.models.ported import PortedSystem
-
-FloatArray = NDArray[np.float64]
+from discrepancy.campaign.records import FloatArray
+from discrepancy.models.interface import PortedSystem
 
 MOST_STATES = 40
 """Largest order of a linear system that is made from records."""

@@ -1,30 +1,27 @@
 """A structure from a mesh or matrices as a model: its reduced model, whose modes and statics are known."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import inv
 
-from discrepancy.campaign.records import Quantity, Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.body import DEFAULT_PLACE, Moving, Outputs, Place
-from discrepancy.models.interface import ModelParameter, PortScale
+from discrepancy.models.interface import ModelParameter, Outputs, Place, check_outputs, place_among
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.structural import StructuralModel
+from discrepancy.models.structural import Moving, State, StructuralModel
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, ModelPatch, Primitive
 from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum
 from fe.runtime.state import Losses
-
-FloatArray = NDArray[np.float64]
 
 LOAD_FACTOR = "load_factor"
 """Control that is the load factor of flights."""
 DEVIATION = 0.25
 """Standard deviation of a parameter whose calibration is not known, as a share of its range."""
+SAME = 1e-9
+"""Difference of two rows, relative to the largest entry, that is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +50,8 @@ class ReducedSystem(SecondOrderSystem):
     solve = flexibility
 
 
-class ReducedBody:
-    """A reduced structure, as `discrepancy.models.structural.Body`.
+class StructureModel(StructuralModel):
+    """A structure from a mesh or matrices; its parameters and free masses have `DEVIATION`.
 
     A control in N is a force, and where a load of it meets a displacement output along it there is a port,
     which has the name of that. Other controls are nominal but for the load factor, which is zero where none
@@ -71,11 +68,16 @@ class ReducedBody:
         If no control is a force or a load factor.
     """
 
-    missing: tuple[str, ...] = ()
-
     def __init__(self, model: ReducedModel) -> None:
+        nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
+        parameters = tuple(
+            ModelParameter(name, nominal[name], DEVIATION * (high - low), unit, low, high)
+            for names, unit in ((model.parameters, "1"), (model.masses, "kg"))
+            for name in names
+            for low, high in [model.validity[name]]
+        )
+        super().__init__(model.name, parameters)
         self.model, self.regions = model, model.regions
-        self.length: float | None = None
         units = zip(model.controls, model.control_units.split(), strict=True)
         self.forces = tuple(name for name, unit in units if unit == "N")
         if not self.forces and LOAD_FACTOR not in model.controls:
@@ -86,9 +88,10 @@ class ReducedBody:
             )
         self.reference = (*self.forces, LOAD_FACTOR)[0]
         _, outputs, accelerations = model.rows
+        strains, displacements = np.split(outputs, [len(model.gauges)])
         named = (
-            (model.gauges, Quantity.STRAIN, outputs[: len(model.gauges)]),
-            (model.displacements, Quantity.DISPLACEMENT, outputs[len(model.gauges) :]),
+            (model.gauges, Quantity.STRAIN, strains),
+            (model.displacements, Quantity.DISPLACEMENT, displacements),
             (model.accelerations, Quantity.ACCELERATION, accelerations),
         )
         self._outputs = {
@@ -97,16 +100,14 @@ class ReducedBody:
             for name, row in zip(names, rows, strict=True)
         }
         self._systems = Memory()
-        nominal = model.nominal[len(model.parameters) + len(model.regions) :][: len(model.masses)]
-        values = np.concatenate((model.nominal[: len(model.parameters)], nominal))
-        points = {}
-        for force in self.forces:
-            row = self._load(values, **{force: 1.0})
-            for name, output in zip(model.displacements, outputs[len(model.gauges) :], strict=True):
-                if np.abs(output - row).max() <= SAME * np.abs(row).max():
-                    points[name] = output
-        self.points: Mapping[str, FloatArray] = points
-        self.port_rows: Mapping[str, FloatArray] = points
+        means = np.array([item.mean for item in parameters])
+        along = [self._load(means, **{force: 1.0}) for force in self.forces]
+        self.points = self.port_rows = {
+            name: row
+            for push in along
+            for name, row in zip(model.displacements, displacements, strict=True)
+            if np.abs(row - push).max() <= SAME * np.abs(push).max()
+        }
 
     def _vector(self, parameters: FloatArray, losses: Losses) -> FloatArray:
         model, vector = self.model, self.model.nominal.copy()
@@ -140,14 +141,9 @@ class ReducedBody:
             If there is no such output, or it is of another quantity.
         """
         if component:
-            raise ModelError(f"{self.model.name} does not tell strains across its gauges.")
-        for output, quantity in outputs:
-            own = self.output_quantity(output)
-            if own is None or not quantity.shows(own):
-                known = ", ".join(f"{name} ({found.value})" for name, (found, _) in self._outputs.items())
-                raise ModelError(
-                    f"{self.model.name} has no output {output!r} that shows {quantity.value}; it has {known}."
-                )
+            raise ModelError(f"{self.name} does not tell strains across its gauges.")
+        known = (f"{name} ({quantity.value})" for name, (quantity, _) in self._outputs.items())
+        check_outputs(self.name, self, outputs, known)
         size = len(self.model.rows[0])
         return np.array([self._outputs[output][1] for output, _ in outputs]).reshape(len(outputs), size)
 
@@ -155,10 +151,6 @@ class ReducedBody:
         """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""
         forces = primitive is LoadGain and bool(self.forces)
         return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.points))
-
-    def internal_forces(self, forces: ModelPatch) -> ModelPatch:
-        """Return forces as they act at ports."""
-        return forces
 
     def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
         """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
@@ -168,28 +160,17 @@ class ReducedBody:
         ModelError
             If there is no such force, or none is named of several.
         """
-        if place == DEFAULT_PLACE and place not in self.forces and len(self.forces) < 2:
-            place = self.reference
-        if place not in (*self.forces, self.reference):
-            raise ModelError(
-                f"The load place {place!r} is no force of {self.model.name}; it has {', '.join(self.forces)}."
-            )
-        return self._load(parameters, **{str(place): 1.0})
+        place = place_among(self.forces or (self.reference,), place, self.name)
+        return self._load(parameters, **{place: 1.0})
 
-    def units(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
-        """Return the unit loads (k, n) of a trial at rest: load factor and its square, or a force of 1 N."""
-        if trial.kind is not TrialKind.FLIGHT:
-            return self._with_always(self.force_row(trial.load_place, parameters, loads)[None], parameters)
+    def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+        """Return the loads (2, n) of the load factor and of its square, which is zero."""
         if LOAD_FACTOR not in self.model.controls:
             raise ModelError(
-                f"The trial {trial.name!r} is a flight, but {self.model.name} has no control {LOAD_FACTOR}."
+                f"The trial {trial.name!r} is a flight, but {self.name} has no control {LOAD_FACTOR}."
             )
         row = self._load(parameters, **{LOAD_FACTOR: 1.0})
-        return self._with_always(np.stack((row, np.zeros_like(row))), parameters)
-
-    def _with_always(self, rows: FloatArray, parameters: FloatArray) -> FloatArray:
-        always = self.always(parameters)
-        return rows if always is None else np.vstack((rows, always))
+        return np.stack((row, np.zeros_like(row)))
 
     def always(self, parameters: FloatArray) -> FloatArray | None:
         """Return the load (n,) of constant loads and of controls that no trial records, if there is any."""
@@ -201,9 +182,7 @@ class ReducedBody:
         acting = model.load_coefficients(vector)
         return np.asarray(model.rows[0] @ acting) if acting.any() else None
 
-    def stiffness(
-        self, parameters: FloatArray, health: Losses, structure: ModelPatch, temperature: float
-    ) -> ReducedSystem:
+    def stiffness(self, state: State) -> ReducedSystem:
         """Return the structure at parameters and losses.
 
         Raises
@@ -211,8 +190,9 @@ class ReducedBody:
         OutsideModelError
             If one lies outside the validity box of the reduced model.
         """
-        key = parameters.tobytes(), tuple(float(loss) for loss in health)
-        return self._systems.get(key, lambda: self._made(self._vector(parameters, health)))
+        parameters, losses, *_ = state
+        key = parameters.tobytes(), losses
+        return self._systems.get(key, lambda: self._made(self._vector(parameters, losses)))
 
     def _made(self, vector: FloatArray) -> ReducedSystem:
         model, state = self.model, ReducedState(self.model, vector)
@@ -234,37 +214,7 @@ class ReducedBody:
             found=(2.0 * np.pi * state.modes.frequency, np.ascontiguousarray(state.shapes)),
         )  # fmt: skip
 
-    def moving(
-        self, parameters: FloatArray, health: Losses, structure: ModelPatch, temperature: float, place: Place,
-        ports: tuple[str, ...] = (),
-    ) -> Moving:  # fmt: skip
+    def moving(self, state: State, place: Place, ports: tuple[str, ...] = ()) -> Moving:
         """Return the structure as it moves, in its own coordinates; errors as of `stiffness`."""
-        system = self.stiffness(parameters, health, structure, temperature)
+        system = self.stiffness(state)
         return Moving(np.eye(len(system.mass)), system)
-
-    def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
-        """Return nothing: no force is spread over the structure."""
-        return {}
-
-
-SAME = 1e-9
-"""Difference of two rows, relative to the largest entry, that is rounding."""
-
-
-def structure_model(model: ReducedModel) -> StructuralModel:
-    """Return a reduced structure as a model, its parameters and free masses with `DEVIATION`.
-
-    Raises
-    ------
-    ModelError
-        If no control is a force or a load factor.
-    """
-    kinds = ((model.parameters, "1"), (model.masses, "kg"))
-    nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
-    parameters = [
-        ModelParameter(name, nominal[name], DEVIATION * (high - low), unit, low, high)
-        for names, unit in kinds
-        for name in names
-        for low, high in [model.validity[name]]
-    ]
-    return StructuralModel(ReducedBody(model), model.name, tuple(parameters))

@@ -5,25 +5,156 @@ it for a `Motion`, which says what outputs show. Between the stamps the linear p
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Hold, Quantity, Release, Start
+from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start
 from discrepancy.campaign.sampling import is_even
 from discrepancy.errors import ModelError
-from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.free_motion import free_motion
-from discrepancy.models.input_course import SMOOTH_PARTS, Course
+from discrepancy.models.acting import SMOOTH_PARTS, Acting, Course, Shown, shown_rows
+from discrepancy.models.compiled_motion import Steps, compiled_kernel
+from discrepancy.models.interface import PortedSystem, Response
 from discrepancy.models.linear_system import LinearSystem, solved
-from discrepancy.models.ported import PortedSystem
-from discrepancy.models.rig_records import Acting, shown_rows
-from discrepancy.models.second_order_motion import Motion
-from discrepancy.models.stepwise import Begin, Boundaries, advance, exact_steps, exponentials, substeps
-from discrepancy.models.stepwise_kernel import Steps
+from discrepancy.models.stepwise import (
+    Begin,
+    Boundaries,
+    advance,
+    exact_steps,
+    exponentials,
+    free_motion,
+    substeps,
+)
 from fe.runtime.motion import Laws, ModalMotion, simulate
 
-FloatArray = NDArray[np.float64]
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion at the samples of a trial.
+
+    Attributes
+    ----------
+    system : LinearSystem
+        What moved.
+    acting : Acting
+        What acted.
+    time : (N,) ndarray
+        Times of the motion since the release or the begin of the record [s].
+    q, velocity : (N, M + P) ndarray
+        Modal coordinates, those of the drives too, and their rates (mass-normalised).
+    port_forces : (N, J) ndarray
+        Internal forces.
+    lagged : (N, J) ndarray
+        Internal forces as omitted modes follow them.
+    laws : Laws
+        Their laws.
+    held : int
+        First samples that lie before the release, where the shape is held.
+    holding : (n,) ndarray, optional
+        Force that held the release point until then [N].
+    """
+
+    system: LinearSystem
+    acting: Acting
+    time: FloatArray
+    q: FloatArray
+    velocity: FloatArray
+    port_forces: FloatArray
+    lagged: FloatArray
+    laws: Laws
+    held: int = 0
+    holding: FloatArray | None = None
+
+    @cached_property
+    def acceleration(self) -> FloatArray:
+        """Second derivatives (N, M + P) of the modal coordinates, from the equation of motion."""
+        system, count = self.system, len(self.system.angular_frequency)
+        found = np.empty_like(self.q)
+        pull = self.q[:, :count] @ system.free.whole.T
+        if self.laws.rate != 0.0:
+            pull *= 1.0 + self.laws.rate * self.time[:, None]
+        found[:, :count] = system.forces_at(self.acting, self.time) - pull
+        found[:, :count] -= self.velocity[:, :count] @ system.free.damping.T
+        if len(self.laws):
+            rows = self.laws.rows(system.modal.actions or system.modal.ports, self.q.shape[1])
+            found[:, :count] -= self.port_forces @ rows[:, :count]
+        for number, drive in enumerate(self.acting.drives):
+            found[:, count + number] = system.heaviness * drive.at(self.time, 2)
+        found[: self.held] = 0.0
+        return found
+
+    @cached_property
+    def _jerk(self) -> FloatArray:
+        if len(self.time) < 2:
+            return np.zeros_like(self.q)
+        return np.asarray(np.gradient(self.acceleration, self.time, axis=0))
+
+    def derivative(self, order: int) -> FloatArray:
+        """Return a derivative (N, M + P) of the modal coordinates, up to the third."""
+        if order < 2:
+            return (self.q, self.velocity)[order]
+        return self.acceleration if order == 2 else self._jerk
+
+    def values(self, rows: FloatArray) -> FloatArray:
+        """Return row . u and row . x (N, C) of rows (C, n + m)."""
+        n, shapes = self.system.displacements, self.system.all_shapes
+        found = self.q @ (rows[:, :n] @ shapes[:n]).T
+        if self.system.states:
+            found += self.velocity @ (rows[:, n:] @ shapes[n:]).T
+        return found + self._left_out(rows) if self.system.truncated else np.asarray(found)
+
+    def _left_out(self, rows: FloatArray) -> FloatArray:
+        """Return what omitted modes add to row . u (N, C).
+
+        They follow applied forces without delay, and internal ones and the end of a holding force with that
+        of their damping.
+        """
+        system = self.system
+        residual, found = system.residual(rows.T), np.zeros((len(self.time), len(rows)))
+        if self.acting.loads:
+            found += self.acting.load_at(self.time, residual)
+        if len(self.laws):
+            found -= self.lagged @ (system.port_rows(self.laws) @ residual)
+        if self.holding is not None and system.relaxation > 0.0:
+            lag = system.relaxation
+            count = int(np.searchsorted(self.time, 40.0 * lag, side="right"))
+            fading = np.exp(-np.maximum(self.time[:count], 0.0) / lag)
+            found[:count] += np.outer(fading, self.holding @ residual)
+        return found
+
+    def response(self, rows: FloatArray, quantities: Sequence[Quantity]) -> Response:
+        """Return what sensors at rows (C, n) show, and the rates; see `seen`."""
+        return self.seen(shown_rows(rows, quantities))
+
+    def seen(self, shown: Sequence[Shown]) -> Response:
+        """Return what outputs show, and the rates; omitted modes are in what is not derived only."""
+        system = self.system
+        values, rates = np.zeros((2, len(self.time), len(shown)))
+        for order, rows in enumerate(system.by_order(shown, system.all_shapes)):
+            if np.any(rows):
+                values += self.derivative(order) @ rows.T
+                if order < 3:
+                    rates += self.derivative(order + 1) @ rows.T
+        still = [number for number, item in enumerate(shown) if item.order == 0]
+        if system.truncated and still:
+            values[:, still] += self._left_out(np.array([shown[number].row for number in still]))
+        for number, item in enumerate(shown):
+            if item.constant:
+                values[:, number] += item.constant
+            if item.reaction is not None:
+                along = system.lift[:, item.reaction]
+                values[:, number] -= self.acting.load_at(self.time, along[:, None])[:, 0]
+                if len(self.laws):
+                    values[:, number] += self.port_forces @ (
+                        self.laws.rows(system.acting_rows, len(along)) @ along
+                    )
+            for factor, course in item.courses:
+                values[:, number] += factor * course.at(self.time)
+            if item.reaction is not None or item.courses:
+                rates[:, number] = np.gradient(values[:, number], self.time)
+        return Response(values, rates)
+
 
 LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point less than this share of the most moving one is scaled by the share."""
@@ -37,11 +168,25 @@ class SecondOrderSystem(LinearSystem):
     def motion(self, acting: Acting, laws: Laws, refinement: int = 1) -> Motion:
         """Return the motion of a trial; a record that the clock makes begin late is followed from its begin.
 
+        Before a release from rest the shape is held. A release that is not from rest is continued backwards
+        without internal forces where its clock asks for times before zero.
+
+        Parameters
+        ----------
+        acting : Acting
+            What acts.
+        laws : Laws
+            Internal forces.
+        refinement : int
+            Steps are this many times smaller.
+
         Raises
         ------
         ModelError
-            If it begins at rest where there is none.
+            If it begins at rest where there is none, or the release point cannot be moved.
         """
+        if acting.release is not None:
+            return self._let_go(*acting.release, acting, laws, refinement)
         times, first = acting.sampled, float(acting.time[0])
         begin = self._first(acting, laws)
         found = self._followed(acting, laws, first, times, begin, refinement)
@@ -49,69 +194,13 @@ class SecondOrderSystem(LinearSystem):
             self._rest_on_drives(found, begin.v, laws)
         return Motion(self, acting, times, found.q, found.v, found.port_forces, found.lagged, laws)
 
-    def forced(
-        self,
-        input_row: FloatArray,
-        course: Course,
-        time: FloatArray,
-        laws: Laws,
-        *,
-        clock: tuple[float, float] = (0.0, 0.0),
-        refinement: int = 1,
+    def _let_go(
+        self, row: FloatArray, release: Release, acting: Acting, laws: Laws, refinement: int
     ) -> Motion:
-        """Return the motion at `time` (N,) from rest under the course of a force [N] along a row (n,).
-
-        The record of the force is taken as right; with a clock error the samples of the motion are taken at
-        (1 + rate) t + zero, and the force is read there from its record. Parameters as in `ringdown`.
-        """
-        acting = Acting(time, np.zeros(len(self.mass)), [(input_row, course)], clock=clock)
-        return self.motion(acting, laws, refinement)
-
-    def ringdown(
-        self,
-        release_row: FloatArray,
-        release: Release,
-        initial: FloatArray,
-        time: FloatArray,
-        laws: Laws,
-        *,
-        clock: tuple[float, float] = (0.0, 0.0),
-        refinement: int = 1,
-    ) -> Motion:
-        """Return the motion of a structure that springs hold after a release.
-
-        Parameters
-        ----------
-        release_row : (n,) ndarray
-            The release point: row . u is its displacement, and the holding force acts along it.
-        release : Release
-            How it began.
-        initial : (R, 2) ndarray
-            As in `Conditions`; rows beyond the modes are passed over.
-        time : (N,) ndarray
-            Stamps of the samples [s], strictly increasing.
-        laws : Laws
-            Internal forces.
-        clock : tuple of float
-            Rate and zero: a sample stamped t shows the motion at (1 + rate) t + zero.
-        refinement : int
-            Steps are this many times smaller.
-
-        Returns
-        -------
-        Motion
-            Before a release from rest the shape is held. A record that does not begin at rest is continued
-            backwards without internal forces where its clock asks for times before zero.
-
-        Raises
-        ------
-        ModelError
-            If the release point cannot be moved, or the static state has no solution.
-        """
-        acting = Acting(time, np.zeros(len(self.mass)), begins=Start.UNKNOWN, clock=clock)
+        """Return the motion of a structure that springs hold after a release at a row (n,)."""
         times, acts = acting.sampled, laws.act_at(0.0)
         loaded = laws.only(acts) if laws.spans else laws
-        begin, holding = self._released(release_row, release, initial, loaded)
+        begin, holding = self._released(row, release, acting.initial, loaded)
         q, v, memory = begin
         if memory is not None and laws.spans:
             begin = begin._replace(memory=laws.filled(memory, acts))

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
 from discrepancy.models.interface import Conditions, Model, Response
 from discrepancy.models.wrapped import built_in_sensors
@@ -20,8 +19,6 @@ from fe.runtime.sensors import (
     needs_components,
     uses_sensors,
 )
-
-FloatArray = NDArray[np.float64]
 
 __all__ = ["observe", "observe_response", "record_of", "uses_sensors"]
 
@@ -51,7 +48,7 @@ def observe(
     conditions : Conditions
         Parameters, initial state, clock and health.
     refinement : int
-        As of `Model.respond`.
+        As of `Conditions`.
 
     Raises
     ------
@@ -64,18 +61,20 @@ def observe(
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
     patch = (_by_channels(built_in_sensors(model), campaign) + patch).in_trial(trial.name)
+    if refinement != 1:
+        conditions = replace(conditions, refinement=refinement)
     if not uses_sensors(patch):
-        return model.respond(trial, outputs, patch, conditions, refinement=refinement)
+        return model.respond(trial, outputs, patch, conditions)
     rate, zero = clock_of(patch)
-    if rate or zero:
-        clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
-        conditions = replace(conditions, clock=clock)
-    bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS)))
     components = needs_components(patch)
+    if rate or zero or components:
+        clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
+        conditions = replace(conditions, clock=clock, components=components)
+    bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS)))
     loggers = logger_rates(campaign, trial, patch)
 
     def responded(stamped: Trial, given: Conditions) -> Response:
-        return model.respond(stamped, outputs, bare, given, components=components, refinement=refinement)
+        return model.respond(stamped, outputs, bare, given)
 
     response = (
         responded(trial, conditions) if loggers is None else _logged(trial, conditions, loggers, responded)

@@ -8,19 +8,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.models.compiled_motion import compiled_steps
+from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.sampling import is_even
+from discrepancy.models.compiled_motion import Steps, Structure, compiled_steps
 from discrepancy.models.memory import Memory
-from discrepancy.models.stepwise_kernel import Steps, Structure
 from fe.runtime.modal_system import ModalSystem, exact_step
 from fe.runtime.motion import FASTEST_PHASE, SLOWEST_PHASE, Laws, ModalMotion, port_flexibility
 from fe.runtime.motion_arrays import Samples, State
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
@@ -270,3 +270,42 @@ def _substeps(system: CoupledModes, laws: Laws, lengths: FloatArray) -> IntArray
         return np.full(len(lengths), STEPS_AT_LEAST, dtype=np.int64)
     rate = max(float(paces.min()) / SLOWEST_PHASE, float(paces.max()) / FASTEST_PHASE)
     return np.maximum(np.ceil(rate * lengths - 1e-9), 1.0).astype(np.int64)
+
+
+def free_motion(
+    modal: ModalSystem, q: FloatArray, v: FloatArray, times: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return free motion (N, M), displacement and velocity, of uncoupled modes.
+
+    Parameters
+    ----------
+    modal : ModalSystem
+        The modes; only the diagonal of their damping acts.
+    q, v : (M,) ndarray
+        Displacement and velocity at time zero, mass-normalised.
+    times : (N,) ndarray
+        [s]; evenly spaced ones take a tenth of the time.
+    """
+    half = 0.5 * np.diag(modal.damping)
+    w = modal.angular_frequency
+    root = np.sqrt((half**2 - w**2).astype(complex))
+    root = np.where(np.abs(root) < 1e-6 * w, 1e-6 * w, root)  # critical: beside it, by 1e-12 of w^2
+    fast, slow = -half - root, -half + root
+    first = (v - fast * q) / (2.0 * root)  # q = first e^(slow t) + second e^(fast t)
+    if np.all(root.imag != 0.0):  # the two are conjugate
+        wave = 2.0 * first * _waves(slow, times)
+        return np.ascontiguousarray(wave.real), np.ascontiguousarray((slow * wave).real)
+    one, two = first * _waves(slow, times), (q - first) * _waves(fast, times)
+    return np.ascontiguousarray((one + two).real), np.ascontiguousarray((slow * one + fast * two).real)
+
+
+def _waves(rates: NDArray[Any], times: FloatArray) -> NDArray[np.complex128]:
+    """Return e^(rate t) (N, M); at evenly spaced times as products of few exponentials."""
+    count, block = len(times), 32
+    if count <= 2 * block or not is_even(times):
+        return np.asarray(np.exp(np.outer(times, rates)))
+    interval = (times[-1] - times[0]) / (count - 1)
+    blocks = -(-count // block)
+    coarse = np.exp(np.outer(times[0] + interval * block * np.arange(blocks), rates))
+    fine = np.exp(np.outer(interval * np.arange(block), rates))
+    return np.asarray((coarse[:, None, :] * fine).reshape(blocks * block, -1)[:count])

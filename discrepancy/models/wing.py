@@ -1,21 +1,38 @@
 """The wing as a model: its reduced structure under patches, in static tests, flights and ring-downs."""
 
+from collections.abc import Hashable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from calibration.errors import CalibrationError
 from calibration.joint.prior import wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE
+from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import ModelParameter
-from discrepancy.models.structural import StructuralModel
-from discrepancy.models.wing_structure import WingStructure
+from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale, check_outputs
+from discrepancy.models.memory import Memory
+from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.models.structural import Moving, State, StructuralModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError
+from fe.runtime.patch import (
+    PRIMITIVES,
+    LocalStiffnessLoss,
+    ModelPatch,
+    ModulusTemperature,
+    PointMass,
+    PortLoad,
+    Primitive,
+    RootCompliance,
+)
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.patched_structure import motion_basis
+from fe.runtime.patched_wing import LOAD_PLACE, MODE_COUNT, ON_MODES, PORTS, PatchedWing, strain_gauge
+from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import wing_names
 from fe.wing.design import load_design
 from reporting.progress import Progress
@@ -31,8 +48,25 @@ SHIPPED_PRIOR = {
 paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
 
 
+class Stiffness:
+    """Factorised stiffness (n, n) of the wing in one state."""
+
+    def __init__(self, matrix: FloatArray) -> None:
+        self.matrix = matrix
+        try:
+            self._factor = cho_factor(matrix, lower=True, check_finite=False)
+        except np.linalg.LinAlgError as cause:
+            raise ModelError(
+                f"The patched wing has no stiffness left in some direction ({cause})."
+            ) from cause
+
+    def solve(self, loads: FloatArray) -> FloatArray:
+        """Return K^-1 loads, (n,) or (n, k)."""
+        return np.asarray(cho_solve(self._factor, loads, check_finite=False))
+
+
 class WingModel(StructuralModel):
-    """The wing.
+    """The wing in the states and under the structural patches that are asked for, each made once.
 
     Parameters
     ----------
@@ -50,17 +84,23 @@ class WingModel(StructuralModel):
     load_point_displacement and displacement[y, x].
     """
 
+    missing = STATION_PORTS
+    reference = LOAD_PLACE
+
     def __init__(
         self, arrays: PatchArrays, name: str = "wing", prior: dict[str, tuple[float, float]] | None = None
     ) -> None:
-        self.wing = PatchedWing(arrays)
+        self.wing = wing = PatchedWing(arrays)
         prior = prior or SHIPPED_PRIOR
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         parameters = tuple(
             ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
             for item in wing_priors(box, **prior)
         )
-        super().__init__(WingStructure(self.wing), name, parameters)
+        super().__init__(name, parameters)
+        self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
+        self.points = {port: wing.port_rows[port] for port in PORTS}
+        self._stiffnesses, self._systems, self._rows = Memory(), Memory(), Memory()
 
     @classmethod
     def shipped(cls, progress: Progress | None = None) -> "WingModel":
@@ -97,3 +137,95 @@ class WingModel(StructuralModel):
             return cls(patch_arrays(result.wing_design, progress), result.asset, prior)
         except (FiniteElementError, CalibrationError, OSError) as cause:
             raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
+
+    # ------------------------------------------------------------ outputs, ports and loads
+
+    def output_quantity(self, output: str) -> Quantity | None:
+        """Return what an output is, or None if there is no such output."""
+        if self.wing.output_row(output) is None:
+            return None
+        return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
+
+    def output_rows(self, outputs: Outputs, component: int, losses: ModelPatch) -> FloatArray:
+        """Return the rows (C, n) of outputs; `component` 1 and 2: transverse and shear strain.
+
+        Raises
+        ------
+        ModelError
+            If there is no such output, or it is of another quantity.
+        """
+        rows = self._rows.get((outputs, component), lambda: self._made_rows(outputs, component))
+        factors = self.wing.strain_factors(losses)
+        if factors is None:
+            return rows
+        gauges = self._rows.get(
+            (outputs, "gauges"), lambda: np.array([strain_gauge(output) for output, _ in outputs])
+        )
+        return rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
+
+    def _made_rows(self, outputs: Outputs, component: int) -> FloatArray:
+        places = f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction"
+        named = ("tip_displacement", "load_point_displacement", places)
+        gauges = f"strain[1] to strain[{self.wing.gauge_count}]"
+        check_outputs("The wing", self, outputs, (gauges, *named))
+        rows = [self.wing.output_row(output, component) for output, _ in outputs]
+        return np.array(rows, dtype=np.float64).reshape(len(rows), self.wing.size)
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
+        return primitive in PRIMITIVES.values() and primitive is not PortLoad
+
+    def at_ports(self, forces: ModelPatch) -> ModelPatch:
+        """Return forces as they act at ports of `port_rows`."""
+        return self.wing.internal_forces(forces)
+
+    def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+        """Return the load (n,) of 1 N at a place; raises `InvalidPatchError` if it is off the wing."""
+        return self.wing.force_row(place, loads)
+
+    def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+        """Return the parts (2, n) of the lift."""
+        return self.wing.load_parts(loads)
+
+    def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
+        """Return the scales of a force over the planform, from those of its mean and the first mode."""
+        share = self.wing.planform.share
+        motion = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
+        ratio = motion / float(share @ motion)
+        by_place = tuple(zip(share.tolist(), ratio.tolist(), strict=True))
+        return {PLANFORM: replace(ports["span"], spread=by_place)}
+
+    # ------------------------------------------------------------ structure
+
+    def stiffness(self, state: State) -> Stiffness:
+        """Return the stiffness in a state."""
+        factor = float(state.parameters[0])
+        return self._stiffnesses.get(
+            _stiffness_key(state), lambda: Stiffness(self.wing.stiffness(factor, *state[1:]))
+        )
+
+    def moving(self, state: State, place: Place, ports: tuple[str, ...] = ()) -> Moving:
+        """Return the wing as it moves when released from, or pushed at, a place, with forces at `ports`."""
+        masses, held = state.structure.of(PointMass), self.wing.held_ports(ports)
+
+        def make() -> Moving:
+            _, servo, pitot, alpha, beta = state.parameters.tolist()
+            stiffness, mass = self.stiffness(state), self.wing.mass(servo, pitot, masses)
+            still = stiffness.solve(np.vstack((self.wing.force_row(place), *held.values())).T)
+            basis = motion_basis(stiffness.solve, mass, self.wing.arrays.start_shapes, still)
+            small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness.matrix @ basis
+            small_mass, small = 0.5 * (small_mass + small_mass.T), 0.5 * (small + small.T)
+            rows = {port: row @ basis for port, row in held.items()}
+            damping = alpha * small_mass + beta * small
+            system = SecondOrderSystem(small_mass, damping, small, rows, MODE_COUNT, beta, ON_MODES)
+            return Moving(basis, system)
+
+        further = (masses.primitives, state.parameters[1:].tobytes(), place, tuple(held))
+        return self._systems.get((_stiffness_key(state), further), make)
+
+
+def _stiffness_key(state: State) -> Hashable:
+    """Return what the stiffness of a state depends on; primitives of other kinds are passed over."""
+    kept = state.structure.of(RootCompliance, LocalStiffnessLoss, ModulusTemperature)
+    warmer = state.warmer if len(kept.of(ModulusTemperature)) else 0.0
+    return float(state.parameters[0]), state.losses, kept.primitives, warmer

@@ -1,7 +1,5 @@
 """Small campaigns to try: simulated trials of a model, with what every test has: noise, zeros, gains."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +16,8 @@ from discrepancy.errors import CampaignFileError, ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.reduced_structure import ReducedBody
+from discrepancy.models.reduced_structure import StructureModel
 from discrepancy.models.sensing import observe
-from discrepancy.models.structural import StructuralModel
 from discrepancy.models.wrapped import innermost
 from fe.runtime.patch import ModelPatch
 
@@ -103,9 +100,9 @@ def plan_of(model: Model) -> ExamplePlan:
         known = [bare.runs.asset.description.variable(bare.runs.variable(name)) for name in forces.values()]
         limits = [item.maximum for item in known if item is not None and item.maximum is not None]
         largest = 0.5 * min(limits, default=np.inf)
-    elif isinstance(bare, StructuralModel) and isinstance(bare.body, ReducedBody):
-        reduced = bare.body.model
-        places, outputs = [*bare.body.forces], [*reduced.gauges, *reduced.displacements]
+    elif isinstance(bare, StructureModel):
+        reduced = bare.model
+        places, outputs = [*bare.forces], [*reduced.gauges, *reduced.displacements]
         largest = 0.5 * min((reduced.validity[name][1] for name in places), default=np.inf)
     else:
         return wing_plan()

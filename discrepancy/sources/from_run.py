@@ -3,9 +3,6 @@
 `docs/run_folder.md` describes the folder; it is read by its files alone.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -19,8 +16,8 @@ from calibration.result.file import load_calibration
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.models.interface import Model
-from discrepancy.models.patched import PatchedModel
 from discrepancy.models.wing import WingModel
+from discrepancy.models.wrapped import PatchedModel
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.packing.patched_runtime import output_channels
@@ -43,49 +40,29 @@ STRAIN = "strain"
 TEMPERATURE = ("temperature_difference", "temperature")
 """Names under which a run may record the temperature: less the reference [K], or itself [degC]."""
 REFERENCE_TEMPERATURE = 20.0
-HEALTH_MEAN, HEALTH_DEVIATION = 0.4, 0.25
-"""Prior of each stiffness loss in each turn, where the belief is left aside: about even from 0 to 0.8."""
+HEALTH_DEVIATION = 0.25
+"""Least prior deviation of a stiffness loss in a turn, about its smoothed belief. The belief was led astray
+by what is looked for, and is much surer than it is right; 24 gauges tell the health of a turn anyway."""
+BLOCK, HELD_OUT_SHARE = 4, 0.2
+"""Turns of a block that is held out; share of the turns that is, in whole blocks spread over the flight."""
 
 
-@dataclass(frozen=True)
-class RunPlan:
-    """How a run is read.
-
-    Attributes
-    ----------
-    health : {"belief", "broad"}
-        Mean of the health in a turn: the smoothed belief, or the same in all.
-    health_deviation : float
-        Least prior deviation of a stiffness loss in a turn. The belief was led astray by what is looked for,
-        and is much surer than it is right; 24 gauges tell the health of a turn anyway.
-    block : int
-        Turns of a block that is held out.
-    held_out_share : float
-        Share of the turns that is held out, in whole blocks spread over the flight.
-    noise_deviation : float or None
-        Of a strain reading [1]; by default what the scenario says of the gauges, else what its twin assumes.
-    first_turn, last_turn : int or None
-        Turns that are read; None for the first of the flight, and its last.
-    """
-
-    health: str = "belief"
-    health_deviation: float = HEALTH_DEVIATION
-    block: int = 4
-    held_out_share: float = 0.2
-    noise_deviation: float | None = None
-    first_turn: int | None = None
-    last_turn: int | None = None
-
-
-def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
+def run_campaign(
+    folder: Path | str,
+    first_turn: int | None = None,
+    last_turn: int | None = None,
+    held_out_share: float = HELD_OUT_SHARE,
+) -> Campaign:
     """Return the flight of a run folder as a campaign.
 
     Parameters
     ----------
     folder : path
         As `uav-twin run --out` leaves it.
-    plan : RunPlan, optional
-        How it is read.
+    first_turn, last_turn : int, optional
+        Turns that are read; by default from the first of the flight to its last.
+    held_out_share : float
+        Share of the turns that is held out.
 
     Returns
     -------
@@ -101,10 +78,10 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
     CampaignDataError
         If nothing was observed, or a steady force acted beside the load factor.
     """
-    folder, plan = Path(folder), plan or RunPlan()
+    folder = Path(folder)
     restore_folder(folder)
     try:
-        return _campaign(folder, plan, _config(folder)["scenario"])
+        return _campaign(folder, (first_turn, last_turn), held_out_share, _config(folder)["scenario"])
     except DiscrepancyError:
         raise
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as cause:
@@ -115,18 +92,18 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
         ) from cause
 
 
-def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign:
+def _campaign(
+    folder: Path, turns: tuple[int | None, int | None], held_out_share: float, scenario: dict[str, Any]
+) -> Campaign:
     _refuse_others(folder, scenario)
     run = _run(folder)
     # Turns before a patch that was adopted on the way were believed with another model.
-    first = max(
-        (turn for turn in (run.attrs.get(PATCH_STEP), plan.first_turn) if turn is not None), default=None
-    )
-    since = slice(first, plan.last_turn)
+    adopted = run.attrs.get(PATCH_STEP)
+    since = slice(max((turn for turn in (adopted, turns[0]) if turn is not None), default=None), turns[1])
     observed, smoothed = (run[name].to_dataset().sel(step=since) for name in ("observed", "smoothed"))
     if not observed.sizes["step"]:
-        wanted = [f"from {plan.first_turn} on"] if plan.first_turn is not None else []
-        wanted += [f"up to {plan.last_turn}"] if plan.last_turn is not None else []
+        ends = zip(("from {} on", "up to {}"), turns, strict=True)
+        wanted = [text.format(turn) for text, turn in ends if turn is not None]
         raise CampaignDataError(f"{folder.name} has the turns {_ends(run)}, and none {', '.join(wanted)}.")
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
     used = np.isfinite(strain)
@@ -136,12 +113,10 @@ def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign
     names = tuple(f"g{number}" for number in np.asarray(observed["sensor"].values).tolist())
     mean = np.asarray(smoothed["mean"].values, dtype=np.float64)
     deviation = np.asarray(smoothed["standard_deviation"].values, dtype=np.float64)
-    if plan.health == "broad":
-        mean = np.full_like(mean, HEALTH_MEAN)
-    deviation = np.maximum(deviation, plan.health_deviation)
+    deviation = np.maximum(deviation, HEALTH_DEVIATION)
     time = _step_size(folder) * (np.asarray(observed["step"].values, dtype=np.float64) + 1.0)
     temperature, known = _temperature(run, since, size)
-    noise, source = _noise(scenario, plan)
+    noise, source = _noise(scenario)
     channels = {
         name: Channel(name, Quantity.STRAIN, f"strain[{name[1:]}]", NoiseRecord(noise, inf)) for name in names
     }
@@ -150,7 +125,7 @@ def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign
         load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64), temperature=temperature,
         run=str(run.attrs.get("scenario", "run")), health=mean, health_deviation=deviation,
     )  # fmt: skip
-    held = held_out_turns(size, plan.block, plan.held_out_share)
+    held = held_out_turns(size, BLOCK, held_out_share)
     trials = [whole.rows(~held)]
     if held.any():
         trials.append(whole.rows(held, name="turns held out", held_out=True))
@@ -164,13 +139,9 @@ def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign
         data_hash=hash_file(folder / RUN_FILE),
         remarks=(
             f"Flight of {counted(size, 'turn')} read from a run folder; health in each turn: "
-            f"{plan.health} with a deviation of {plan.health_deviation:g} or more.",
+            f"belief with a deviation of {HEALTH_DEVIATION:g} or more.",
             f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source}.",
-            *(
-                (f"{lost} of {size * gauges} readings {'was' if lost == 1 else 'were'} lost.",)
-                if lost
-                else ()
-            ),
+            *([f"{lost} of {size * gauges} readings {'was' if lost == 1 else 'were'} lost."] if lost else []),
         ),
     )
 
@@ -327,9 +298,8 @@ def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[FloatArray,
     return np.zeros(size), False
 
 
-def _noise(scenario: dict[str, Any], plan: RunPlan) -> tuple[float, str]:
-    if plan.noise_deviation is not None:
-        return plan.noise_deviation, "as given"
+def _noise(scenario: dict[str, Any]) -> tuple[float, str]:
+    """Return the deviation of a strain reading [1], and who says so."""
     stated = ((scenario.get("truth") or {}).get("noise") or {}).get("standard_deviation")
     if stated:
         return float(stated), "as the scenario says of the gauges"

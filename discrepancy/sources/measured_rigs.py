@@ -3,19 +3,15 @@
 The data are not part of the package; `docs/measured_rigs.md` says where they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
-
-FloatArray = NDArray[np.float64]
 
 FALLING = 3.0
 """While the reading of the sensor's z is below this share of a rest's, it falls [m/s^2]."""

@@ -1,8 +1,5 @@
 """The published measurements of the real wing as a campaign: five ring-downs, and two loading runs."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 
@@ -46,51 +43,33 @@ PARAMETERS = {
 for what the amplitude does to the frequency and the damping ratio that were calibrated to."""
 
 
-@dataclass(frozen=True)
-class RecordPlan:
-    """What of a ring-down record is used.
-
-    Attributes
-    ----------
-    begin, end : float
-        Window since the release [s]; before it higher modes ring that the model does not meet.
-    columns : int
-        Columns of the plot that are averaged into one sample. Four (32 ms) have a zero of their frequency
-        response at 30.8 Hz, where the second bending mode rings.
-    detrended : bool
-        Whether the slow zero that the trials share is taken off: the moving average over three periods (Hann
-        weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing.
-        What moves slowly in one trial alone is noise and stays.
-    release : float
-        Nominal displacement of the tip at the window's begin [m]; the unknown scale of the signal makes any
-        value as good.
-    mode_count : int
-        Modes whose state at the begin is free.
-    loading_runs : bool
-        Whether the loading runs are used too, where they are.
-    held_out : tuple of int
-        Trials kept for proof, counted from 1.
-    """
-
-    begin: float = 0.8
-    end: float = inf
-    columns: int = 4
-    detrended: bool = True
-    release: float = 0.05
-    mode_count: int = 2
-    loading_runs: bool = True
-    held_out: tuple[int, ...] = (3, 5)
+BEGIN = 0.8
+"""Begin of the window since the release [s]; before it higher modes ring that the model does not meet."""
+COLUMNS = 4
+"""Columns of the plot that are averaged into one sample. Four (32 ms) have a zero of their frequency response
+at 30.8 Hz, where the second bending mode rings."""
+RELEASE, MODE_COUNT = 0.05, 2
+"""Nominal displacement of the tip at the window's begin [m], where the unknown scale of the signal makes any
+value as good; modes whose state there is free."""
+HELD_OUT = (3, 5)
+"""Trials kept for proof, counted from 1."""
 
 
-def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
+def wing_campaign(
+    data: Path | str, *, begin: float = BEGIN, columns: int = COLUMNS, detrended: bool = True
+) -> Campaign:
     """Return the published measurements of the real wing as a campaign.
 
     Parameters
     ----------
     data : path
         The authors' calibration folder, with `step2` and `step3`.
-    plan : RecordPlan, optional
-        What of the ring-downs is used.
+    begin, columns
+        In place of `BEGIN` and `COLUMNS`.
+    detrended : bool
+        Whether the slow zero that the trials share is taken off: the moving average over three periods (Hann
+        weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing.
+        What moves slowly in one trial alone is noise and stays.
 
     Returns
     -------
@@ -105,18 +84,18 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
     CampaignDataError
         If a record cannot be used.
     """
-    data, plan = Path(data), plan or RecordPlan()
+    data = Path(data)
     try:
         records = read_records(data)
-        pairs = read_measurements(data) if plan.loading_runs and _has_pairs(data) else None
+        pairs = read_measurements(data) if _has_pairs(data) else None
     except CalibrationError as cause:
         raise CampaignFileError(f"The measurements of the wing cannot be read: {cause}") from cause
     if any(len(record.time) != len(records[0].time) for record in records) or len(records) < 2:
         raise CampaignDataError(
             f"{data} must hold two or more ring-down records of one length; it holds {len(records)}."
         )
-    zero = _shared_zero(records) if plan.detrended else np.zeros(records[0].count)
-    windows = [_windowed(record, zero, plan) for record in records]
+    zero = _shared_zero(records) if detrended else np.zeros(records[0].count)
+    windows = [_windowed(record, zero, begin, columns) for record in records]
     scatter = trial_scatter(windows)
     spread = float(np.std(scatter, ddof=1))
     noise = pre_trigger_record(
@@ -136,8 +115,8 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
         trials.append(
             Trial.plain(
                 f"release {number}", TrialKind.RINGDOWN, (SIGNAL,), time, values=signal[:, None],
-                release=Release(plan.release, 1.0, at_rest=False, mode_count=plan.mode_count),
-                held_out=number in plan.held_out,
+                release=Release(RELEASE, 1.0, at_rest=False, mode_count=MODE_COUNT),
+                held_out=number in HELD_OUT,
             )
         )  # fmt: skip
     return Campaign(
@@ -148,8 +127,8 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
         PARAMETERS,
         hash_record([[*trial.values.ravel().tolist()] for trial in trials]),
         (
-            f"Ring-downs: {records[0].source} to {records[-1].source}, from {plan.begin:g} s after the "
-            f"release; {counted(plan.columns, 'column')} of the plot averaged into a sample of "
+            f"Ring-downs: {records[0].source} to {records[-1].source}, from {begin:g} s after the "
+            f"release; {counted(columns, 'column')} of the plot averaged into a sample of "
             f"{1e3 * _interval(windows):.3g} ms.",
             f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
             f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
@@ -157,9 +136,9 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
     )
 
 
-def write_wing_campaign(data: Path | str, out: Path | str, plan: RecordPlan | None = None) -> Campaign:
+def write_wing_campaign(data: Path | str, out: Path | str) -> Campaign:
     """Write `wing_campaign` as a folder and return it as read from there; errors as there and of writing."""
-    return read_campaign(write_campaign(wing_campaign(data, plan), out))
+    return read_campaign(write_campaign(wing_campaign(data), out))
 
 
 def trial_scatter(windows: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
@@ -196,17 +175,18 @@ def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
     return zero
 
 
-def _windowed(record: RingDownRecord, zero: FloatArray, plan: RecordPlan) -> tuple[FloatArray, FloatArray]:
-    """Return times since the first and samples of a record in the plan's window."""
+def _windowed(
+    record: RingDownRecord, zero: FloatArray, begin: float, columns: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return times since the first and samples of a record from the window's begin on."""
     known = np.isfinite(zero)
-    inside = np.flatnonzero(known & (record.time >= plan.begin) & (record.time <= plan.end))
-    count = len(inside) // plan.columns
+    inside = np.flatnonzero(known & (record.time >= begin))
+    count = len(inside) // columns
     if count < 60:
         raise CampaignDataError(
-            f"{record.source}: {counted(count, 'sample')} {be(count)} left between {plan.begin:g} and "
-            f"{plan.end:g} s; 60 are needed."
+            f"{record.source}: {counted(count, 'sample')} {be(count)} left after {begin:g} s; 60 are needed."
         )
-    kept = inside[: count * plan.columns].reshape(count, plan.columns)
+    kept = inside[: count * columns].reshape(count, columns)
     time = record.time[kept].mean(axis=1)
     interval = float(time[-1] - time[0]) / (count - 1)
     return np.asarray(interval * np.arange(count), dtype=np.float64), np.asarray(

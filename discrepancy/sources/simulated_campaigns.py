@@ -4,11 +4,10 @@ from dataclasses import dataclass, replace
 from math import isinf
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.campaign.records import Campaign, Trial
+from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Term
@@ -18,8 +17,6 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.separability import DETECTED, as_predicted
 from discrepancy.models.interface import Model
-
-FloatArray = NDArray[np.float64]
 
 TRIES = 60
 """Draws of an effect's prior until one is detectable; without success the effect is not detectable here."""

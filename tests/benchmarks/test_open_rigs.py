@@ -52,7 +52,7 @@ def test_equations_and_model_files_agree(name: str, tmp_path: Path) -> None:
         (Truth(bench.factors, law, size), ModelPatch((primitive,))),
     ):
         expected = simulate(bench.rig, truth, bench.courses[:1], bench.stamps[:1])[0]
-        found = model.respond(campaign.trials[0], outputs, patch, Conditions(factors), refinement=4).values
+        found = model.respond(campaign.trials[0], outputs, patch, Conditions(factors, refinement=4)).values
         assert np.sqrt(np.mean(((found - expected) / bench.noise) ** 2)) < 0.5
     assert bench.left(truth, bench.bare) > 1.0  # the law is seen beside calibration and zeros
 

@@ -28,8 +28,8 @@ from discrepancy.model_choice import ModelChoice, choose_model
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
-from discrepancy.models.patched import PatchedModel
 from discrepancy.models.sensing import observe
+from discrepancy.models.wrapped import PatchedModel
 from discrepancy.search.strategy import search
 from discrepancy.sources.examples import example_campaign, plan_of, write_example
 from discrepancy.verdict import VerdictKind

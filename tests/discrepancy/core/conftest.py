@@ -71,9 +71,6 @@ class ClosedForm:
         outputs: tuple[tuple[str, Quantity], ...],
         patch: ModelPatch,
         conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
     ) -> Response:
         columns = [OUTPUTS.index(output) for output, _ in outputs]
         theta = conditions.parameters

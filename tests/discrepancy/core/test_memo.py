@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.models.interface import Conditions
-from discrepancy.models.memo import MemoModel
+from discrepancy.models.wrapped import MemoModel
 from fe.runtime.patch import ModelPatch
 
 

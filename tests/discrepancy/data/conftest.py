@@ -55,9 +55,6 @@ class Oscillator:
         outputs: tuple[tuple[str, Quantity], ...],
         patch: ModelPatch,
         conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
     ) -> Response:
         stiffness = self.stiffness * float(conditions.parameters[0])
         x, v = self._motion(trial, stiffness, conditions)
@@ -70,8 +67,8 @@ class Oscillator:
         return Response(
             parts[0],
             v[:, None] * scale[0] if trial.is_dynamic else None,
-            parts[1] if components else None,
-            parts[2] if components else None,
+            parts[1] if conditions.components else None,
+            parts[2] if conditions.components else None,
         )
 
     def _motion(self, trial: Trial, stiffness: float, conditions: Conditions):

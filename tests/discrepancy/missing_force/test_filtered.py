@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from discrepancy.missing_force.filtered import Filtered, Process
 from discrepancy.missing_force.regression import regression
 from discrepancy.missing_force.trial import SeenTrial
-from discrepancy.models.ported import PortedSystem
+from discrepancy.models.interface import PortedSystem
 
 FloatArray = NDArray[np.float64]
 

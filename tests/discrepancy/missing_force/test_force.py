@@ -23,12 +23,11 @@ from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.shares import ForceShare, ForceShares, order_of
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
+from discrepancy.models.acting import refined
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.patched import PatchedModel
-from discrepancy.models.ported import apart, refined
-from discrepancy.models.wrapped import has_law
+from discrepancy.models.wrapped import PatchedModel, apart, has_law
 from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.report.text import force_sentence
 from discrepancy.search.strategy import Search

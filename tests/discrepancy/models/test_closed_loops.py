@@ -123,7 +123,7 @@ def test_a_pendulum_follows_its_target_as_integrated(hold: str, measured: bool) 
     weight, servo = 1.1, 0.9
     outputs = (("angle", Quantity.ANGLE), ("torque", Quantity.TORQUE))
     response = model_of(text).respond(
-        driven(time, item), outputs, ModelPatch(), Conditions(np.array([weight, servo])), refinement=4
+        driven(time, item), outputs, ModelPatch(), Conditions(np.array([weight, servo]), refinement=4)
     )
 
     def torque(t: float, state: FloatArray, k: int) -> float:
@@ -190,8 +190,8 @@ def test_what_leaves_one_store_enters_the_next_and_flows_over_when_full() -> Non
     true = integrated(rate, time, np.array([1.0, 0.5]))
     errors = []
     for refinement in (2, 4):
-        conditions = Conditions(np.zeros(0), initial=begin)
-        found = model_of(TANKS).respond(trial, outputs, laws, conditions, refinement=refinement).values
+        conditions = Conditions(np.zeros(0), initial=begin, refinement=refinement)
+        found = model_of(TANKS).respond(trial, outputs, laws, conditions).values
         errors.append(float(np.abs(found - true).max()))
     assert errors[1] < 2e-3
     assert errors[0] > 3.0 * errors[1]  # of second order

@@ -12,10 +12,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from discrepancy.campaign.records import Quantity, Release
+from discrepancy.models.acting import Acting, Course
 from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.input_course import Course
-from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.second_order_motion import Motion
+from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.laws.micro_slip import slip_displacements
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import ModalMotion, laws_of, simulate
@@ -56,7 +55,9 @@ def chain(modes: int, beta: float) -> SecondOrderSystem:
 def ringdown(beta: float, *items: Primitive, refinement: int = 1) -> Motion:
     system = chain(3, beta)
     laws = laws_of(ModelPatch(items), list(system.ports))
-    return system.ringdown(TIP, RELEASE, np.zeros((0, 2)), TIME, laws, refinement=refinement)
+    return system.motion(
+        Acting(TIME, np.zeros(len(TIP)), initial=np.zeros((0, 2)), release=(TIP, RELEASE)), laws, refinement
+    )
 
 
 LAWS = {
@@ -329,7 +330,9 @@ def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
     time = np.linspace(0.0, 90.0, 3001)
     force = np.asarray(15.0 * np.sin(2.0 * np.pi * time / 90.0))
     rows = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
-    moved = system.forced(TIP, Course.of(time, force), time, laws).values(rows)
+    moved = system.motion(Acting(time, np.zeros(len(TIP)), [(TIP, Course.of(time, force))]), laws).values(
+        rows
+    )
     still = system.static(np.outer(force, TIP), laws).values @ rows.T
     assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())
 

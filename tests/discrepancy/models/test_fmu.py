@@ -156,8 +156,9 @@ def error(
     refinement: int = 1,
 ) -> float:  # fmt: skip
     """Return the largest difference of the two models as a share of each output's largest value."""
-    exact = lumped.respond(case, OUTPUTS, changes, conditions, refinement=32 if case.is_dynamic else 1).values
-    mine = rig.respond(case, OUTPUTS, changes, conditions, refinement=refinement).values
+    fine, finer = (replace(conditions, refinement=n) for n in (refinement, 32 if case.is_dynamic else 1))
+    exact = lumped.respond(case, OUTPUTS, changes, finer).values
+    mine = rig.respond(case, OUTPUTS, changes, fine).values
     return float(np.max(np.max(np.abs(mine - exact), axis=0) / np.max(np.abs(exact), axis=0)))
 
 
@@ -286,8 +287,8 @@ def test_stepping_the_fmu_gives_what_superposition_gives(
     stepped = FmuModel.load(path)
     short = trial(TrialKind.RINGDOWN, 120, release=Release(AMPLITUDE))
     for name in ("coulomb", "quadratic", "bouc-wen"):
-        first = stepped.respond(short, OUTPUTS, patch(LAWS[name]), CONDITIONS, refinement=2).values
-        second = rig.respond(short, OUTPUTS, patch(LAWS[name]), CONDITIONS, refinement=2).values
+        first = stepped.respond(short, OUTPUTS, patch(LAWS[name]), replace(CONDITIONS, refinement=2)).values
+        second = rig.respond(short, OUTPUTS, patch(LAWS[name]), replace(CONDITIONS, refinement=2)).values
         # steps may have been chosen differently: both are within their error
         assert np.max(np.abs(first - second), axis=0) == pytest.approx(0.0, abs=2e-4 * AMPLITUDE)
     stepped.close()
@@ -433,7 +434,9 @@ def test_what_the_model_cannot_do_is_refused(rig: FmuModel) -> None:
         RINGDOWN, patch(replace(LAWS["coulomb"], port="tip"))  # type: ignore[type-var]
     )  # fmt: skip
     assert "names no load_factor" in refused(trial(TrialKind.FLIGHT, 2, load_factor=np.ones(2)))
-    assert "is loaded at 'wing tip', and the FMU model" in refused(replace(LOADS, load_place="wing tip"))
+    assert "In the trial 'a trial' the load place is 'wing tip', and the FMU model" in refused(
+        replace(LOADS, load_place="wing tip")
+    )
     assert "has no output 'x'" in refused(LOADS, outputs=(("x", Quantity.DISPLACEMENT),))
     assert "is at rest" in refused(LOADS, outputs=(("displacement", Quantity.VELOCITY),))
 

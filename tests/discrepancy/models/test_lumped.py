@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course
+from discrepancy.models.acting import Acting, Course
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
@@ -80,10 +80,8 @@ def patch(*items: Primitive) -> ModelPatch:
 
 
 def shown(model: LumpedModel, what: Trial, *items: Primitive, **options: Any) -> FloatArray:
-    conditions = options.pop("conditions", ONES)
-    return model.respond(
-        what, options.pop("outputs", DISPLACEMENTS), patch(*items), conditions, **options
-    ).values
+    conditions, outputs = options.pop("conditions", ONES), options.pop("outputs", DISPLACEMENTS)
+    return model.respond(what, outputs, patch(*items), replace(conditions, **options)).values
 
 
 # ---------------------------------------------------------------- static
@@ -331,10 +329,9 @@ def test_omitted_modes_follow_slow_forces() -> None:
     time = np.arange(500) * 0.01
     force = 1.0 - np.cos(4.0 * time)
     row = np.array([0.0, 1.0, 0.0])
-    answers = [
-        system.forced(row, Course.of(time, force), time, NO_LAWS).values(np.eye(3)) for system in (whole, one)
-    ]
-    bare = one.forced(row, Course.of(time, force), time, NO_LAWS).q @ one.shapes.T
+    acting = Acting(time, np.zeros(3), [(row, Course.of(time, force))])
+    answers = [system.motion(acting, NO_LAWS).values(np.eye(3)) for system in (whole, one)]
+    bare = one.motion(acting, NO_LAWS).q @ one.shapes.T
     scale = np.max(np.abs(answers[0]))
     assert np.max(np.abs(answers[0] - answers[1])) < 2e-3 * scale
     assert np.max(np.abs(answers[0] - bare)) > 2e-2 * scale
@@ -423,8 +420,8 @@ def test_an_empty_patch_and_sensor_primitives_change_no_bit(chain: LumpedModel) 
         (static([1.0]), (("x9", Quantity.DISPLACEMENT),), (), "has no output 'x9'; it has x1, x2"),
         (static([1.0]), (("x1", Quantity.STRAIN),), (), "is a displacement, but a channel"),
         (static([1.0]), (("x1", Quantity.VELOCITY),), (), "is static, but a channel"),
-        (static([1.0], load_place="nose"), DISPLACEMENTS, (), "'nose' is not an input .* has end"),
-        (static([1.0], load_place=(0.1, 0.2)), DISPLACEMENTS, (), "is not an input"),
+        (static([1.0], load_place="nose"), DISPLACEMENTS, (), "load place is 'nose', .* takes forces at end"),
+        (static([1.0], load_place=(0.1, 0.2)), DISPLACEMENTS, (), "takes forces at"),
         (static([1.0]), DISPLACEMENTS, (Washout(0.1, 1.0),), "cannot carry the primitive 'washout'"),
         (static([1.0]), DISPLACEMENTS, (FreePlay("nose", 1.0, 1.0),), "port 'nose', which"),
         (static([1.0], load_place="middle"), DISPLACEMENTS, (LoadPlace(0.1, 0.0),), "no station_deriv"),

@@ -26,7 +26,7 @@ from discrepancy.campaign.records import (
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course, Drive
+from discrepancy.models.acting import Course, Drive
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
@@ -173,7 +173,7 @@ def shown(
 ) -> FloatArray:  # fmt: skip
     given = {"parameters": np.ones(len(model.parameters)), **conditions}
     return model.respond(
-        what, tuple(outputs.items()), ModelPatch(laws), Conditions(**given), refinement=refinement
+        what, tuple(outputs.items()), ModelPatch(laws), Conditions(**given, refinement=refinement)
     ).values
 
 

@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
+from discrepancy.models.acting import Acting, Course
 from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.input_course import Course
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.second_order import SecondOrderSystem
@@ -46,7 +46,7 @@ def trial(kind: TrialKind, time: FloatArray, **changes: Any) -> Trial:
 
 def shown(model: LumpedModel, what: Trial, *items: Primitive, refinement: int = 1) -> FloatArray:
     return model.respond(
-        what, OUTPUTS, ModelPatch(items), Conditions(np.ones(3)), refinement=refinement
+        what, OUTPUTS, ModelPatch(items), Conditions(np.ones(3), refinement=refinement)
     ).values
 
 
@@ -86,7 +86,7 @@ def test_even_stamps_are_those_of_the_even_stepper(laws: tuple[Primitive, ...]) 
         system.modal, internal, q=np.zeros(2), v=np.zeros(2), force=force, interval=0.01,
         shape=shape @ system.shapes, kernel=compiled_kernel(),
     )  # fmt: skip
-    found = system.forced(shape, Course.of(time, force), time, internal)
+    found = system.motion(Acting(time, np.zeros(len(shape)), [(shape, Course.of(time, force))]), internal)
     pairs = ((found.q, even.q), (found.velocity, even.v), (found.port_forces, even.port_forces))
     for one, other in pairs:
         np.testing.assert_allclose(

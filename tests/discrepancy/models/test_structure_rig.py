@@ -13,9 +13,9 @@ import pytest
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.fmu_excitation import Excitation, Run
+from discrepancy.models.fmu_runs import Excitation, Run
 from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.reduced_structure import structure_model
+from discrepancy.models.reduced_structure import StructureModel
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch import ModelPatch, PowerStiffness
 from fe.runtime.reduced import ReducedModel
@@ -55,7 +55,7 @@ def pair(
 def either(request: pytest.FixtureRequest, pair: tuple[FmuModel, ReducedModel]) -> tuple[Model, ReducedModel]:
     """The structure itself, and its FMU."""
     model, reduced = pair
-    return (structure_model(reduced) if request.param == "structure" else model), reduced
+    return (StructureModel(reduced) if request.param == "structure" else model), reduced
 
 
 def test_it_is_the_structure_at_rest(either: tuple[Model, ReducedModel]) -> None:
@@ -97,7 +97,7 @@ def test_it_is_its_fmu(
 ) -> None:
     """All kinds of trials, with and without a spring at the tip."""
     fmu, reduced = pair
-    zero, own = np.zeros(40), structure_model(reduced)
+    zero, own = np.zeros(40), StructureModel(reduced)
     assert (own.ports(), [(p.name, p.mean, p.deviation, p.low, p.high) for p in own.parameters]) == (
         fmu.ports(), [(p.name, p.mean, pytest.approx(p.deviation), p.low, p.high) for p in fmu.parameters],
     )  # fmt: skip
@@ -117,7 +117,7 @@ def test_it_is_its_fmu(
 
 
 def test_any_region_is_known_by_its_name(pair: tuple[FmuModel, ReducedModel]) -> None:
-    own, reduced = structure_model(pair[1]), pair[1]
+    own, reduced = StructureModel(pair[1]), pair[1]
     health, conditions = np.array([[0.0, 0.2, 0.3]]), np.array([1.0, 0.05])
     named = replace(TRIAL, regions=("other", "z2", "z1"))
     seen = own.respond(named, OUTPUTS[:1], ModelPatch(), Conditions(conditions, health=health)).values[-1]
@@ -154,7 +154,7 @@ def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(pair: tuple[FmuModel,
         wanted = model.respond(trial, OUTPUTS, ModelPatch(), conditions).values
         for refinement in (8, 16):
             before = model.runs.step_count
-            seen = model.respond(trial, OUTPUTS, spring, conditions, refinement=refinement).values
+            seen = model.respond(trial, OUTPUTS, spring, replace(conditions, refinement=refinement)).values
             largest = np.abs(wanted).max(axis=0)
             np.testing.assert_allclose(seen / largest, wanted / largest, atol=1e-6)
     assert model.runs.step_count == before  # confirmed at the first parameters

@@ -65,7 +65,7 @@ def trial(kind: TrialKind, name: str = "run", time: FloatArray = TIME) -> Trial:
 
 
 def response(given: Trial, *items: Primitive) -> FloatArray:
-    found = MODEL.respond(given, OUTPUTS, ModelPatch(items), Conditions(np.zeros(0)), refinement=8)
+    found = MODEL.respond(given, OUTPUTS, ModelPatch(items), Conditions(np.zeros(0), refinement=8))
     return found.values
 
 

@@ -59,9 +59,6 @@ class Curve:
         outputs: tuple[tuple[str, Quantity], ...],
         patch: ModelPatch,
         conditions: Conditions,
-        *,
-        components: bool = False,
-        refinement: int = 1,
     ) -> Response:
         values = self.law(trial.force, conditions.parameters)
         return Response(np.tile(values[:, np.newaxis], (1, len(outputs))))

@@ -25,9 +25,9 @@ from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import choice_of_run, choose_model
 from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.memo import MemoModel
 from discrepancy.models.sensing import observe
-from discrepancy.sources.from_run import RunPlan, held_out_turns, run_campaign, run_model
+from discrepancy.models.wrapped import MemoModel
+from discrepancy.sources.from_run import held_out_turns, run_campaign, run_model
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
 from discrepancy.workflow import investigate
@@ -91,11 +91,11 @@ def test_every_turn_is_in_one_trial_as_it_was_observed(campaign: Campaign, tree:
 
 @pytest.mark.xdist_group("wing")
 def test_some_turns_alone_are_read(run: Path) -> None:
-    campaign = run_campaign(run, RunPlan(first_turn=5, last_turn=18))
+    campaign = run_campaign(run, first_turn=5, last_turn=18)
     time = np.sort(np.concatenate([trial.time for trial in campaign.trials]))
     np.testing.assert_array_equal(time, np.arange(6.0, 20.0))
     with pytest.raises(CampaignDataError, match=r"^drifting has the turns 0 to 23, and none from 30 on\."):
-        run_campaign(run, RunPlan(first_turn=30))
+        run_campaign(run, first_turn=30)
 
 
 @pytest.mark.xdist_group("wing")
@@ -115,7 +115,7 @@ def test_the_truth_is_not_read(run: Path, campaign: Campaign, tmp_path: Path) ->
 def test_the_model_of_the_run_gives_the_strains_that_the_fmu_had(
     run: Path, model: Model, tree: xr.DataTree
 ) -> None:
-    trial = run_campaign(run, RunPlan(held_out_share=0.0)).trials[0]
+    trial = run_campaign(run, held_out_share=0.0).trials[0]
     values = [1.0073 if item.name == "young_modulus_factor" else item.mean for item in model.parameters]
     outputs = tuple((f"strain[{number}]", Quantity.STRAIN) for number in range(1, 25))
     conditions = Conditions(np.array(values), health=np.asarray(tree["truth"]["state"].values))
@@ -135,7 +135,7 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) 
     folder = tmp_path / "known"
     fly_mission(folder, 7, known, known, turns=4, draws=10)
     tree, model = tree_of(folder), run_model(folder)
-    campaign = run_campaign(folder, RunPlan(held_out_share=0.0))
+    campaign = run_campaign(folder, held_out_share=0.0)
     values = [1.0073 if item.name == "young_modulus_factor" else item.mean for item in model.parameters]
     conditions = Conditions(np.array(values), health=np.asarray(tree["truth"]["state"].values))
     truth = np.asarray(tree["truth"]["strain"].values)  # of the FMU, which has the effects too
@@ -155,7 +155,7 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) 
     with h5py.File(folder / "run.nc", "a") as file:
         file.attrs["model_patch"], file.attrs["model_patch_from_step"] = "asset/model_patch_1.json", 3
     assert choice_of_run(folder).source_hash == patched
-    (trial,) = run_campaign(folder, RunPlan(held_out_share=0.0)).trials
+    (trial,) = run_campaign(folder, held_out_share=0.0).trials
     np.testing.assert_array_equal(trial.values, campaign.trials[0].values[3:])
     np.testing.assert_array_equal(trial.time, [4.0])
 

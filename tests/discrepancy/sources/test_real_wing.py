@@ -15,7 +15,6 @@ from discrepancy.sources.real_wing import (
     READING_ERROR,
     SIGNAL,
     TIP,
-    RecordPlan,
     trial_scatter,
     wing_campaign,
     write_wing_campaign,
@@ -50,17 +49,15 @@ def write_records(folder: Path, count: int = 4, size: int = 795, seed: int = 3) 
 
 def test_a_sample_is_the_mean_of_four_columns_without_the_shared_zero(tmp_path: Path) -> None:
     write_records(tmp_path)
-    plain = wing_campaign(tmp_path, RecordPlan(detrended=False, columns=1))
-    averaged = wing_campaign(tmp_path, RecordPlan(detrended=False))
+    plain = wing_campaign(tmp_path, detrended=False, columns=1)
+    averaged = wing_campaign(tmp_path, detrended=False)
     first = plain.trials[0].values[:, 0]
     size = len(averaged.trials[0].values)
     np.testing.assert_allclose(
         averaged.trials[0].values[:, 0], first[: 4 * size].reshape(size, 4).mean(axis=1)
     )
     assert averaged.trials[0].interval == pytest.approx(4.0 * STEP, rel=1e-4)
-    slow = [
-        np.mean(wing_campaign(tmp_path, RecordPlan(detrended=on)).trials[0].values) for on in (False, True)
-    ]
+    slow = [np.mean(wing_campaign(tmp_path, detrended=on).trials[0].values) for on in (False, True)]
     assert abs(slow[1]) < 0.1 * abs(slow[0])
 
 

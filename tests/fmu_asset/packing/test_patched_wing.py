@@ -167,7 +167,7 @@ def expected(
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SensorRotation)))
     turned = len(bare) < len(patch)
     conditions = Conditions(STATE, health=np.array([health]))
-    found = model.respond(given, outputs, bare, conditions, components=turned)
+    found = model.respond(given, outputs, bare, replace(conditions, components=turned))
     values = found.values.copy()
     for item in patch.of(SensorRotation):
         assert isinstance(item, SensorRotation)

@@ -1,19 +1,17 @@
-"""What a recorded input does between its samples, and prescribed motions with their derivatives."""
+"""What acts on a system in a trial, between the samples too, and what its outputs show."""
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from math import isfinite, pi
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PPoly
 
-from discrepancy.campaign.records import Hold, Trial
+from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start, Trial
 from discrepancy.models.memory import Memory
 from fe.runtime.expression import Expression
-
-FloatArray = NDArray[np.float64]
 
 KEPT_COURSES, KEPT_TIMES = 64, 24
 """Records whose courses are kept, and times at which each of them is: a search asks for the same ones."""
@@ -191,3 +189,122 @@ class Drive:
     def at(self, time: FloatArray, order: int) -> FloatArray:
         """Return the motion (N,), its first, second or third derivative at times."""
         return self._known.get((order, time.tobytes()), lambda: np.asarray(self._splines[order](time)))
+
+
+Load = tuple[FloatArray, Course | FormulaCourse]
+"""Row (N,) along which a load acts, and its course."""
+
+
+@dataclass(frozen=True)
+class Acting:
+    """What acts in a trial.
+
+    Attributes
+    ----------
+    time : (N,) ndarray
+        Stamps of the inputs and of the samples [s].
+    constant : (n + m,) ndarray
+        Constant load.
+    loads : sequence of Load
+        What else pushes.
+    drives : sequence of Drive
+        Prescribed motions, in the order of `LinearSystem.drives`.
+    begins : Start
+        How it began, where it was not released.
+    initial : (L,) or (R, 2) ndarray
+        State at the first stamp, where it is unknown: displacements and speeds of the modes, then the states.
+        Of a release as in `Conditions`; rows beyond the modes are passed over.
+    release : tuple of ((n,) ndarray, Release), optional
+        How a structure was let go, and the row of the release point: row . u is its displacement, and the
+        holding force acts along it.
+    clock : tuple of float
+        Rate and zero of the samples beside the inputs.
+    references : mapping of str to sequence of Load
+        Those of the loads that are the reference of a controller, by its name.
+    """
+
+    time: FloatArray
+    constant: FloatArray
+    loads: Sequence[Load] = ()
+    drives: Sequence[Drive] = ()
+    begins: Start = Start.SETTLED
+    initial: FloatArray = field(default_factory=lambda: np.zeros(0))
+    clock: tuple[float, float] = (0.0, 0.0)
+    references: Mapping[str, Sequence[Load]] = field(default_factory=dict)
+    release: tuple[FloatArray, Release] | None = None
+
+    @property
+    def sampled(self) -> FloatArray:
+        """Times (N,) at which the samples show the motion [s]."""
+        return (1.0 + self.clock[0]) * self.time + self.clock[1]
+
+    def load_at(self, time: FloatArray, base: FloatArray) -> FloatArray:
+        """Return the loads (T, B) in a base (n + m, B) at times, held ones as they were just before."""
+        return self.total([course.at(time) for _, course in self.loads], base, len(time))
+
+    def ends(self, time: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the loads (K, B) at the begin and the end of the steps between times (K + 1,)."""
+        found = [course.ends(time) for _, course in self.loads]
+        begin, end = ([pair[side] for pair in found] for side in (0, 1))
+        return self.total(begin, base, len(time) - 1), self.total(end, base, len(time) - 1)
+
+    def total(self, amounts: Sequence[FloatArray], base: FloatArray, count: int) -> FloatArray:
+        """Return the loads (T, B) of amounts (T,) of each beside the constant one."""
+        constant, *rows = np.array([self.constant, *(row for row, _ in self.loads)]) @ base
+        if not rows:
+            return np.tile(constant, (count, 1))
+        found: FloatArray = np.array(amounts).T @ np.array(rows)
+        return found + constant if constant.any() else found
+
+
+class Shown(NamedTuple):
+    """What an output shows: row . u and row . x, speed . u', courses with their factors, and a constant.
+
+    `order` is how often row . u is derived, `further` how often row . x; `reaction` is the number of a drive
+    whose force it shows instead.
+    """
+
+    row: FloatArray
+    order: int = 0
+    further: int = 0
+    reaction: int | None = None
+    constant: float = 0.0
+    speed: FloatArray | None = None
+    courses: tuple[tuple[float, Course | FormulaCourse], ...] = ()
+
+
+@cache
+def order_of(quantity: Quantity) -> int:
+    """Return how often a displacement is derived to be of a quantity."""
+    return quantity.moving.index(quantity) if quantity.moving else 0
+
+
+def shown_rows(rows: FloatArray, quantities: Sequence[Quantity]) -> list[Shown]:
+    """Return what sensors of displacements and their derivatives show at rows (C, n)."""
+    return [Shown(row, order_of(quantity)) for row, quantity in zip(rows, quantities, strict=True)]
+
+
+def refined(trial: Trial, parts: int) -> Trial:
+    """Return a trial with stamps that are `parts` times denser, its inputs as they are between samples."""
+    count = len(trial.time)
+    at = np.arange((count - 1) * parts + 1) / parts
+    row = np.minimum(at.astype(np.int64), count - 2)
+    time = np.interp(at, np.arange(count), trial.time)
+    time[::parts] = trial.time
+
+    def dense(values: FloatArray) -> FloatArray:
+        share = (at - row).reshape((-1, *(1,) * (values.ndim - 1)))
+        return np.asarray((1.0 - share) * values[row] + share * values[row + 1])
+
+    def held(values: FloatArray, hold: Hold | None) -> FloatArray:
+        if hold is Hold.ZERO_ORDER:
+            return np.asarray(values[np.minimum((at + 1e-9).astype(np.int64), count - 1)])
+        return Course.of(trial.time, values, hold).at(time)
+
+    return replace(
+        trial, time=time, values=dense(trial.values), used=np.ones((len(time), trial.used.shape[1]), bool),
+        force=held(trial.force, trial.hold), load_factor=dense(trial.load_factor),
+        temperature=dense(trial.temperature),
+        health=dense(trial.health), health_deviation=dense(trial.health_deviation),
+        inputs=tuple(replace(item, values=held(item.values, item.hold)) for item in trial.inputs),
+    )  # fmt: skip
