@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from calibration.errors import ExperimentDataError, MassConstraintError, OutsideValidityError
-from fe.runtime.damping import rayleigh_coefficients
+from fe.runtime.modal_system import rayleigh_coefficients
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState, Geometry
 

@@ -24,7 +24,7 @@ from calibration.static.posterior import child_seed
 from calibration.static.record import StaticCalibration
 from calibration.static.stiffness import PUBLISHED_LINE, calibrate_static, stiffness_curve_of
 from fe.reduction.model_cache import reduced_model
-from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress, SilentProgress

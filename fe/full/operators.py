@@ -27,7 +27,7 @@ from .assembly import (
     rotate_elasticity,
 )
 from .gauges import gauge_output
-from .turn_load import inertia_relief, lift_load
+from .turn_load import Weights, inertia_relief, lift_load
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -198,19 +198,15 @@ def point_mass_weights(mesh: WingMesh, discretisation: Discretisation, place: Po
     return section_displacement(mesh, discretisation, distance, place.chord)
 
 
-def _point_mass(weights: FloatArray) -> sparse.csr_array:
-    nodes = np.flatnonzero(weights)
-    vector = weights[nodes]
-    block = np.outer(vector, vector)
-    rows = np.repeat(nodes, len(nodes))
-    columns = np.tile(nodes, len(nodes))
-    full = 3 * len(weights)
-    return sum(
-        (
-            sparse.coo_array((block.ravel(), (3 * rows + c, 3 * columns + c)), shape=(full, full)).tocsr()
-            for c in range(3)
-        ),
-        start=sparse.csr_array((full, full)),
+def all_point_mass_weights(mesh: WingMesh, discretisation: Discretisation) -> Weights:
+    """`point_mass_weights` of the servos, and of the pitots."""
+    return tuple(
+        tuple(
+            point_mass_weights(mesh, discretisation, place)
+            for place in mesh.design.point_masses
+            if place.kind == kind
+        )
+        for kind in ("servo", "pitot")
     )
 
 
@@ -246,19 +242,13 @@ def assemble(design: WingDesign) -> AffineOperators:
         ).tocsr()
     )
 
-    weights = tuple(
-        tuple(
-            point_mass_weights(mesh, discretisation, place)
-            for place in design.point_masses
-            if place.kind == kind
-        )
-        for kind in ("servo", "pitot")
-    )
+    weights = all_point_mass_weights(mesh, discretisation)
     masses = [discretisation.mass(np.arange(len(mesh.cells)), density)]
     for places in weights:
         matrix = sparse.csr_array(masses[0].shape)
         for place in places:
-            matrix = matrix + _point_mass(place)
+            column = sparse.csr_array(place[:, None])
+            matrix = matrix + sparse.kron(column @ column.T, sparse.eye_array(3), format="csr")
         masses.append(matrix)
 
     load_place = design.planform.semi_span - design.tip_load.distance_from_tip

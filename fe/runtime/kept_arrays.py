@@ -3,10 +3,9 @@
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -19,14 +18,15 @@ from .errors import ReducedModelFileError
 class KeptArrays:
     """Arrays and plain numbers that were made of one design; a kind of record is a subclass with its fields.
 
+    An array is declared with its axes, `Annotated[FloatArray, "loads", 2]`: a number is the length, and a
+    name means one length in all arrays, which `_lengths` or else the first array with that axis tells.
+
     Class attributes
     ----------------
     what : str
         What it is, with its article, for sentences.
     layout : (str, int) or None
         Name and value of the entry of the file that tells the version of its layout.
-    kinds : mapping of str to type
-        Types of the arrays that are not of float64.
 
     Attributes
     ----------
@@ -36,23 +36,27 @@ class KeptArrays:
 
     what: ClassVar[str]
     layout: ClassVar[tuple[str, int] | None] = None
-    kinds: ClassVar[Mapping[str, type[Any]]] = {}
 
     design_hash: str
 
     def __post_init__(self) -> None:
-        for name, expected in self._expected_shapes().items():
-            array = getattr(self, name)
-            kind = self.kinds.get(name, np.float64)
+        lengths = self._lengths()
+        for item in fields(self):
+            axes: tuple[str | int, ...] = getattr(item.type, "__metadata__", ())
+            if not axes:
+                continue
+            array, (kind,) = getattr(self, item.name), get_args(get_args(get_args(item.type)[0])[1])
+            lengths = {**dict(zip(axes, array.shape, strict=False)), **lengths}
+            expected = tuple(axis if isinstance(axis, int) else lengths.get(axis, 0) for axis in axes)
             if array.shape != expected or array.dtype != kind or not np.isfinite(array).all():
                 raise ReducedModelFileError(
-                    f"The array {name} of {self.what} must hold finite numbers in the shape {expected}, but "
-                    f"it has shape {array.shape} and type {array.dtype}; build it anew."
+                    f"The array {item.name} of {self.what} must hold finite numbers in the shape "
+                    f"{expected}, but it has shape {array.shape} and type {array.dtype}; build it anew."
                 )
 
-    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the shape that each array must have."""
-        raise NotImplementedError
+    def _lengths(self) -> dict[str | int, int]:
+        """Return the lengths of axes that follow from others or from names."""
+        return {}
 
     def to_bytes(self) -> bytes:
         """Return the bytes of an `.npz` file; equal records give equal bytes."""

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from .damping import rayleigh_damping_ratio
 from .errors import InvalidStateError
-from .modal_system import ModalSystem, exact_step
+from .modal_system import ModalSystem, exact_step, rayleigh_damping_ratio
 
 if TYPE_CHECKING:
     from .motion import Laws, ModalMotion

@@ -21,8 +21,19 @@ from reporting.section import checked
 from reporting.toml_file import read_toml
 
 from .matrix_design import MatrixDesign
-from .rosettes import LEAST_SINE, Gauge, Name, Named, Vector, refuse_zero, with_rosettes
-from .tables import MOTIONS, ChosenMass, Commanded, Region, StructureDesign
+from .rosettes import LEAST_SINE, Gauge, with_rosettes
+from .tables import (
+    MOTIONS,
+    ChosenMass,
+    Commanded,
+    Direction,
+    Given,
+    Name,
+    Named,
+    Region,
+    StructureDesign,
+    Vector,
+)  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 
@@ -50,7 +61,7 @@ class NamedSet(Part):
         return self
 
 
-class Material(Part):
+class Material(Given):
     """Material of the cells of a set: isotropic, or orthotropic in axes given by two vectors.
 
     An orthotropic material gives three moduli along its axes 1, 2 and 3, Poisson's ratios 12, 13 and 23
@@ -66,24 +77,16 @@ class Material(Part):
     young_moduli: tuple[Modulus, Modulus, Modulus] | None = None
     poisson_ratios: Vector | None = None
     shear_moduli: tuple[Modulus, Modulus, Modulus] | None = None
-    axes: tuple[Vector, Vector] | None = None
+    axes: tuple[Direction, Direction] | None = None
     scaled_by: Name | None = None
+    ways = (
+        ("young_modulus", "poisson_ratio"),
+        ("young_moduli", "poisson_ratios", "shear_moduli", "axes"),
+    )
 
     @model_validator(mode="after")
-    def _one_kind_of_material(self) -> "Material":
-        one = (self.young_modulus, self.poisson_ratio)
-        three = (self.young_moduli, self.poisson_ratios, self.shear_moduli, self.axes)
-        isotropic = all(value is not None for value in one) and all(value is None for value in three)
-        orthotropic = all(value is None for value in one) and all(value is not None for value in three)
-        if not isotropic and not orthotropic:
-            raise ValueError(
-                "either young_modulus and poisson_ratio are expected, or young_moduli, poisson_ratios, "
-                "shear_moduli and axes"
-            )
-        if orthotropic:
-            assert self.axes is not None
-            for axis in self.axes:
-                refuse_zero(axis, "an axis")
+    def _is_stable(self) -> "Material":
+        if self.axes is not None:
             if np.linalg.norm(np.cross(unit_vector(self.axes[0]), unit_vector(self.axes[1]))) < LEAST_SINE:
                 raise ValueError("the two axes must not be parallel")
             if np.linalg.eigvalsh(self.compliance)[0] <= 0.0:
@@ -157,7 +160,7 @@ class Support(Part):
         return self
 
 
-class Load(Commanded):
+class Load(Given, Commanded):
     """A load, constant or times the value of a control.
 
     Either a `force` [N] on a set (shared by area where it holds faces, else equally among its nodes) or at a
@@ -167,27 +170,11 @@ class Load(Commanded):
 
     set: SetName | None = None
     point: Vector | None = None
-    force: Vector | None = None
+    force: Direction | None = None
     pressure: float | None = None
-    acceleration: Vector | None = None
+    acceleration: Direction | None = None
 
-    @model_validator(mode="after")
-    def _one_kind_of_load(self) -> "Load":
-        given = [key for key in ("force", "pressure", "acceleration") if getattr(self, key) is not None]
-        if len(given) != 1:
-            raise ValueError("one of force, pressure and acceleration is expected")
-        refuse_zero(self.force, "force")
-        refuse_zero(self.acceleration, "acceleration")
-        places = [key for key in ("set", "point") if getattr(self, key) is not None]
-        wanted = {"force": "either set or point", "pressure": "set", "acceleration": "no set and no point"}
-        right = {
-            "force": len(places) == 1,
-            "pressure": places == ["set"],
-            "acceleration": not places,
-        }
-        if not right[given[0]]:
-            raise ValueError(f"{wanted[given[0]]} is expected beside {given[0]}")
-        return self
+    ways = (("force", "set"), ("force", "point"), ("pressure", "set"), ("acceleration",))
 
 
 class Damage(Region):
@@ -206,12 +193,7 @@ class PointOutput(Named):
     """Displacement, or acceleration, of a point along a direction."""
 
     point: Vector
-    direction: Vector
-
-    @model_validator(mode="after")
-    def _points_somewhere(self) -> "PointOutput":
-        refuse_zero(self.direction, "direction")
-        return self
+    direction: Direction
 
 
 class MeshDesign(StructureDesign):

@@ -8,22 +8,10 @@ from pydantic import Field, model_validator
 from fe.wing.parts import Part
 from reporting.section import checked
 
-Vector = tuple[float, float, float]
-Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+from .tables import Direction, Named, Vector
+
 LEAST_SINE = 1e-3
 """Two axes whose angle has a smaller sine do not span a plane."""
-
-
-def refuse_zero(vector: Vector | None, key: str) -> None:
-    """Refuse a direction of no length."""
-    if vector is not None and not any(vector):
-        raise ValueError(f"{key} must point somewhere, but is (0, 0, 0)")
-
-
-class Named(Part):
-    """Something that is chosen or read by its name."""
-
-    name: Name
 
 
 class Gauge(Named):
@@ -33,14 +21,9 @@ class Gauge(Named):
     """
 
     point: Vector
-    direction: Vector
+    direction: Direction
     length: float = Field(default=0.0, ge=0.0)
     width: float = Field(default=0.0, ge=0.0)
-
-    @model_validator(mode="after")
-    def _points_somewhere(self) -> "Gauge":
-        refuse_zero(self.direction, "direction")
-        return self
 
 
 class Rosette(Part):

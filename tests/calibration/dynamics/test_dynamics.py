@@ -25,7 +25,7 @@ from calibration.errors import (
     MassConstraintError,
     OutsideValidityError,
 )
-from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_damping_ratio
 
 REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 MASSES = MassRange(servo=(0.05, 0.3), pitot=(0.0, 0.3))

@@ -36,7 +36,7 @@ from calibration.static.experiments import published_measurements
 from calibration.static.posterior import GaussianPrior
 from calibration.static.stiffness import exact_posterior
 from calibration.static.stiffness_curve import PUBLISHED_LINE, LinearStiffnessCurve, stiffness_curve_of
-from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_damping_ratio
 
 FloatArray = NDArray[np.float64]
 

@@ -11,9 +11,8 @@ from scipy.linalg import expm
 from fe.full.operators import AffineOperators
 from fe.full.statics import Factorisation
 from fe.reduction.reduced_basis import Reduction
-from fe.runtime.damping import rayleigh_damping_ratio
 from fe.runtime.errors import InvalidStateError, OutsideModelError
-from fe.runtime.modal_system import exact_step
+from fe.runtime.modal_system import exact_step, rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator, TransientState
