@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from fe.reduction.built_once import built_once, cache_folder
-from fe.runtime.archive import write_bytes_atomically
 from fe.runtime.errors import ReducedModelFileError
+from fe.runtime.kept_arrays import write_bytes_atomically
 from fe.runtime.reduced import ReducedModel
 from reporting.provenance import collect_provenance, hash_bytes, hash_record
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.full.assembly import Discretisation
-from fe.full.gauges import gauge_output
 from fe.full.operators import (
     ROOT_UNKNOWNS,
     all_point_mass_weights,
     cell_density,
     cell_elasticity,
+    gauge_output,
     modulus_variation,
     root_expansion,
     section_displacement,

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.full.affine import AffineSystem
-from fe.full.gauges import patch_pieces
-from fe.full.operators import ROOT_UNKNOWNS
+from fe.full.operators import ROOT_UNKNOWNS, patch_pieces
 from fe.full.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY
 from fe.wing.design import WingDesign
 

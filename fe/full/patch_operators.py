@@ -17,12 +17,12 @@ from scipy import sparse
 from fe.wing.design import WingDesign
 
 from .assembly import Discretisation, point_jacobians
-from .gauges import gauge_output
 from .operators import (
     AffineOperators,
     all_point_mass_weights,
     cell_density,
     cell_elasticity,
+    gauge_output,
     modulus_variation,
     point_mass_weights,
     section_displacement,
@@ -39,7 +39,7 @@ LEAST_LINE_DISTANCE = 0.1
 class TurnedStrain(Discretisation):
     """A discretisation that takes strains along a direction turned in the skin by `angle` [rad].
 
-    From the spanwise direction towards the tip's rear: with angle pi/2, `fe.full.gauges.gauge_output` gives
+    From the spanwise direction towards the tip's rear: with angle pi/2, `gauge_output` gives
     the strain across the gauges, at the same points and with the same weights.
     """
 

@@ -136,7 +136,7 @@ def build(
     design: "WingDesign", progress: "Progress | None" = None, settings: "ReductionSettings | None" = None
 ) -> WingFields:
     """Build the reduced model and the field basis of a wing, without the cache; see `reduced_model`."""
-    from .wing_basis import reduce_model
+    from .reduced_basis import reduce_model
 
     with assembled(design, progress) as operators:
         reduction = reduce_model(operators, settings, progress)

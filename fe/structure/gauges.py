@@ -8,9 +8,9 @@ from scipy import sparse
 
 from fe.runtime.errors import InvalidDesignError
 
+from .design import Gauge
 from .location import Locator, SurfacePoint
 from .mesh import StructureMesh
-from .rosettes import Gauge
 
 FloatArray = NDArray[np.float64]
 

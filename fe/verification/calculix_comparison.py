@@ -331,7 +331,7 @@ def ring_down_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    from fe.reduction.wing_basis import reduce_model
+    from fe.reduction.reduced_basis import reduce_model
     from fe.runtime.transient import ModalIntegrator
 
     model = reduce_model(operators).model

@@ -20,7 +20,7 @@ from fe.full.affine import affine_sum
 from fe.full.operators import AffineOperators
 from fe.full.subspace import Norm, OrthonormalBasis, conjugate_gradients
 from fe.reduction.certified_basis import compressed
-from fe.reduction.reduced_basis import Reduction
+from fe.reduction.reduced_basis import Reduction, reduce_model, wing_structure
 from fe.reduction.settings import (
     ModalSettings,
     ReductionSettings,
@@ -28,7 +28,6 @@ from fe.reduction.settings import (
     remaining_levels,
 )
 from fe.reduction.terms import ReductionTerms
-from fe.reduction.wing_basis import reduce_model, wing_structure
 from fe.runtime.errors import ReductionError, SolutionError
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import region_names

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from fe.full.gauges import gauge_output
 from fe.full.operators import (
     AffineOperators,
     assemble,
     cell_elasticity,
+    gauge_output,
     modulus_variation,
     section_displacement,
 )
