@@ -33,6 +33,8 @@ def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -
             if not damped:
                 springs = j if springs < 0 else springs
                 acting.springs[j] = springs
+                last = state.memory[j, 1]
+                state.current[j], _ = pull_of(ports, state, j, last, course.h, FIRST_PARTS)
         x = y
         if springs >= 0:
             r = at_once * ports.flexibility[port]
@@ -94,22 +96,23 @@ def settle_port(
 ) -> float:
     """Return the position x of a port with laws, x + r sum F(x) = y; their forces go to `state.current`.
 
-    The laws are those whose `leader` is `port`.
-
-    Dry friction first: where it can hold the port, it does. The memories are left as they are.
+    The laws are those whose `leader` is `port`; of those of position, `state.current` has the forces at the
+    last position. Dry friction first: where it can hold the port, it does. The memories are left as they are.
     """
     count = len(ports.numbers)
     last = state.memory[port, 1]
-    start, level = 0.0, 0.0
+    start, level, tolerance = 0.0, 0.0, 1e-12
     for j in range(count):
         if leader[j] != port:
             continue
-        own, _ = pull_of(ports, state, j, last, h, least)
+        if ports.of_speed[j] == 0:
+            start += state.current[j]
+            continue
+        tolerance = 1e-15  # a speed is a small difference of positions
+        state.current[j] = 0.0
         if dry(ports.numbers[j], ports.values[j]):
+            own, _ = pull_of(ports, state, j, last, h, least)
             level += own
-        else:
-            state.current[j] = own
-            start += own
     push = y - last - r * start
     if level > 0.0 and abs(push) <= r * level:
         for j in range(count):
@@ -135,7 +138,7 @@ def settle_port(
             if change > steepest:
                 steep, steepest = j, change
         rest = x + r * total - y
-        if abs(rest) <= 1e-13 * abs(push) + 1e-15 * (abs(x) + abs(y)):
+        if abs(rest) <= 1e-13 * abs(push) + tolerance * (abs(x) + abs(y)):
             return float(x)
         if sign * rest > 0.0:
             high = x

@@ -6,7 +6,6 @@ primitives; which physical effect a set of them stands for is not known here (`d
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -371,19 +370,6 @@ class ModelPatch:
         if not isinstance(rows, list):
             raise InvalidPatchError(f"{where} must be a list of primitives, but is a {type(rows).__name__}.")
         return cls(tuple(_primitive(row, f"{where}, primitive {n}") for n, row in enumerate(rows, start=1)))
-
-    def to_json(self) -> str:
-        """Return the patch as JSON; floats keep every bit."""
-        return json.dumps(self.to_list(), allow_nan=False)
-
-    @classmethod
-    def from_json(cls, text: str, where: str = "The patch") -> "ModelPatch":
-        """Return the patch of a JSON text; raises `InvalidPatchError`."""
-        try:
-            rows = json.loads(text)
-        except json.JSONDecodeError as cause:
-            raise InvalidPatchError(f"{where} is not JSON ({cause}).") from cause
-        return cls.from_list(rows, where)
 
 
 def _primitive(row: object, where: str) -> Primitive:

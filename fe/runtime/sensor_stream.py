@@ -88,17 +88,6 @@ class SensorStream:
                     f"{LARGEST_ORDER} stages, but {item} was given."
                 )
 
-    @property
-    def memory_size(self) -> int:
-        """Number of values that are remembered."""
-        if not self.dynamic:
-            return 0
-        return sum(
-            (1 + int(item.order)) * len(columns_of(item, self.channels))
-            for item in self.patch
-            if isinstance(item, HighPass)
-        )
-
     def read(
         self, sample: Sample, memory: Sequence[float] | None, duration: float
     ) -> tuple[FloatArray, list[float]]:

@@ -412,14 +412,6 @@ class ModalIntegrator:
         """Return the displacement along the load of a number at its point [m]."""
         return float(self.structure.loads[:, point] @ self.displacement(state))
 
-    def energy(self, state: TransientState) -> float:
-        """Return kinetic plus strain energy of the kept modes about the equilibrium under the load [J].
-
-        It never grows while the load stays.
-        """
-        deviation = self._omega * (state.displacement - self._modal_static @ self._still(state))
-        return float(0.5 * (state.velocity @ state.velocity + deviation @ deviation))
-
     def take_over(self, state: TransientState, before: "ModalIntegrator") -> TransientState:
         """Return a state of another integrator in the modes of this one, after a change of health or mass.
 

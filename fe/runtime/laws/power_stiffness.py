@@ -43,5 +43,4 @@ def pull(
     if law[2] * x < 0.0 or x == 0.0:
         return 0.0, (law[0] / law[3] if law[1] == 1.0 and law[2] == 0.0 else 0.0)
     size = law[0] * power(abs(x / law[3]), law[1])
-    slope = law[0] * law[1] / law[3] * power(abs(x / law[3]), law[1] - 1.0)
-    return (size if x > 0.0 else -size), slope
+    return (size if x > 0.0 else -size), law[1] * size / abs(x)
