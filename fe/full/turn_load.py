@@ -1,4 +1,13 @@
-"""Nodal load of a level turn: lift on the skins, and the weight that relieves it."""
+"""Nodal load of a level turn: lift on the skins, and the weight that relieves it.
+
+The lift along the span is that of Schrenk's approximation or of a lifting line: the shape of the lift of a
+symmetrically loaded wing as a function that integrates to one over the half-wing; the amount is the design's.
+
+References
+----------
+O. Schrenk, "A simple approximation method for obtaining the spanwise lift distribution", NACA TM 948 (1940).
+H. Glauert, "The Elements of Aerofoil and Airscrew Theory" (1926), chapter XI.
+"""
 
 from collections.abc import Callable
 

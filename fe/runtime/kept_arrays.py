@@ -1,5 +1,7 @@
 """Records of arrays that live in one `.npz` file: checked where they are made, read back to the last bit.
 
+The file has reproducible bytes, is written whole or not at all, and nothing in it is pickled.
+
 NumPy and relative imports only: this file is copied into the FMU.
 """
 

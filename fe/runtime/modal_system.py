@@ -1,4 +1,6 @@
-"""A linear structure in few modes, and its exact step under a force that is linear in time.
+"""A linear structure in few modes, its Rayleigh damping, and its exact step under a force linear in time.
+
+The damping is that of Kapteyn et al. 2021, eqs. (17) and (18).
 
 NumPy and relative imports only: this file is copied into the FMU.
 """

@@ -1,4 +1,7 @@
-"""What a deck holds, nodes, elements and sets, as the readers of Abaqus and Nastran collect it."""
+"""What a deck holds, nodes, elements and sets, as the readers of Abaqus and Nastran collect it.
+
+Last its coordinate systems: points that are given by radii and angles, or along other axes.
+"""
 
 import re
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Fields as VTU files for ParaView."""
+"""Statics and modes of a structure, by the solver of `fe.full`, and its fields as VTU files for ParaView."""
 
 import tempfile
 from collections.abc import Mapping

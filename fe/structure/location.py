@@ -1,4 +1,7 @@
-"""Where a point lies in a mesh: in which cell, or on which face of the surface, at which local place."""
+"""Where a point lies in a mesh: in which cell, or on which face of the surface, at which local place.
+
+Last the nodal loads (nodes, 3) [N] of forces and pressures there.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property

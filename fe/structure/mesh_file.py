@@ -1,4 +1,7 @@
-"""Reading and checking a mesh file: Gmsh, Abaqus and CalculiX, VTU, Nastran and what else meshio reads."""
+"""Reading and checking a mesh file: Gmsh, Abaqus and CalculiX, VTU, Nastran and what else meshio reads.
+
+Last how much memory a structure of the mesh takes, before it is taken.
+"""
 
 import contextlib
 import io

@@ -1,4 +1,8 @@
-"""The parts of a wing design: the sections of its TOML file, in SI units, each checked on its own."""
+"""The parts of a wing design: the sections of its TOML file, in SI units, each checked on its own.
+
+The shape of the section is of the symmetric four-digit family of NACA Report 460 (Jacobs, Ward and Pinkerton,
+1933).
+"""
 
 import itertools
 import math
