@@ -1,6 +1,6 @@
 """The wing for patches, its rows: displacements, loads, ports and outputs as `patch` changes them.
 
-First local losses of the skin: what strips of the wing keep of its stiffness, and what gauges among them read.
+First local losses of the skin: what strips of the wing keep of its stiffness, what gauges among them read.
 
 NumPy and relative imports only: this file is copied into the FMU. The arrays are those of
 `fe.runtime.patch_arrays`; the equations are in `docs/patches.md`.
