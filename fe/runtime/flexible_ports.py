@@ -51,10 +51,9 @@ def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -
 
 
 def arrive(ports: Ports, state: State, j: int, x: float, least: int) -> None:
-    """Carry the memory of a law of position to `x`, and take its force there."""
+    """Carry the memory of a law of position to `x`, where its force is known."""
     advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, least)
     state.memory[j, 1] = x
-    state.current[j], _ = pull_of(ports, state, j, x, 1.0, 1)
 
 
 def carry_flexible(ports: Ports, acting: Acting, state: State, load: float, h: float) -> None:
