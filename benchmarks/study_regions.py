@@ -24,9 +24,8 @@ from threadpoolctl import threadpool_limits
 
 from fe.full.operators import AffineOperators, assemble
 from fe.full.statics import solve_static
-from fe.reduction.reduced_basis import reduce_structure
+from fe.reduction.reduced_basis import reduce_model, reduce_structure
 from fe.reduction.structure_errors import MeasuredErrors, measured_errors
-from fe.reduction.wing_basis import reduce_model
 from fe.runtime.reduced import ReducedModel
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import WingDesign, load_design

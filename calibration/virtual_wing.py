@@ -23,7 +23,7 @@ from calibration.static.experiments import (
     published_measurements,
 )
 from calibration.static.posterior import MOST_SAMPLES, Seed, child_seed
-from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState, Geometry
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from fe.reduction.built_once import built_once, cache_folder
-from fe.runtime.archive import write_bytes_atomically
+from fe.runtime.kept_arrays import write_bytes_atomically
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.packing.structure_fmu import build_fmu
 

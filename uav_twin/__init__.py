@@ -20,8 +20,8 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from fe.full.operators import assemble
     from fe.full.statics import solve_static
     from fe.reduction.model_cache import reduced_model, reduced_structure
+    from fe.structure.field import natural_frequencies, static_responses
     from fe.structure.operators import load_any as assemble_structure
-    from fe.structure.solution import natural_frequencies, static_responses
     from fe.wing.design import load_design
     from fmu_asset.door.session import FmiAsset
     from fmu_asset.packing.structure_fmu import build_fmu
@@ -115,7 +115,7 @@ _HOMES = {
     "load_design": "fe.wing.design",
     "load_model": "discrepancy.model_choice",
     "load_scenario": "twin_master.scenario.reading",
-    "natural_frequencies": "fe.structure.solution",
+    "natural_frequencies": "fe.structure.field",
     "open_fleet": "twin_master.fleet.reading:fleet_groups",
     "open_run": "twin_master.watch.snapshot",
     "prepare_twin": "twin_master.mission.preparation",
@@ -126,7 +126,7 @@ _HOMES = {
     "report_figures": "twin_master.report.page",
     "resume": "twin_master.workflow:resume_run",
     "solve_static": "fe.full.statics",
-    "static_responses": "fe.structure.solution",
+    "static_responses": "fe.structure.field",
     "structure_files": "scenarios",
     "value_iteration": "twin_master.network.planner",
     "watch": "twin_master.watch.from_python",

@@ -95,8 +95,8 @@ def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, An
 
     Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in SI units.
     """
+    from fe.structure.field import natural_frequencies, static_responses
     from fe.structure.operators import Structure
-    from fe.structure.solution import natural_frequencies, static_responses
 
     design, heavy = structure.design, structure.mass().diagonal().any()
     frequencies = natural_frequencies(structure, modes)[0].tolist() if heavy else []
@@ -125,8 +125,8 @@ def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, An
 
 
 def _of_mesh(structure: "Structure") -> dict[str, Any]:
-    from fe.structure.memory import upper_estimate
-    from fe.structure.solution import weighed
+    from fe.structure.field import weighed
+    from fe.structure.mesh_file import upper_estimate
 
     mesh = structure.mesh
     mass, centre = weighed(structure)

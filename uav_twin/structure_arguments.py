@@ -63,6 +63,6 @@ def reduced(file: Path, memory_limit: float | None) -> "ReducedModel":
 
 
 def _bytes(memory_limit: float | None) -> float | None:
-    from fe.structure.memory import GIB
+    from fe.structure.mesh_file import GIB
 
     return None if memory_limit is None else memory_limit * GIB

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from fe.full.assembly import Discretisation, point_jacobians
-from fe.full.gauges import gauge_output
 from fe.full.modes import lowest_eigenpairs
 from fe.full.operators import (
     ROOT_UNKNOWNS,
@@ -27,6 +26,7 @@ from fe.full.operators import (
     assemble,
     cell_density,
     cell_elasticity,
+    gauge_output,
     modulus_variation,
     point_mass_weights,
     section_displacement,

@@ -19,7 +19,7 @@ from calibration.joint.inference import servo_range
 from calibration.joint.measurement import ModalMeasurement
 from calibration.joint.prior import TOTAL_MASS
 from calibration.lab_folder import LAB_ERRORS, find_lab_file
-from fe.runtime.damping import rayleigh_coefficients
+from fe.runtime.modal_system import rayleigh_coefficients
 from fe.runtime.reduced import ReducedModel
 from reporting.table_file import read_table
 

@@ -38,7 +38,7 @@ from calibration.static.posterior import child_seed
 from calibration.static.quality import assess_fit
 from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of
 from fe.reduction.model_cache import reduced_model
-from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress, SilentProgress

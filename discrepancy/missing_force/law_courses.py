@@ -9,7 +9,7 @@ from scipy.special import erf
 
 from discrepancy.models.compiled_motion import law_functions
 from fe.compilation import compiled
-from fe.runtime.laws import LAWS, advance, force, steady
+from fe.runtime.laws import LAWS, advance, pull, steady
 from fe.runtime.laws.interface import HEAD, PARAMETERS, PortForce
 from fe.runtime.motion_arrays import FIRST_PARTS
 
@@ -32,7 +32,7 @@ def along(
         else:
             advance(number, law, elements, memory, x[k], FIRST_PARTS if k == 0 else 1)
             memory[1] = x[k]
-            found[k] = force(number, law, memory, x[k])
+            found[k] = pull(number, law, elements, memory, x[k], 1.0, 1)[0]
 
 
 @cache

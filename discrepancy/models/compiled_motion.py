@@ -181,7 +181,8 @@ def compiled_kernel() -> Kernel:
     The functions of `fe` stay plain; they can be called from compiled ones from then on.
     """
     functions = _kernel_functions()
-    callable_when_compiled(static_path.static_forces, error_model="numpy")
+    for function in (static_path.static_forces, static_path.arrive_at_rest):
+        callable_when_compiled(function, error_model="numpy")
     return Kernel(
         compiled(motion_kernel.integrate, functions, "numpy"),
         compiled(static_path.static_path, functions, "numpy"),

@@ -47,7 +47,9 @@ def held_forces(
         if ports.of_speed[j] == 0:
             middle = x[j] + 0.5 * h * v[j] + h * h / 6.0 * (push[j] - taken[j] / h)
             laws.advance(ports.numbers[j], ports.values[j], ports.elements[j], memory[j], middle, 1)
-            forces[j] = laws.force(ports.numbers[j], ports.values[j], memory[j], middle)
+            forces[j] = laws.pull(
+                ports.numbers[j], ports.values[j], ports.elements[j], memory[j], middle, 1.0, 1
+            )[0]
     for j in range(count):
         if ports.of_speed[j] == 1:
             left = push[j]

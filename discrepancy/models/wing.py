@@ -30,8 +30,15 @@ from fe.runtime.patch import (
     RootCompliance,
 )
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.patched_structure import motion_basis
-from fe.runtime.patched_wing import LOAD_PLACE, MODE_COUNT, ON_MODES, PORTS, PatchedWing, strain_gauge
+from fe.runtime.patched_wing import (
+    LOAD_PLACE,
+    MODE_COUNT,
+    ON_MODES,
+    PORTS,
+    PatchedWing,
+    motion_basis,
+    strain_gauge,
+)
 from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import wing_names
 from fe.wing.design import load_design

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.full.assembly import Discretisation
-from fe.full.gauges import gauge_output
 from fe.full.operators import (
     ROOT_UNKNOWNS,
+    all_point_mass_weights,
     cell_density,
     cell_elasticity,
+    gauge_output,
     modulus_variation,
-    point_mass_weights,
     root_expansion,
     section_displacement,
 )
@@ -143,10 +143,7 @@ def wing_pieces(design: WingDesign, base: WingPieces | None = None) -> WingPiece
         and design.lift == base.design.lift
         and not (relieved and (np.any(density != base.density) or places != base.design.point_masses))
     )
-    weights = tuple(
-        tuple(point_mass_weights(mesh, body, place) for place in places if place.kind == kind)
-        for kind in ("servo", "pitot")
-    )
+    weights = all_point_mass_weights(mesh, body)
     plan = design.planform
     tip = np.zeros(body.unknowns)
     tip[2::3] = section_displacement(

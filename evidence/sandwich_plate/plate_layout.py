@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from skfem import MeshQuad
 
-from fe.wing.airfoil import four_digit_half_thickness, four_digit_slope
 from fe.wing.design import WingDesign, rib_interval
 from fe.wing.grid import chord_lines, span_lines, web_faces
 from fe.wing.mesh import straight_edged
+from fe.wing.parts import four_digit_half_thickness, four_digit_slope
 
 from .plate import Plate, Surface, tensor_mesh
 

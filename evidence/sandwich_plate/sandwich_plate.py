@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.full.affine import AffineSystem
-from fe.full.gauges import patch_pieces
-from fe.full.operators import ROOT_UNKNOWNS
-from fe.full.turn_load import STANDARD_GRAVITY
+from fe.full.operators import ROOT_UNKNOWNS, patch_pieces
+from fe.full.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY
 from fe.wing.design import WingDesign
-from fe.wing.lift import DISTRIBUTIONS
 
 from .plate import FIELDS, A, B, Plate, Surface, U, V, W, plane_stress, surface_strain
 from .plate_frame import frame_stiffness

@@ -4,6 +4,7 @@ K(e, z) = e K_skin + (1 - z1) K_1 + ... + K_0 and M(m) = M_0 + m_servo M_s + m_p
 skin without the damage regions: in the published model the factor e does not scale them.
 The root is a rigid rib on three springs; its held motions are eliminated, so that all matrices act on the
 free unknowns: those of the nodes outside the root section, then root heave [m], flap [rad] and yaw [rad].
+Gauge strains are weights of nodal displacements: Kapteyn et al. 2021, eq. (15).
 """
 
 from dataclasses import dataclass
@@ -23,14 +24,76 @@ from .assembly import (
     gauss_points,
     isotropic_elasticity,
     orthotropic_elasticity,
+    point_jacobians,
     positions,
     rotate_elasticity,
 )
-from .gauges import gauge_output
-from .turn_load import inertia_relief, lift_load
+from .turn_load import Weights, inertia_relief, lift_load
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+
+def patch_pieces(middle: float, length: float, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gauss points (p,) and weights (p,) of the mean over a length, piece by piece between mesh lines.
+
+    Strain jumps at the edge of a defect, which is a mesh line: points that do not know of it misjudge how
+    much of a patch lies beyond.
+    """
+    if length == 0.0:
+        return np.array([middle]), np.array([1.0])
+    start, end = middle - 0.5 * length, middle + 0.5 * length
+    breaks = np.array([start, *lines[(lines > start) & (lines < end)], end])
+    line, weight = np.polynomial.legendre.leggauss(3)
+    pieces = np.diff(breaks)[:, None]
+    points = breaks[:-1, None] + 0.5 * (1.0 + line) * pieces
+    return points.ravel(), (0.5 * weight * pieces / length).ravel()
+
+
+def gauge_output(mesh: WingMesh, discretisation: Discretisation) -> sparse.csr_array:
+    """Strain of each gauge, csr (gauges, full) [1/m]: eq. (15) at the true gauge points.
+
+    The strain along the span of the upper skin, on its outer surface or in the middle of its thickness,
+    averaged over the gauge's patch piece by piece between the mesh lines, positive in compression.
+    """
+    design = mesh.design
+    gauges, plan = design.gauges, design.planform
+    owner: list[int] = []
+    share: list[float] = []
+    points: list[SurfacePoint] = []
+    for gauge, (distance, chord_fraction) in enumerate(gauges.positions):
+        # The patch is a rectangle: the same distances fore and aft of the gauge's own chord line.
+        middle = (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
+        for place, span_weight in zip(
+            *patch_pieces(distance, gauges.averaging_spanwise, mesh.span_lines), strict=True
+        ):
+            lead = plan.straight_chord_line * plan.chord(place / plan.semi_span)
+            _, _, lines = mesh.upper_skin_lines(place)
+            behind = patch_pieces(middle + lead, gauges.averaging_chordwise, lines)
+            for chordwise, chord_weight in zip(*behind, strict=True):
+                owner.append(gauge)
+                share.append(span_weight * chord_weight)
+                points.append(mesh.skin_point(place, chordwise))
+    cells = np.array([point.cell for point in points])
+    local = np.array([point.local for point in points])
+    if gauges.surface == "middle":
+        local[:, 2] = 0.5
+    dofs, weights = discretisation.strain_along(cells, local, _span_direction(mesh, cells, local))
+    weights = -np.array(share)[:, None] * weights
+    rows = np.repeat(owner, dofs.shape[1])
+    return sparse.coo_array(
+        (weights.ravel(), (rows, dofs.ravel())), shape=(len(gauges.positions), discretisation.unknowns)
+    ).tocsr()
+
+
+def _span_direction(mesh: WingMesh, cells: IntArray, local: FloatArray) -> FloatArray:
+    """Find the unit direction (p, 3) along the span in the surface, at one point of each of p cells."""
+    jacobian = point_jacobians(mesh.corners[cells], local)
+    normal = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    direction = np.array([0.0, 1.0, 0.0]) - normal[:, 1:2] * normal
+    return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
+
 
 MASS_TERM_NAMES: tuple[str, ...] = ("base", "servo", "pitot")
 ROOT_UNKNOWNS = 3
@@ -198,19 +261,15 @@ def point_mass_weights(mesh: WingMesh, discretisation: Discretisation, place: Po
     return section_displacement(mesh, discretisation, distance, place.chord)
 
 
-def _point_mass(weights: FloatArray) -> sparse.csr_array:
-    nodes = np.flatnonzero(weights)
-    vector = weights[nodes]
-    block = np.outer(vector, vector)
-    rows = np.repeat(nodes, len(nodes))
-    columns = np.tile(nodes, len(nodes))
-    full = 3 * len(weights)
-    return sum(
-        (
-            sparse.coo_array((block.ravel(), (3 * rows + c, 3 * columns + c)), shape=(full, full)).tocsr()
-            for c in range(3)
-        ),
-        start=sparse.csr_array((full, full)),
+def all_point_mass_weights(mesh: WingMesh, discretisation: Discretisation) -> Weights:
+    """`point_mass_weights` of the servos, and of the pitots."""
+    return tuple(
+        tuple(
+            point_mass_weights(mesh, discretisation, place)
+            for place in mesh.design.point_masses
+            if place.kind == kind
+        )
+        for kind in ("servo", "pitot")
     )
 
 
@@ -246,19 +305,13 @@ def assemble(design: WingDesign) -> AffineOperators:
         ).tocsr()
     )
 
-    weights = tuple(
-        tuple(
-            point_mass_weights(mesh, discretisation, place)
-            for place in design.point_masses
-            if place.kind == kind
-        )
-        for kind in ("servo", "pitot")
-    )
+    weights = all_point_mass_weights(mesh, discretisation)
     masses = [discretisation.mass(np.arange(len(mesh.cells)), density)]
     for places in weights:
         matrix = sparse.csr_array(masses[0].shape)
         for place in places:
-            matrix = matrix + _point_mass(place)
+            column = sparse.csr_array(place[:, None])
+            matrix = matrix + sparse.kron(column @ column.T, sparse.eye_array(3), format="csr")
         masses.append(matrix)
 
     load_place = design.planform.semi_span - design.tip_load.distance_from_tip

@@ -17,16 +17,17 @@ from scipy import sparse
 from fe.wing.design import WingDesign
 
 from .assembly import Discretisation, point_jacobians
-from .gauges import gauge_output
 from .operators import (
     AffineOperators,
+    all_point_mass_weights,
     cell_density,
     cell_elasticity,
+    gauge_output,
     modulus_variation,
     point_mass_weights,
     section_displacement,
 )
-from .turn_load import STANDARD_GRAVITY
+from .turn_load import STANDARD_GRAVITY, inertia_relief, lift_load
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -38,7 +39,7 @@ LEAST_LINE_DISTANCE = 0.1
 class TurnedStrain(Discretisation):
     """A discretisation that takes strains along a direction turned in the skin by `angle` [rad].
 
-    From the spanwise direction towards the tip's rear: with angle pi/2, `fe.full.gauges.gauge_output` gives
+    From the spanwise direction towards the tip's rear: with angle pi/2, `gauge_output` gives
     the strain across the gauges, at the same points and with the same weights.
     """
 
@@ -208,18 +209,9 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
 
 def _full_lift(operators: AffineOperators, weight: FloatArray) -> FloatArray:
     """Return the load (full,) [N] of load factor 1 without the weight that the design's load holds."""
-    from .turn_load import inertia_relief, lift_load
-
     mesh, discretisation = operators.wing_mesh, operators.discretisation
     lift = lift_load(mesh, discretisation)
     if not mesh.design.lift.inertia_relief:
         return lift
-    places = tuple(
-        tuple(
-            point_mass_weights(mesh, discretisation, place)
-            for place in mesh.design.point_masses
-            if place.kind == kind
-        )
-        for kind in ("servo", "pitot")
-    )
+    places = all_point_mass_weights(mesh, discretisation)
     return lift + inertia_relief(mesh.design, discretisation, cell_density(mesh), places, lift) - weight

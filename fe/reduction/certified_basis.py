@@ -4,7 +4,7 @@ The method and what it reaches are in `docs/reduced_model.md`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from math import ceil
 from typing import Any
 
@@ -13,7 +13,6 @@ import numpy.typing as npt
 from pymor.algorithms.greedy import WeakGreedySurrogate, weak_greedy
 from pymor.core.exceptions import ExtensionError
 from pymor.core.logger import set_log_levels
-from scipy import sparse
 
 from fe.full.affine import AffineSum
 from fe.full.subspace import (
@@ -25,11 +24,11 @@ from fe.full.subspace import (
 )
 from fe.runtime.reduced import ReducedModel
 
-from .dual_solutions import DualData, DualProblem
+from .dual_solutions import DualProblem
 from .settings import TOGETHER
+from .terms import ReductionTerms, State
 
 FloatArray = npt.NDArray[np.float64]
-State = tuple[float, ...]
 
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
@@ -42,106 +41,43 @@ ROUNDING_FACTOR, LEAST_ROUNDING = 8.0, 5e-6
 with condition numbers of 1e10, full solutions differ by 1e-6 among themselves."""
 
 
-@dataclass(frozen=True)
-class AffineProblem:
-    """A structure as its reduction sees it.
-
-    Attributes
-    ----------
-    stiffness_terms, mass_terms : tuple of csr (n, n)
-        Positive semi-definite terms; the last of the stiffness is always times one.
-    loads : (n, L) ndarray
-        Loads.
-    outputs : (n, O) ndarray
-        Static outputs.
-    groups : tuple of slice
-        Outputs of one kind, whose errors are measured against the largest of them.
-    theta : callable
-        Coefficients (T,) of the stiffness terms at a state.
-    """
-
-    stiffness_terms: tuple[sparse.csr_array, ...]
-    mass_terms: tuple[sparse.csr_array, ...]
-    loads: FloatArray
-    outputs: FloatArray
-    groups: tuple[slice, ...]
-    theta: Callable[[State], FloatArray]
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """How a reduced model is judged at a state: its solutions (N,) to each load alone, and its largest bound.
-
-    Attributes
-    ----------
-    solutions : callable
-        Coordinates of the solution to each load.
-    bound : callable
-        Certified bound relative to the largest output, of the load where that is largest.
-    """
-
-    solutions: Callable[[ReducedModel, State], list[FloatArray]]
-    bound: Callable[[ReducedModel, State], float]
-
-
 class StaticReduction:
     """State of the greedy search: the bases that full solutions have given.
 
     Parameters
     ----------
-    problem : AffineProblem
+    terms : ReductionTerms
         The full model.
     norm : Norm
-        Energy norm at `reference`.
-    reference : (T - 1,) ndarray
-        Coefficients of the stiffness terms of the norm, without the last.
-    duals : callable
-        Solves the dual problems.
-    farthest : (T - 1,) ndarray
-        Largest distance of each coefficient from its reference.
+        Energy norm at the reference of the terms.
     advance : callable
         Told one more part, and of what.
-    least : (groups, L) ndarray
-        Outputs of a group under a load that are smaller are judged by this.
     """
 
-    def __init__(
-        self,
-        problem: AffineProblem,
-        norm: Norm,
-        reference: FloatArray,
-        duals: Callable[[DualProblem], DualData],
-        farthest: FloatArray,
-        advance: Callable[[int, str], object],
-        least: FloatArray,
-    ) -> None:
-        terms = problem.stiffness_terms
-        self.stiffness = AffineSum(terms).matrix
-        self.least = least
-        self.problem, self.norm, self.reference, self.advance = problem, norm, reference, advance
-        self.farthest = farthest
-        n = len(problem.loads)
+    def __init__(self, terms: ReductionTerms, norm: Norm, advance: Callable[[int, str], object]) -> None:
+        self.terms, self.norm, self.advance = terms, norm, advance
+        self.stiffness = AffineSum(terms.stiffness_terms).matrix
+        self.least = terms.least(norm)
+        n, count = len(terms.loads), len(terms.stiffness_terms)
         self.basis = OrthonormalBasis(n, norm, drop=1e-7)
-        self.in_basis = np.empty((len(terms), 0, 0))  # stiffness terms in the basis
+        self.in_basis = np.empty((count, 0, 0))  # stiffness terms in the basis
         self.rounding = 0.0
         self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
-        self.residual_load = self.residual_basis.extend(problem.loads)
-        self.residual_stiffness = np.empty((len(self.residual_load), len(terms), 0))
-        self.dual = duals(DualProblem(terms, problem.outputs, norm, self.stiffness, advance))
+        self.residual_load = self.residual_basis.extend(terms.loads)
+        self.residual_stiffness = np.empty((len(self.residual_load), count, 0))
+        self.dual = terms.duals(
+            DualProblem(terms.stiffness_terms, terms.outputs, norm, self.stiffness, advance)
+        )
         self.correction = np.swapaxes(self.dual.products, 1, 2) @ self.residual_basis.vectors
         self.snapshots: list[State] = []
 
-    def _matrices(self, thetas: list[FloatArray]) -> Any:
-        """Return the stiffnesses at several coefficients (T,), each for its own columns."""
-        return BlockDiagonal([self.stiffness(theta) for theta in thetas])
-
     def add_snapshots(self, states: list[State]) -> None:
         """Solve the full model for all loads at several states and extend the bases."""
-        thetas, loads = [self.problem.theta(state) for state in states], self.problem.loads
+        thetas, loads = [self.terms.theta(state) for state in states], self.terms.loads
         # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
         tolerance = SNAPSHOT_TOLERANCE if self.snapshots else FIRST_TOLERANCE
         solution = conjugate_gradients(
-            self._matrices(thetas),
+            BlockDiagonal([self.stiffness(theta) for theta in thetas]),
             self.norm,
             np.concatenate([loads] * len(states), axis=1),
             np.concatenate([self._galerkin(theta) for theta in thetas], axis=1),
@@ -152,9 +88,9 @@ class StaticReduction:
         new = self.basis.vectors[:, before:]
         if not new.shape[1]:
             raise ExtensionError  # rounding is reached; what the search reached is judged after it
-        self._take_images([np.asarray(term @ new) for term in self.problem.stiffness_terms])
+        self._take_images([np.asarray(term @ new) for term in self.terms.stiffness_terms])
         if not self.snapshots:
-            self.rounding = self._rounding(thetas[0], self.problem.outputs.T @ solution)
+            self.rounding = self._rounding(thetas[0], self.terms.outputs.T @ solution)
         self.snapshots.extend(states)
 
     def _take_images(self, images: list[FloatArray]) -> None:
@@ -177,17 +113,17 @@ class StaticReduction:
     def _galerkin(self, theta: FloatArray) -> FloatArray:
         """Return the solutions (n, L) in the present basis."""
         if not self.basis.size:
-            return np.zeros_like(self.problem.loads)
+            return np.zeros_like(self.terms.loads)
         basis = self.basis.vectors
         stiffness = np.tensordot(theta, self.in_basis, 1)
-        return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.problem.loads))
+        return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.terms.loads))
 
     def _rounding(self, theta: FloatArray, wanted: FloatArray) -> float:
         """Return the relative difference of outputs between full solutions and the basis that holds them."""
-        difference = np.abs(self.problem.outputs.T @ self._galerkin(theta) - wanted)
+        difference = np.abs(self.terms.outputs.T @ self._galerkin(theta) - wanted)
         return max(
             float(np.divide(largest, size, out=np.zeros_like(size), where=size > 0.0).max())
-            for rows, least in zip(self.problem.groups, self.least, strict=True)
+            for rows, least in zip(self.terms.groups, self.least, strict=True)
             for largest, size in (
                 (difference[rows].max(axis=0), np.maximum(np.abs(wanted[rows]).max(axis=0), least)),
             )
@@ -195,12 +131,12 @@ class StaticReduction:
 
     def arrays(self) -> dict[str, Any]:
         """Return the static fields of `ReducedArrays`, and `cross_mass` with the static basis alone."""
-        problem, basis = self.problem, self.basis.vectors
+        terms, basis = self.terms, self.basis.vectors
         return {
             "static_stiffness": 0.5 * (self.in_basis + self.in_basis.transpose(0, 2, 1)),
-            "static_load": problem.loads.T @ basis,
-            "static_output": problem.outputs.T @ basis,
-            "bound_reference": self.reference,
+            "static_load": terms.loads.T @ basis,
+            "static_output": terms.outputs.T @ basis,
+            "bound_reference": terms.reference[:-1],
             "residual_load": self.residual_load,
             "residual_stiffness": self.residual_stiffness,
             # |sum c_q a_j d_qj| <= |c| |a| |d|; plus rounding
@@ -216,19 +152,22 @@ class StaticReduction:
 
     def cross_mass(self, modal_basis: FloatArray) -> FloatArray:
         """Return the mass terms (1 + P, Nm, N) between a modal basis (n, Nm) and the static one."""
-        images = [np.asarray(term @ self.basis.vectors) for term in self.problem.mass_terms]
+        images = [np.asarray(term @ self.basis.vectors) for term in self.terms.mass_terms]
         return np.stack([modal_basis.T @ image for image in images])
+
+    def bound(self, model: ReducedModel, state: State) -> float:
+        """Return the certified bound of a model of these bases at a state, see `ReductionTerms.bound`."""
+        return self.terms.bound(model, state, self.least)
 
     def _largest_coefficients(self) -> float:
         """Return the largest length of (1, theta), by which load and terms of a residual are multiplied."""
-        largest = self.reference + self.farthest
+        largest = (self.terms.reference + self.terms.farthest())[:-1]
         return float(np.sqrt(2.0 + largest @ largest))
 
 
 def greedy(
     static: StaticReduction,
     model: Callable[[], ReducedModel],
-    judgement: Judgement,
     states: list[State],
     *,
     tolerance: float,
@@ -242,8 +181,6 @@ def greedy(
         Takes the full solutions.
     model : callable
         The reduced model of its present bases.
-    judgement : Judgement
-        The bound.
     states : list of State
         Where it is looked at.
     tolerance : float
@@ -284,7 +221,7 @@ def greedy(
             few = len(mus) // LOOKED_AT if self.rounds > 1 and static.dual.output.size else 0
             for count in (few, len(mus)):
                 for number in order[first:count]:
-                    bounds[number] = self.known[number] = judgement.bound(present, mus[number])
+                    bounds[number] = self.known[number] = static.bound(present, mus[number])
                 first = count
                 if bounds.max() > SEARCH_MARGIN * tolerance:
                     break
@@ -304,7 +241,7 @@ def greedy(
     bounds = [float(value) for value in result["max_errs"][1:]]
     if len(bounds) < surrogate.rounds or bounds[-1] > SEARCH_MARGIN * tolerance:  # not all were looked at
         present = model()
-        bounds.append(max(judgement.bound(present, mu) for mu in states))
+        bounds.append(max(static.bound(present, mu) for mu in states))
     return bounds
 
 
@@ -325,3 +262,74 @@ def _spread(states: FloatArray, bounds: FloatArray, count: int, least: float) ->
             break
         chosen.append(int(score.argmax()))
     return [tuple(states[number].tolist()) for number in chosen]
+
+
+def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
+    """Return the model on fewer static basis vectors, its residuals on as few as they then need.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        A model with N static basis vectors.
+    directions : (N, K) ndarray
+        Orthonormal combinations of them.
+
+    Returns
+    -------
+    ReducedModel
+        The Galerkin model on the combinations; its bound is as certified as before.
+    """
+    stiffness = directions.T @ model.static_stiffness @ directions
+    residual = np.concatenate(
+        (model.residual_load, (model.residual_stiffness @ directions).reshape(len(model.residual_load), -1)),
+        axis=1,
+    )
+    orthonormal, factor = np.linalg.qr(residual)
+    loads = model.residual_load.shape[1]
+    return replace(
+        model,
+        static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
+        static_load=model.static_load @ directions,
+        static_output=model.static_output @ directions,
+        residual_load=np.ascontiguousarray(factor[:, :loads]),
+        residual_stiffness=np.ascontiguousarray(factor[:, loads:].reshape(len(factor), len(stiffness), -1)),
+        dual_correction=model.dual_correction @ orthonormal,
+        cross_mass=model.cross_mass @ directions,
+    )
+
+
+def fewest_directions(
+    model: ReducedModel, static: StaticReduction, states: list[State], tolerance: float
+) -> FloatArray:
+    """Return the fewest singular directions of the reduced solutions that keep the bound below a tolerance.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The model that the greedy search made.
+    static : StaticReduction
+        What it was made of.
+    states : list of tuple
+        States to look at.
+    tolerance : float
+        Relative bound wanted.
+
+    Returns
+    -------
+    (N, K) ndarray
+        Orthonormal combinations of its static basis vectors; all of them if fewer do not suffice.
+    """
+    solutions = []
+    for state in states:
+        for response in static.terms.responses(model, state):
+            solutions.append(response.coordinates / np.linalg.norm(response.coordinates))
+    directions = np.linalg.svd(np.array(solutions).T, full_matrices=False)[0]
+    low, high = min(2, directions.shape[1]), directions.shape[1]
+    while low < high:
+        middle = (low + high) // 2
+        smaller = compressed(model, directions[:, :middle])
+        if all(static.bound(smaller, state) <= tolerance for state in states):
+            high = middle
+        else:
+            low = middle + 1
+    return np.asarray(directions[:, :low])

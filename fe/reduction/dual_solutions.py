@@ -4,7 +4,6 @@ Either the solution at the nearest of several anchors is taken, or those at a fe
 state, as a reduced basis of each output (Rozza, Huynh and Patera 2008).
 """
 
-import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +14,6 @@ from scipy import sparse
 
 from fe.full.subspace import BlockDiagonal, Norm, conjugate_gradients
 from fe.runtime.errors import ReductionError
-
-from .settings import MOST_GRID_REGIONS, remaining_levels
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -61,39 +58,6 @@ class DualProblem:
     norm: Norm
     stiffness: Callable[[FloatArray], Any]
     advance: Callable[[int, str], object]
-
-    def solved(
-        self,
-        theta: Callable[[FloatArray], FloatArray],
-        middle: FloatArray,
-        ends: FloatArray,
-        counts: tuple[int, ...],
-    ) -> DualData:
-        """Return the dual solutions of a structure: at anchors or, of many regions, to be combined.
-
-        Parameters
-        ----------
-        theta : callable
-            Coefficients (T,) of the stiffness terms at parameters and what is kept of K regions (V,).
-        middle, ends : (V,), (V, 2) ndarray
-            Their middle, and their range.
-        counts : tuple of int
-            Number of anchors along each loss; where all are one, more than `MOST_GRID_REGIONS` are combined.
-        """
-        parameters = len(middle) - len(counts)
-        if len(counts) > MOST_GRID_REGIONS and max(counts) == 1:
-            alone = [
-                np.where(row, end, middle)
-                for row, span in zip(np.eye(len(middle)), ends, strict=True)
-                for end in span
-            ]
-            return self.combined([theta(values) for values in (middle, *alone)])
-        levels = [
-            remaining_levels(1.0 - span, count) for span, count in zip(ends[parameters:], counts, strict=True)
-        ]
-        return self.nearest(
-            [theta(np.append(middle[:parameters], kept)) for kept in itertools.product(*levels)]
-        )
 
     def nearest(self, anchors: list[FloatArray]) -> DualData:
         """Return the solutions at anchors (T,), with the norms of their residuals elsewhere."""

@@ -6,7 +6,7 @@ basis, which takes milliseconds.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -56,13 +56,12 @@ class FieldBasis(KeptArrays):
     """
 
     what = "a field basis"
-    kinds: ClassVar = {"cells": np.int64, "region": np.int64}
 
-    points: FloatArray
-    cells: IntArray
-    region: IntArray
-    static_displacement: FloatArray
-    modal_displacement: FloatArray
+    points: Annotated[FloatArray, "points", 3]
+    cells: Annotated[IntArray, "cells", 20]
+    region: Annotated[IntArray, "cells"]
+    static_displacement: Annotated[FloatArray, "points", 3, "static"]
+    modal_displacement: Annotated[FloatArray, "points", 3, "modal"]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,17 +69,6 @@ class FieldBasis(KeptArrays):
             raise ReducedModelFileError(
                 "The cells of a field basis have nodes that are not there; build the basis anew."
             )
-
-    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
-        points, cells = self.points.shape[:1], self.cells.shape[:1]
-        static, modal = self.static_displacement.shape[2:3], self.modal_displacement.shape[2:3]
-        return {
-            "points": (*points, 3),
-            "cells": (*cells, 20),
-            "region": cells,
-            "static_displacement": (*points, 3, *static),
-            "modal_displacement": (*points, 3, *modal),
-        }
 
 
 @dataclass(frozen=True)

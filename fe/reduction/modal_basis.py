@@ -4,45 +4,28 @@ First a working basis is grown by Davidson corrections until the modes of sample
 in it; then the modes of many states, computed in the working basis, are compressed by singular values.
 """
 
-import itertools
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 from scipy.linalg import eigh
 
 from fe.full.affine import AffineSum, affine_sum
 from fe.full.subspace import Norm, OrthonormalBasis
 from fe.runtime.errors import ReductionError
 
-from .settings import MOST_GRID_REGIONS, TOGETHER, ModalSettings
+from .settings import TOGETHER, ModalSettings
+from .terms import ModalState, ReductionTerms
 
 FloatArray = npt.NDArray[np.float64]
 
-ModalState = tuple[FloatArray, FloatArray]
-"""Coefficients of the stiffness terms (T,) and of the mass terms (1 + P,)."""
-
 START_ITERATIONS = 4
-
-
-class MatrixTerms(Protocol):
-    """What the modes of a structure are made of: terms csr (n, n) of its stiffness and mass."""
-
-    @property
-    def stiffness_terms(self) -> tuple[sparse.csr_array, ...]:
-        """Terms of the stiffness."""
-
-    @property
-    def mass_terms(self) -> tuple[sparse.csr_array, ...]:
-        """Terms of the mass."""
 
 
 class _WorkingBasis:
     """Basis orthonormal in the reference norm, with the projected terms."""
 
-    def __init__(self, system: MatrixTerms, norm: Norm) -> None:
+    def __init__(self, system: ReductionTerms, norm: Norm) -> None:
         self.system, self.norm = system, norm
         self.sums = tuple(AffineSum(terms).matrix for terms in (system.stiffness_terms, system.mass_terms))
         self.basis = OrthonormalBasis(system.stiffness_terms[0].shape[0], norm, drop=1e-6)
@@ -78,40 +61,17 @@ def eigenmodes(
     return np.asarray(values), np.asarray(vectors)
 
 
-def loss_corners(regions: int) -> list[tuple[int, ...]]:
-    """Return which end of its range each loss takes, (K,) of 0 and 1, where modes are computed.
-
-    All corners up to `MOST_GRID_REGIONS`; beyond, all healthy, all damaged, each region alone damaged, and
-    each alone healthy.
-    """
-    if regions <= MOST_GRID_REGIONS:
-        return list(itertools.product((0, 1), repeat=regions))
-    alone = [tuple(int(number == chosen) for number in range(regions)) for chosen in range(regions)]
-    others = [tuple(1 - end for end in corner) for corner in alone]
-    return [(0,) * regions, *alone, *others, (1,) * regions]
-
-
 def modal_basis(
-    system: MatrixTerms,
-    norm: Norm,
-    middle: FloatArray,
-    sampled: list[ModalState],
-    compression: list[ModalState],
-    settings: ModalSettings,
-    advance: Callable[[], object],
+    system: ReductionTerms, norm: Norm, settings: ModalSettings, advance: Callable[[], object]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Make a basis for the first modes of any structure.
 
     Parameters
     ----------
-    system : MatrixTerms
-        The full model.
+    system : ReductionTerms
+        The full model, where the working basis is refined, and whose modes are compressed together.
     norm : Norm
         The energy norm of one of its stiffnesses.
-    middle : (1 + P,) ndarray
-        Coefficients of the mass terms with which the search begins.
-    sampled, compression : list of ModalState
-        Where the working basis is refined, and whose modes are compressed together.
     settings : ModalSettings
         Accuracy.
     advance : callable
@@ -136,15 +96,16 @@ def modal_basis(
             f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
         )
     working = _WorkingBasis(system, norm)
-    matrix = affine_sum(middle, system.mass_terms)
+    matrix = affine_sum(system.middle_mass, system.mass_terms)
     # inverse iteration on a block; what it leaves is refined below
     vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
     for _ in range(START_ITERATIONS):
         vectors = np.linalg.qr(norm.riesz(np.asarray(matrix @ vectors)))[0]
     working.extend(vectors)
+    sampled = system.sampled_modes()
     for first in range(0, len(sampled), TOGETHER):
         _refine(working, sampled[first : first + TOGETHER], count, settings, advance)
-    basis = _compress(working, compression, count, settings)
+    basis = _compress(working, system.compressed_modes(), count, settings)
     stiffness, mass = (
         # What rounding made of the symmetry of large entries is averaged out.
         0.5 * (terms + terms.transpose(0, 2, 1))

@@ -5,7 +5,7 @@ bytes on a machine whatever its cores do.
 """
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -57,6 +57,10 @@ def _loaded(kind: type[_Kept], path: Path, design_hash: str) -> _Kept:
     if arrays.design_hash != design_hash:
         raise ReducedModelFileError(f"{path} holds {kind.what} of another design; delete it.")
     return arrays
+
+
+def _once(kind: type[_Kept], path: Path, design_hash: str, build: Callable[[], _Kept]) -> _Kept:
+    return built_once(path, lambda: _loaded(kind, path, design_hash), build, lambda made: made.save(path))
 
 
 # ---------------------------------------------------------------- wings
@@ -125,19 +129,14 @@ def _kept_fields(
         wing.basis.save(fields)
         wing.model.save(path)
 
-    return built_once(
-        path,
-        load=load,
-        build=lambda: build(design, progress, settings),
-        keep=keep,
-    )
+    return built_once(path, load, lambda: build(design, progress, settings), keep)
 
 
 def build(
     design: "WingDesign", progress: "Progress | None" = None, settings: "ReductionSettings | None" = None
 ) -> WingFields:
     """Build the reduced model and the field basis of a wing, without the cache; see `reduced_model`."""
-    from .wing_basis import reduce_model
+    from .reduced_basis import reduce_model
 
     with assembled(design, progress) as operators:
         reduction = reduce_model(operators, settings, progress)
@@ -169,12 +168,7 @@ def patch_arrays(
     """
     wing = given_or_shipped(design)
     path = entry("patches", wing.hash, settings)
-    return built_once(
-        path,
-        load=lambda: _loaded(PatchArrays, path, wing.hash),
-        build=lambda: build_patch_arrays(wing, progress, settings),
-        keep=lambda arrays: arrays.save(path),
-    )
+    return _once(PatchArrays, path, wing.hash, lambda: build_patch_arrays(wing, progress, settings))
 
 
 def build_patch_arrays(
@@ -225,12 +219,7 @@ def reduced_structure(
             structure = load_any(file, memory_limit)
         return reduced(structure, settings, progress)
 
-    return built_once(
-        path,
-        load=lambda: _loaded(ReducedModel, path, design_hash),
-        build=build_structure,
-        keep=lambda model: model.save(path),
-    )
+    return _once(ReducedModel, path, design_hash, build_structure)
 
 
 def check_structure(file: Path | str) -> None:

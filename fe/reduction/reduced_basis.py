@@ -3,47 +3,29 @@
 The method and what it reaches are in `docs/reduced_model.md`.
 """
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.stats import qmc
 
-from fe.full.affine import affine_sum
+from fe.full.affine import AffineSystem, affine_sum
 from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
-from fe.runtime.reduced import ReducedModel, StaticResponse
-from fe.structure.affine import AffineStructure
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import TIP_FORCE, WING, DigitalState
+from fe.structure.affine import AffineStructure, LoadTerm, StiffnessTerm
 from reporting.progress import Progress, SilentProgress
 from reporting.words import counted
 
-from .certified_basis import AffineProblem, Judgement, State, StaticReduction, greedy
-from .compression import compressed, fewest_directions
-from .dual_solutions import DualData, DualProblem
-from .modal_basis import ModalState, eigenmodes, loss_corners, modal_basis
-from .settings import (
-    MOST_GRID_REGIONS,
-    ModalSettings,
-    StructureSettings,
-    default_anchors,
-    loss_splits,
-    remaining_levels,
-)
+from .certified_basis import StaticReduction, compressed, fewest_directions, greedy
+from .modal_basis import eigenmodes, modal_basis
+from .settings import ModalSettings, ReductionSettings, StructureSettings, loss_splits
+from .terms import ReductionTerms, State
 
 FloatArray = npt.NDArray[np.float64]
-
-LEAST_COSINE = 1e-3
-"""A load whose outputs are smaller than this part of what its energy could do to them is judged by that part:
-nothing of the structure sees it there."""
-UNSEEN_SHARE = 0.1
-"""Where another load is seen, one that is not is judged by this part of what that does, each at its most."""
-SAMPLED_INSIDE = 10
-"""States inside the box at which the modes are refined."""
-CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024
-"""States inside the box on the training set, beside corners; of more regions than a grid would take."""
 
 
 @dataclass(frozen=True)
@@ -69,161 +51,6 @@ class Reduction:
     modal_basis: FloatArray
     snapshots: tuple[State, ...]
     bound_history: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class _ModalData:
-    """Modal basis (n, Nm), the terms in it, and the shapes (F, Nm) that modes are followed by."""
-
-    basis: FloatArray
-    stiffness: FloatArray
-    mass: FloatArray
-    followed: FloatArray
-
-
-class ReductionTerms:
-    """What the reduction takes of a structure: terms merged by what they are times, the constant one last."""
-
-    def __init__(self, structure: AffineStructure) -> None:
-        self.structure = structure
-        parameters, controls = list(structure.parameters), list(structure.controls)
-        masses, regions = list(structure.masses), list(structure.regions)
-
-        def number(names: list[str], name: str | None) -> int:
-            return 0 if name is None else 1 + names.index(name)
-
-        terms = [
-            (term.matrix, (number(parameters, term.parameter), number(regions, term.region)))
-            for term in structure.stiffness_terms
-        ]
-        if terms[-1][1] != (0, 0):  # the error bound has a constant term
-            terms.append((sparse.csr_array(terms[0][0].shape), (0, 0)))
-        self.stiffness_factors = np.array([factors for _, factors in terms], dtype=np.int64)
-        columns: dict[tuple[int, int], FloatArray] = {}
-        for load in structure.load_terms:
-            place = (number(controls, structure.loads[load.load]), number(masses, load.mass))
-            columns[place] = columns[place] + load.vector if place in columns else load.vector
-        columns = {place: vector for place, vector in columns.items() if vector.any()}
-        self.load_factors = np.array(list(columns), dtype=np.int64).reshape(-1, 2)
-        outputs = sparse.vstack((structure.gauge_output, structure.displacement_output)).T
-        count, gauges = outputs.shape[1], len(structure.gauges)
-        groups = (slice(0, gauges), slice(gauges, count))
-        self.problem = AffineProblem(
-            stiffness_terms=tuple(matrix for matrix, _ in terms),
-            mass_terms=structure.mass_terms,
-            loads=np.stack(list(columns.values()), axis=1) if columns else np.empty((structure.unknowns, 0)),
-            outputs=np.asarray(outputs.toarray()),
-            groups=tuple(part for part in groups if part.stop > part.start),
-            theta=self.theta,
-        )
-        self.parameters = [structure.ranges[name] for name in parameters]
-        self.losses = [structure.ranges[name] for name in regions]
-        self.masses = [structure.ranges[name] for name in masses]
-        self.counts = default_anchors(len(regions))
-        self.reference = self._coefficients(
-            np.array([np.mean(ends) for ends in self.parameters]),
-            np.array([remaining_levels(ends, 1)[0] for ends in self.losses]),
-        )
-
-    def _coefficients(self, parameters: FloatArray, kept: FloatArray) -> FloatArray:
-        """Coefficients (T,) of the stiffness terms at parameters and what the regions have kept."""
-        factor, left = np.append(1.0, parameters), np.append(1.0, kept)
-        return np.asarray(factor[self.stiffness_factors[:, 0]] * left[self.stiffness_factors[:, 1]])
-
-    def theta(self, state: State) -> FloatArray:
-        """Coefficients (T,) of the stiffness terms at parameters and losses."""
-        values, count = np.array(state), len(self.parameters)
-        return self._coefficients(values[:count], 1.0 - values[count:])
-
-    def duals(self, problem: DualProblem) -> DualData:
-        """Dual solutions, at parameters and what the regions have kept."""
-        split, kept = len(self.parameters), [remaining_levels(ends, 1)[0] for ends in self.losses]
-        middle = np.array([*(np.mean(ends) for ends in self.parameters), *kept])
-        ends = np.array([*self.parameters, *(1.0 - np.array(self.losses))])
-        return problem.solved(
-            lambda values: self._coefficients(values[:split], values[split:]), middle, ends, self.counts
-        )
-
-    def corners(self) -> list[State]:
-        """Corners of parameters and losses: all of a few, else those of `loss_corners`."""
-        box = (*self.parameters, *self.losses)
-        return [
-            tuple(float(span[end]) for span, end in zip(box, ends, strict=True))
-            for ends in loss_corners(len(box))
-        ]
-
-    def training(self) -> list[State]:
-        """States on which the greedy search looks for the largest bound: corners, and points between them."""
-        count = CHOSEN_STATES if len(self.losses) <= MOST_GRID_REGIONS else CHOSEN_OF_MANY
-        points = qmc.Halton(len(self.parameters) + len(self.losses), scramble=False).random(count)
-        return [*self.corners(), *self.inside(points)]
-
-    def inside(self, shares: FloatArray) -> list[State]:
-        """States at shares (B, P + K) of the ranges; a loss goes by equal ratios of what is kept."""
-        columns = [
-            low + (high - low) * share for (low, high), share in zip(self.parameters, shares.T, strict=False)
-        ] + [
-            1.0 - (1.0 - low) * ((1.0 - high) / (1.0 - low)) ** share
-            for (low, high), share in zip(self.losses, shares.T[len(self.parameters) :], strict=True)
-        ]
-        return [tuple(state) for state in np.column_stack(columns).tolist()]
-
-    def sampled_modes(self) -> list[ModalState]:
-        """Corners under least and largest masses in turns, and a few states inside."""
-        at_corners = [
-            (
-                self.theta(state),
-                np.array((1.0, *(ends[(number + place) % 2] for place, ends in enumerate(self.masses)))),
-            )
-            for number, state in enumerate(self.corners())
-        ]
-        return [*at_corners, *self._modes_inside(SAMPLED_INSIDE)]
-
-    def compressed_modes(self) -> list[ModalState]:
-        """Corners under all least and largest masses, at most 64 of them, and states inside."""
-        masses = list(itertools.islice(itertools.product(*self.masses), 64))
-        at_corners = [
-            (self.theta(state), np.array((1.0, *chosen))) for state in self.corners() for chosen in masses
-        ]
-        return [*at_corners, *self._modes_inside(4 * SAMPLED_INSIDE)]
-
-    def _modes_inside(self, count: int) -> list[ModalState]:
-        """States of a Halton sequence, masses among them."""
-        varied = len(self.parameters) + len(self.losses)
-        points = qmc.Halton(varied + len(self.masses), scramble=False).random(1 + count)[1:]
-        low, high = np.array(self.masses).reshape(-1, 2).T
-        masses = low + (high - low) * points[:, varied:]
-        return [
-            (self.theta(state), np.array((1.0, *chosen)))
-            for state, chosen in zip(self.inside(points[:, :varied]), masses, strict=True)
-        ]
-
-    def largest_loads(self) -> FloatArray:
-        """Largest coefficient (L,) of each load."""
-        controls, masses = (
-            np.abs([(1.0, 1.0), *(self.structure.ranges[name] for name in names)]).max(axis=1)
-            for names in (self.structure.controls, self.structure.masses)
-        )
-        return np.asarray(controls[self.load_factors[:, 0]] * masses[self.load_factors[:, 1]])
-
-    def farthest(self) -> FloatArray:
-        """Largest distance (T,) of each coefficient from its reference."""
-        factor = np.array([(1.0, 1.0), *self.parameters])[self.stiffness_factors[:, 0]]
-        kept = 1.0 - np.array([(0.0, 0.0), *self.losses])[self.stiffness_factors[:, 1]]
-        ends = (factor[:, :, np.newaxis] * kept[:, np.newaxis, :]).reshape(len(factor), -1)
-        return np.asarray(np.abs(ends - self.reference[:, np.newaxis]).max(axis=1))
-
-    @property
-    def nominal(self) -> ModalState:
-        """The structure as it is nominally, healthy."""
-        parameters = np.array([*self.structure.parameters.values()])
-        masses = np.array((1.0, *self.structure.masses.values()))
-        return self._coefficients(parameters, np.ones(len(self.losses))), masses
-
-    @property
-    def middle_mass(self) -> FloatArray:
-        """Coefficients (1 + P,) of the mass terms in the middle."""
-        return np.array([1.0, *(np.mean(span) for span in self.masses)])
 
 
 def reduce_structure(
@@ -259,24 +86,14 @@ def reduce_structure(
     terms = ReductionTerms(structure)
     _check(terms, name)
     with progress.stage("Factorising the structure"):
-        norm = Norm(affine_sum(terms.reference, terms.problem.stiffness_terms))
+        norm = Norm(affine_sum(terms.reference, terms.stiffness_terms))
     with progress.stage("Reducing the modes") as stage:
         modes = _modes(terms, norm, name, settings.modal, stage.advance, followed_load)
     with progress.stage("Reducing the statics") as stage:
-        static = StaticReduction(
-            terms.problem,
-            norm,
-            terms.reference[:-1],
-            terms.duals,
-            terms.farthest()[:-1],
-            stage.advance,
-            least := _least(terms, norm),
-        )
-        judgement, states = judgement_of(terms, least), terms.training()
+        static, states = StaticReduction(terms, norm, stage.advance), terms.training()
         history = greedy(
             static,
-            lambda: _model(static, terms, name, modes, settings.modal.mode_count),
-            judgement,
+            lambda: _model(static, name, modes, settings.modal.mode_count),
             states,
             tolerance=settings.bound_tolerance,
             most_snapshots=settings.most_snapshots,
@@ -288,12 +105,12 @@ def reduce_structure(
             f"raise most_solutions (now {settings.most_snapshots}) or tolerance in the table [reduction] of "
             "a structure file, or narrow the ranges of parameters and losses."
         )
-    model = _model(static, terms, name, modes, settings.modal.mode_count)
-    directions = fewest_directions(model, judgement, states, settings.bound_tolerance)
+    model = _model(static, name, modes, settings.modal.mode_count)
+    directions = fewest_directions(model, static, states, settings.bound_tolerance)
     return Reduction(
         compressed(model, directions),
         static.basis.vectors @ directions,
-        modes.basis,
+        modes[0],
         tuple(static.snapshots),
         tuple(history),
     )
@@ -306,23 +123,29 @@ def _modes(
     settings: ModalSettings,
     advance: Callable[[], object],
     followed_load: int | None,
-) -> _ModalData:
-    """Return the modal basis with the terms in it; raises `ReductionError`."""
-    sampled, compression = terms.sampled_modes(), terms.compressed_modes()
+) -> tuple[FloatArray, dict[str, Any]]:
+    """Return the modal basis (n, Nm) and the modal fields of `ReducedArrays`; raises `ReductionError`."""
     try:
-        basis, stiffness, mass = modal_basis(
-            terms.problem, norm, terms.middle_mass, sampled, compression, settings, advance
-        )
+        basis, stiffness, mass = modal_basis(terms, norm, settings, advance)
     except np.linalg.LinAlgError:
         raise ReductionError(
             f"The masses of {name} move in fewer ways than the {settings.mode_count + 2} modes that are "
             "looked for; give its materials a density."
         ) from None
-    if followed_load is None:
-        return _ModalData(basis, stiffness, mass, np.empty((0, basis.shape[1])))
-    square, shapes = eigenmodes(stiffness, mass, *terms.nominal, settings.mode_count)
-    contribution = (terms.problem.loads[:, followed_load] @ basis @ shapes) ** 2 / square
-    return _ModalData(basis, stiffness, mass, shapes[:, np.sort(np.argsort(contribution)[-2:])].T)
+    load, followed = terms.loads.T @ basis, np.empty((0, basis.shape[1]))
+    if followed_load is not None:
+        square, shapes = eigenmodes(stiffness, mass, *terms.nominal, settings.mode_count)
+        contribution = (load[followed_load] @ shapes) ** 2 / square
+        followed = shapes[:, np.sort(np.argsort(contribution)[-2:])].T
+    return basis, {
+        "modal_stiffness": stiffness,
+        "modal_mass": mass,
+        "modal_load": load,
+        "modal_output": np.concatenate(
+            (terms.outputs.T @ basis, terms.structure.acceleration_output @ basis)
+        ),
+        "followed_shapes": followed,
+    }
 
 
 def _check(terms: ReductionTerms, name: str) -> None:
@@ -331,7 +154,7 @@ def _check(terms: ReductionTerms, name: str) -> None:
     for missing, what in (
         (not structure.regions, "[[damage]]: a twin needs a region that may lose stiffness"),
         (not len(terms.load_factors), "[[load]] that does anything: nothing would strain it"),
-        (not terms.problem.groups, "[[gauge]] and no [[displacement]]: nothing could be observed"),
+        (not terms.groups, "[[gauge]] and no [[displacement]]: nothing could be observed"),
     ):
         if missing:
             raise ReductionError(f"The structure {name} has no {what}.")
@@ -342,14 +165,11 @@ def _check(terms: ReductionTerms, name: str) -> None:
 
 
 def _model(
-    static: StaticReduction,
-    terms: ReductionTerms,
-    name: str,
-    modes: _ModalData,
-    mode_count: int,
+    static: StaticReduction, name: str, modes: tuple[FloatArray, dict[str, Any]], mode_count: int
 ) -> ReducedModel:
     """Return the reduced model of the present bases."""
-    structure, problem, basis = terms.structure, terms.problem, modes.basis
+    terms, (basis, modal) = static.terms, modes
+    structure = terms.structure
     chosen = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
     nominal = structure.parameters | structure.masses | structure.controls
     return ReducedModel(
@@ -372,54 +192,47 @@ def _model(
         dual_split=np.concatenate(
             [loss_splits(ends, count) for ends, count in zip(terms.losses, terms.counts, strict=True)]
         ),
-        modal_stiffness=modes.stiffness,
-        modal_mass=modes.mass,
-        modal_load=problem.loads.T @ basis,
-        modal_output=np.concatenate((problem.outputs.T @ basis, structure.acceleration_output @ basis)),
         cross_mass=static.cross_mass(basis),
         mode_count=mode_count,
-        followed_shapes=modes.followed,
+        **modal,
         **static.arrays(),
     )
 
 
-def _least(terms: ReductionTerms, norm: Norm) -> FloatArray:
-    """Return the outputs (groups, L) below which a load is not seen; see `LEAST_COSINE`."""
-    problem, largest = terms.problem, terms.largest_loads()
-    solutions = norm.riesz(problem.loads)
-    loads = np.linalg.norm(norm.whitened(problem.loads), axis=0)
-    outputs = np.linalg.norm(norm.whitened(problem.outputs), axis=0)
-    seen = np.abs(problem.outputs.T @ solutions)
-    found = []
-    for part in problem.groups:
-        least, size = LEAST_COSINE * loads * outputs[part].max(), seen[part].max(axis=0)
-        of_others = UNSEEN_SHARE * (size * largest).max() / largest
-        found.append(np.where(size < least, np.maximum(least, of_others), least))
-    return np.array(found)
+def wing_structure(system: AffineSystem, settings: ReductionSettings) -> AffineStructure:
+    """Return a wing as a structure with names: lift and tip force, gauges and the displacement of the tip."""
+    state, (servo, pitot) = DigitalState(), settings.nominal_masses
+    pairs = (("young_modulus_factor", None), *((None, name) for name in system.regions), (None, None))
+    gauges = system.gauge_output.shape[0]
+    return AffineStructure(
+        parameters={"young_modulus_factor": 1.0},
+        masses={"servo_mass": servo, "pitot_mass": pitot},
+        controls={"load_factor": 1.0, "tip_force": 0.0},
+        control_units={"load_factor": "1", "tip_force": "N"},
+        ranges=settings.named_ranges(system.regions),
+        regions=system.regions,
+        stiffness_terms=tuple(
+            StiffnessTerm(term, *pair) for term, pair in zip(system.stiffness_terms, pairs, strict=True)
+        ),
+        mass_terms=system.mass_terms,
+        loads={"lift": "load_factor", "tip": "tip_force"},
+        load_terms=(LoadTerm("lift", system.load_lift), LoadTerm("tip", system.load_tip)),
+        gauges=tuple(f"gauge_{number}" for number in range(1, gauges + 1)),
+        displacements=("tip",),
+        accelerations=(),
+        gauge_output=system.gauge_output,
+        displacement_output=sparse.csr_array(system.tip_displacement_output[np.newaxis]),
+        acceleration_output=sparse.csr_array((0, system.unknowns)),
+        expansion=system.expansion,
+        damping_alpha=state.damping_alpha,
+        damping_beta=state.damping_beta,
+        design_hash=system.design_hash,
+    )
 
 
-def judgement_of(terms: ReductionTerms, least: FloatArray) -> Judgement:
-    """Return how the model is judged: each load alone, gauges and displacements each by their largest.
-
-    Outputs (groups, L) that are smaller than `least` are judged by it.
-    """
-    unit = np.eye(len(terms.load_factors))
-
-    def responses(model: ReducedModel, state: State) -> list[StaticResponse]:
-        chosen = model.nominal.copy()
-        chosen[: len(state)] = state
-        return [model.static_response(chosen, load=load) for load in unit]
-
-    def bound(model: ReducedModel, state: State) -> float:
-        worst = 0.0
-        for number, found in enumerate(responses(model, state)):
-            kinds = (
-                (found.strain, found.strain_error_bound),
-                (found.displacement, found.displacement_error_bound),
-            )
-            present = [(values, error) for values, error in kinds if values.size]
-            for (values, error), floor in zip(present, least[:, number], strict=True):
-                worst = max(worst, error / max(float(np.abs(values).max()), floor))
-        return worst
-
-    return Judgement(lambda model, state: [found.coordinates for found in responses(model, state)], bound)
+def reduce_model(
+    system: AffineSystem, settings: ReductionSettings | None = None, progress: Progress | None = None
+) -> Reduction:
+    """Make the reduced model of a wing, its flapwise bendings followed; see `reduce_structure`."""
+    settings = settings or ReductionSettings()
+    return reduce_structure(wing_structure(system, settings), WING, settings, progress, TIP_FORCE)

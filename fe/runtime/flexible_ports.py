@@ -9,7 +9,7 @@ Written in the subset of Python that numba compiles too. NumPy and relative impo
 into the FMU.
 """
 
-from .laws import advance, dry, force, pull, settle
+from .laws import advance, dry, pull
 from .motion_arrays import FIRST_PARTS, Acting, Course, IntArray, Ports, State
 
 
@@ -33,6 +33,8 @@ def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -
             if not damped:
                 springs = j if springs < 0 else springs
                 acting.springs[j] = springs
+                last = state.memory[j, 1]
+                state.current[j], _ = pull_of(ports, state, j, last, course.h, FIRST_PARTS)
         x = y
         if springs >= 0:
             r = at_once * ports.flexibility[port]
@@ -49,28 +51,9 @@ def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -
 
 
 def arrive(ports: Ports, state: State, j: int, x: float, least: int) -> None:
-    """Carry the memory of a law of position to `x`, and take its force there."""
+    """Carry the memory of a law of position to `x`, where its force is known."""
     advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, least)
     state.memory[j, 1] = x
-    state.current[j] = force(ports.numbers[j], ports.values[j], state.memory[j], x)
-
-
-def carry_lone(ports: Ports, state: State, load: float, h: float) -> None:
-    """Carry the only law to the step's end, and give the modes the second half of its impulse."""
-    keep = ports.relaxation / (ports.relaxation + h)
-    ease = 1.0 - keep
-    state.memory[0, 3] *= keep
-    y = ports.feed[0, 0] * load + ports.feed[1, 0] + state.memory[0, 3]
-    y -= ports.flexibility[0] * keep * state.memory[0, 2]
-    for m in range(len(state.q)):
-        y += ports.rows[0, m] * state.q[m]
-    r = ease * ports.flexibility[0]
-    state.current[0] = settle(
-        ports.numbers[0], ports.values[0], ports.elements[0], state.memory[0], y, r, h, state.current[0]
-    )
-    state.memory[0, 2] = keep * state.memory[0, 2] + ease * state.current[0]
-    for m in range(len(state.q)):
-        state.v[m] -= ports.rows[0, m] * state.current[0] * (0.5 * h)
 
 
 def carry_flexible(ports: Ports, acting: Acting, state: State, load: float, h: float) -> None:
@@ -112,22 +95,23 @@ def settle_port(
 ) -> float:
     """Return the position x of a port with laws, x + r sum F(x) = y; their forces go to `state.current`.
 
-    The laws are those whose `leader` is `port`.
-
-    Dry friction first: where it can hold the port, it does. The memories are left as they are.
+    The laws are those whose `leader` is `port`; of those of position, `state.current` has the forces at the
+    last position. Dry friction first: where it can hold the port, it does. The memories are left as they are.
     """
     count = len(ports.numbers)
     last = state.memory[port, 1]
-    start, level = 0.0, 0.0
+    start, level, tolerance = 0.0, 0.0, 1e-12
     for j in range(count):
         if leader[j] != port:
             continue
-        own, _ = pull_of(ports, state, j, last, h, least)
+        if ports.of_speed[j] == 0:
+            start += state.current[j]
+            continue
+        tolerance = 1e-15  # a speed is a small difference of positions
+        state.current[j] = 0.0
         if dry(ports.numbers[j], ports.values[j]):
+            own, _ = pull_of(ports, state, j, last, h, least)
             level += own
-        else:
-            state.current[j] = own
-            start += own
     push = y - last - r * start
     if level > 0.0 and abs(push) <= r * level:
         for j in range(count):
@@ -138,9 +122,9 @@ def settle_port(
     sign = 1.0 if push > 0.0 else -1.0
     # the root lies that way from the last position, if the structure is stable
     low, high = last, last + sign * 1e300
-    x = last + sign * max(abs(push) - r * level, 0.0)
+    x, rest, steep = last + sign * max(abs(push) - r * level, 0.0), 0.0, port
     for _ in range(80):
-        total, slope = 0.0, 1.0
+        total, slope, steepest = 0.0, 1.0, -1.0
         for j in range(count):
             if leader[j] != port:
                 continue
@@ -150,18 +134,24 @@ def settle_port(
             state.current[j] = own
             total += own
             slope += r * change
+            if change > steepest:
+                steep, steepest = j, change
         rest = x + r * total - y
-        if abs(rest) <= 1e-12 * (abs(x) + abs(y)) or abs(high - low) <= 1e-15 * abs(x):
-            break
+        if abs(rest) <= 1e-13 * abs(push) + tolerance * (abs(x) + abs(y)):
+            return float(x)
         if sign * rest > 0.0:
             high = x
         else:
             low = x
+        if abs(high - low) <= 1e-15 * abs(x):
+            break
         step = x - rest / slope if slope > 1e-6 else high
         if sign * (step - low) > 0.0 and sign * (high - step) > 0.0:
             x = step
-        elif abs(high) < 1e299:
-            x = 0.5 * (low + high)
+        elif abs(high) < 1e299:  # nearer to where the way begins: a force of speed may rise steeply there
+            x = low + 0.1 * (high - low)
         else:
             x += sign * abs(rest)
+    if r > 0.0:  # a force that rises within rounding gives what is missing
+        state.current[steep] -= rest / r
     return float(x)

@@ -1,23 +1,139 @@
 """Records of arrays that live in one `.npz` file: checked where they are made, read back to the last bit.
 
+The file has reproducible bytes, is written whole or not at all, and nothing in it is pickled.
+
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from collections.abc import Mapping
+import io
+import os
+import tempfile
+import zipfile
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from .archive import arrays_from_bytes, arrays_to_bytes, require_arrays, write_bytes_atomically
 from .errors import ReducedModelFileError
+
+_TIMESTAMP = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip archive can hold
+
+
+def arrays_to_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
+    """Return the bytes of an `.npz` archive; equal arrays give equal bytes on every machine and day.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        The arrays by name; object arrays are refused (they would need pickle).
+
+    Returns
+    -------
+    bytes
+        The archive: not compressed, since the result of a compression depends on the library's version.
+
+    Raises
+    ------
+    ValueError
+        If an array holds Python objects.
+    """
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name in sorted(arrays):
+            entry = zipfile.ZipInfo(f"{name}.npy", date_time=_TIMESTAMP)
+            entry.external_attr = 0o644 << 16
+            entry.create_system = 3
+            content = io.BytesIO()
+            np.lib.format.write_array(content, np.asarray(arrays[name], order="C"), allow_pickle=False)
+            archive.writestr(entry, content.getvalue())
+    return buffer.getvalue()
+
+
+def arrays_from_bytes(
+    content: bytes, where: str, wanted: Collection[str] = ()
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of an `.npz` archive, checksums verified.
+
+    Parameters
+    ----------
+    content : bytes
+        The archive.
+    where : str
+        What is being read, for the error message.
+    wanted : collection of str
+        Names that must be there.
+
+    Returns
+    -------
+    dict of str to ndarray
+        The arrays by name.
+
+    Raises
+    ------
+    ReducedModelFileError
+        If the archive is damaged, cut short, lacks an array or holds anything but plain arrays.
+    """
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for entry in archive.namelist():
+                member = io.BytesIO(archive.read(entry))
+                arrays[entry.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
+                if member.read(1):
+                    raise ValueError("bytes follow an array")
+    except Exception as cause:  # zipfile and NumPy answer damage with nearly every exception that there is
+        reason = " ".join(str(cause).split()) or type(cause).__name__
+        raise ReducedModelFileError(
+            f"{where} is not a sound archive of plain arrays ({reason}); delete it and build it anew."
+        ) from cause
+    require_arrays(arrays, where, wanted)
+    return arrays
+
+
+def require_arrays(arrays: Mapping[str, npt.NDArray[Any]], where: str, wanted: Iterable[str]) -> None:
+    """Raise `ReducedModelFileError` if one of the `wanted` names is not among the arrays of `where`."""
+    missing = [name for name in wanted if name not in arrays]
+    if missing:
+        raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
+
+
+def write_bytes_atomically(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all: a reader never sees half of it, whatever happens meanwhile.
+
+    Parameters
+    ----------
+    path : Path
+        The file; its folder must exist.
+    content : bytes
+        What it is to hold.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an older file of that name is then untouched.
+    """
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
 
 
 @dataclass(frozen=True, repr=False)
 class KeptArrays:
     """Arrays and plain numbers that were made of one design; a kind of record is a subclass with its fields.
+
+    An array is declared with its axes, `Annotated[FloatArray, "loads", 2]`: a number is the length, and a
+    name means one length in all arrays, which `_lengths` or else the first array with that axis tells.
 
     Class attributes
     ----------------
@@ -25,8 +141,6 @@ class KeptArrays:
         What it is, with its article, for sentences.
     layout : (str, int) or None
         Name and value of the entry of the file that tells the version of its layout.
-    kinds : mapping of str to type
-        Types of the arrays that are not of float64.
 
     Attributes
     ----------
@@ -36,23 +150,27 @@ class KeptArrays:
 
     what: ClassVar[str]
     layout: ClassVar[tuple[str, int] | None] = None
-    kinds: ClassVar[Mapping[str, type[Any]]] = {}
 
     design_hash: str
 
     def __post_init__(self) -> None:
-        for name, expected in self._expected_shapes().items():
-            array = getattr(self, name)
-            kind = self.kinds.get(name, np.float64)
+        lengths = self._lengths()
+        for item in fields(self):
+            axes: tuple[str | int, ...] = getattr(item.type, "__metadata__", ())
+            if not axes:
+                continue
+            array, (kind,) = getattr(self, item.name), get_args(get_args(get_args(item.type)[0])[1])
+            lengths = {**dict(zip(axes, array.shape, strict=False)), **lengths}
+            expected = tuple(axis if isinstance(axis, int) else lengths.get(axis, 0) for axis in axes)
             if array.shape != expected or array.dtype != kind or not np.isfinite(array).all():
                 raise ReducedModelFileError(
-                    f"The array {name} of {self.what} must hold finite numbers in the shape {expected}, but "
-                    f"it has shape {array.shape} and type {array.dtype}; build it anew."
+                    f"The array {item.name} of {self.what} must hold finite numbers in the shape "
+                    f"{expected}, but it has shape {array.shape} and type {array.dtype}; build it anew."
                 )
 
-    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the shape that each array must have."""
-        raise NotImplementedError
+    def _lengths(self) -> dict[str | int, int]:
+        """Return the lengths of axes that follow from others or from names."""
+        return {}
 
     def to_bytes(self) -> bytes:
         """Return the bytes of an `.npz` file; equal records give equal bytes."""

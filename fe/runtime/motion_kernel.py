@@ -14,12 +14,11 @@ into the FMU. `discrepancy.models.compiled_motion` has the same compiled.
 
 import numpy as np
 
-from .flexible_ports import begin_flexible, carry_flexible, carry_lone
+from .flexible_ports import begin_flexible, carry_flexible, pull_of
 from .laws import (
     advance,
     crossing,
     dry,
-    force,
     holding_limit,
     holds,
     kick,
@@ -72,7 +71,6 @@ def follow(
     find_routes(ports, acting)
     begin_on_modes(linear, ports, acting, state, course.known)
     begin_flexible(ports, acting, state, course)
-    lone = len(ports.numbers) == 1 and acting.route[0] == FLEXIBLE
     driven = False
     for sample in range(len(course.load)):
         driven = driven or course.load[sample] != 0.0
@@ -85,10 +83,7 @@ def follow(
             first_half(linear, ports, acting, state, before, time, h)
             move(linear, state, before.room, load_begin, load_end, driven)
             hold(ports, acting, state, before, h)
-            if lone:
-                carry_lone(ports, state, load_end, h)
-            else:
-                carry_flexible(ports, acting, state, load_end, h)
+            carry_flexible(ports, acting, state, load_end, h)
             second_half(linear, ports, acting, state, before, time, h, load_begin, load_end)
         time = course.start + sample * substeps * h
         record(linear, ports, acting, state, course.load[sample], time, sample, out)
@@ -152,7 +147,7 @@ def begin_on_modes(linear: Linear, ports: Ports, acting: Acting, state: State, k
                 state.memory[j, 1] = x
         else:
             advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, FIRST_PARTS)
-            state.current[j] = force(ports.numbers[j], ports.values[j], state.memory[j], x)
+            state.current[j], _ = pull_of(ports, state, j, x, 1.0, 1)
 
 
 def first_half(
@@ -251,7 +246,7 @@ def second_half(
             continue
         x = at_port(ports.rows, j, state.q)
         advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, 1)
-        state.current[j] = force(ports.numbers[j], ports.values[j], state.memory[j], x)
+        state.current[j], _ = pull_of(ports, state, j, x, 1.0, 1)
         for m in range(modes):
             state.v[m] -= ports.acts[j, m] * state.current[j] * half
     if linear.rate != 0.0:

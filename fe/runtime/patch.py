@@ -6,12 +6,12 @@ primitives; which physical effect a set of them stands for is not known here (`d
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from .errors import InvalidPatchError
+from .expression import Expression
 from .laws import LAWS
 from .laws.bouc_wen import BoucWen as BoucWen
 from .laws.free_play import FreePlay as FreePlay
@@ -23,21 +23,18 @@ from .laws.power_stiffness import PowerStiffness as PowerStiffness
 from .laws.sine_force import SineForce as SineForce
 from .primitive import Primitive as Primitive
 from .primitive import Window as Window
-from .sensor_primitives import CHANNEL_UNIT as CHANNEL_UNIT
-from .sensor_primitives import EVERY_CHANNEL as EVERY_CHANNEL
-from .sensor_primitives import PER_RELEASE as PER_RELEASE
-from .sensor_primitives import ChannelOffset as ChannelOffset
-from .sensor_primitives import Clock as Clock
-from .sensor_primitives import DecayingLine as DecayingLine
-from .sensor_primitives import HighPass as HighPass
-from .sensor_primitives import Line as Line
-from .sensor_primitives import LoggerClock as LoggerClock
-from .sensor_primitives import RunOffset as RunOffset
-from .sensor_primitives import SensorDrift as SensorDrift
-from .sensor_primitives import SensorGain as SensorGain
-from .sensor_primitives import SensorRotation as SensorRotation
-from .sensor_primitives import ThermalStrain as ThermalStrain
-from .sensor_primitives import course_of as course_of
+
+EVERY_CHANNEL = "*"
+"""Name that stands for every channel of the primitive's quantity."""
+CHANNEL_UNIT = "channel's unit"
+PER_RELEASE = f"{CHANNEL_UNIT} per release amplitude"
+"""Units of numbers that are shown by a channel."""
+
+
+def course_of(text: str, kind: str) -> Expression:
+    """Return a formula in `time`; raises `InvalidPatchError`."""
+    return Expression(text, ("time", "pi"), f"The formula of the primitive {kind!r}")
+
 
 # ---------------------------------------------------------------- mass and stiffness
 
@@ -46,7 +43,6 @@ from .sensor_primitives import course_of as course_of
 class PointMass(Primitive):
     """A mass [kg] on the elastic line at `station` [m] from the root (lumped model: at a named place)."""
 
-    kind: ClassVar[str] = "point_mass"
     units: ClassVar[dict[str, str]] = {"mass": "kg", "station": "m"}
     mass: float
     station: float
@@ -56,7 +52,6 @@ class PointMass(Primitive):
 class RootCompliance(Primitive):
     """A rotational spring in series with the root: `compliance` [rad/(N m)] about the flapping axis."""
 
-    kind: ClassVar[str] = "root_compliance"
     units: ClassVar[dict[str, str]] = {"compliance": "rad/(N m)"}
     compliance: float
 
@@ -65,7 +60,6 @@ class RootCompliance(Primitive):
 class LocalStiffnessLoss(Primitive):
     """The skin between `start` and `start + length` [m] from the root keeps 1 - `loss` of its stiffness."""
 
-    kind: ClassVar[str] = "local_stiffness_loss"
     units: ClassVar[dict[str, str]] = {"loss": "1", "start": "m", "length": "m"}
     loss: float
     start: float
@@ -76,7 +70,6 @@ class LocalStiffnessLoss(Primitive):
 class ModulusTemperature(Primitive):
     """Young's modulus falls with temperature: E (1 - `coefficient` (T - T_ref)), `coefficient` [1/K]."""
 
-    kind: ClassVar[str] = "modulus_temperature"
     units: ClassVar[dict[str, str]] = {"coefficient": "1/K"}
     coefficient: float
 
@@ -85,7 +78,6 @@ class ModulusTemperature(Primitive):
 class StiffnessDrift(Primitive):
     """The whole stiffness changes with time within a record: K (1 + `rate` t), `rate` [1/s]."""
 
-    kind: ClassVar[str] = "stiffness_drift"
     units: ClassVar[dict[str, str]] = {"rate": "1/s"}
     rate: float
 
@@ -106,7 +98,6 @@ class StiffnessDrift(Primitive):
 class LoadPlace(Primitive):
     """Applied forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
 
-    kind: ClassVar[str] = "load_place"
     units: ClassVar[dict[str, str]] = {"along_span": "m", "along_chord": "m"}
     along_span: float
     along_chord: float
@@ -116,7 +107,6 @@ class LoadPlace(Primitive):
 class LoadGain(Primitive):
     """The force that acts is (1 + `gain`) times the recorded one plus `tare` [N], while one is applied."""
 
-    kind: ClassVar[str] = "load_gain"
     units: ClassVar[dict[str, str]] = {"gain": "1", "tare": "N"}
     gain: float
     tare: float
@@ -126,7 +116,6 @@ class LoadGain(Primitive):
 class Washout(Primitive):
     """Lift in flight is l (1 - `coefficient` n eta^`exponent`), eta = y / semi-span, n the load factor."""
 
-    kind: ClassVar[str] = "washout"
     units: ClassVar[dict[str, str]] = {"coefficient": "1", "exponent": "1"}
     coefficient: float
     exponent: float
@@ -136,7 +125,6 @@ class Washout(Primitive):
 class InertiaRelief(Primitive):
     """In flight the structure's weight times n relieves the lift by this `fraction` more than modelled."""
 
-    kind: ClassVar[str] = "inertia_relief"
     units: ClassVar[dict[str, str]] = {"fraction": "1"}
     fraction: float
 
@@ -145,7 +133,6 @@ class InertiaRelief(Primitive):
 class PortLoad(Primitive):
     """A force [N or N m] that pushes a port along its motion, a formula in `time` [s] of the trial."""
 
-    kind: ClassVar[str] = "port_load"
     in_windows: ClassVar[bool] = True
     courses: ClassVar[tuple[str, ...]] = ("force",)
     port: str
@@ -156,16 +143,148 @@ class PortLoad(Primitive):
         course_of(self.force, self.kind)
 
 
-_EVERY: tuple[type[Primitive], ...] = (
-    PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature, StiffnessDrift,
-    *LAWS,
-    LoadPlace, LoadGain, Washout, InertiaRelief, PortLoad,
-    SensorGain, SensorDrift, ChannelOffset, SensorRotation, ThermalStrain, HighPass, Clock, LoggerClock, Line,
-    DecayingLine,
-    RunOffset,
-)  # fmt: skip
-PRIMITIVES: dict[str, type[Primitive]] = {primitive.kind: primitive for primitive in _EVERY}
-"""Every primitive by its kind."""
+# ---------------------------------------------------------------- what is read
+#
+# `channel` is a channel's name, or `EVERY_CHANNEL` for all of `quantity` ("" for all quantities).
+
+
+@dataclass(frozen=True, slots=True)
+class SensorGain(Primitive):
+    """A channel shows (1 + `gain`) times what it should."""
+
+    in_windows: ClassVar[bool] = True
+    units: ClassVar[dict[str, str]] = {"gain": "1"}
+    channel: str
+    gain: float
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorDrift(Primitive):
+    """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
+
+    in_windows: ClassVar[bool] = True
+    units: ClassVar[dict[str, str]] = {"amplitude": CHANNEL_UNIT, "time": "s", "exponent": "1"}
+    channel: str
+    amplitude: float
+    time: float
+    exponent: float = 1.0
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelOffset(Primitive):
+    """A channel shows `offset` more, a formula in `time` [s] of the trial, in the channel's unit."""
+
+    in_windows: ClassVar[bool] = True
+    courses: ClassVar[tuple[str, ...]] = ("offset",)
+    channel: str
+    offset: str
+    quantity: str = ""
+
+    def __post_init__(self) -> None:
+        super(ChannelOffset, self).__post_init__()
+        course_of(self.offset, self.kind)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorRotation(Primitive):
+    """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
+
+    units: ClassVar[dict[str, str]] = {"angle": "rad"}
+    channel: str
+    angle: float
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalStrain(Primitive):
+    """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
+
+    in_windows: ClassVar[bool] = True
+    units: ClassVar[dict[str, str]] = {"coefficient": "1/K"}
+    channel: str
+    coefficient: float
+
+
+@dataclass(frozen=True, slots=True)
+class HighPass(Primitive):
+    """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s].
+
+    They had settled at the value before the record's first sample.
+    """
+
+    units: ClassVar[dict[str, str]] = {"time_constant": "s", "order": "1"}
+    channel: str
+    time_constant: float
+    order: float = 1.0
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Clock(Primitive):
+    """A sample that is stamped t was taken at (1 + `rate`) t + `zero` [s]."""
+
+    units: ClassVar[dict[str, str]] = {"rate": "1", "zero": "s"}
+    rate: float
+    zero: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoggerClock(Primitive):
+    """The clock of a logger: what it stamps t, readings and recorded inputs alike, was at (1 + `rate`) t.
+
+    `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records everything.
+    """
+
+    units: ClassVar[dict[str, str]] = {"rate": "1"}
+    logger: str
+    rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class Line(Primitive):
+    """A line at `frequency` [Hz] is added: cosine cos + sine sin (2 pi f t), t since the trial's start.
+
+    Amplitudes in the channel's unit. It is in the noise record too.
+    """
+
+    in_windows: ClassVar[bool] = True
+    units: ClassVar[dict[str, str]] = {"frequency": "Hz", "cosine": CHANNEL_UNIT, "sine": CHANNEL_UNIT}
+    channel: str
+    frequency: float
+    cosine: float
+    sine: float
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DecayingLine(Primitive):
+    """A mode that the model does not have, e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), in ring-downs.
+
+    t since the trial's start; amplitudes in the channel's unit per unit of the trial's release amplitude.
+    """
+
+    units: ClassVar[dict[str, str]] = {
+        "frequency": "Hz", "damping_ratio": "1", "cosine": PER_RELEASE, "sine": PER_RELEASE
+    }  # fmt: skip
+    channel: str
+    frequency: float
+    damping_ratio: float
+    cosine: float
+    sine: float
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RunOffset(Primitive):
+    """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
+
+    units: ClassVar[dict[str, str]] = {"offset": CHANNEL_UNIT}
+    run: str
+    offset: float
+    channel: str = EVERY_CHANNEL
+    quantity: str = "displacement"
+
 
 STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)
 """Primitives that change the linear structure: it is solved anew."""
@@ -174,19 +293,13 @@ INTERNAL_FORCES = (*LAWS, StiffnessDrift)
 LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)
 """Primitives that change the loads that are known."""
 SENSORS = (
-    SensorGain,
-    SensorDrift,
-    ChannelOffset,
-    SensorRotation,
-    ThermalStrain,
-    HighPass,
-    Clock,
-    LoggerClock,
-    Line,
-    DecayingLine,
-    RunOffset,
-)
+    SensorGain, SensorDrift, ChannelOffset, SensorRotation, ThermalStrain, HighPass, Clock, LoggerClock, Line,
+    DecayingLine, RunOffset,
+)  # fmt: skip
 """Primitives that change what is read, not what happens."""
+_EVERY: tuple[type[Primitive], ...] = (*STRUCTURE, StiffnessDrift, *LAWS, *LOADS, PortLoad, *SENSORS)
+PRIMITIVES = {primitive.kind: primitive for primitive in _EVERY}
+"""Every primitive by its kind."""
 
 
 @dataclass(frozen=True)
@@ -257,19 +370,6 @@ class ModelPatch:
         if not isinstance(rows, list):
             raise InvalidPatchError(f"{where} must be a list of primitives, but is a {type(rows).__name__}.")
         return cls(tuple(_primitive(row, f"{where}, primitive {n}") for n, row in enumerate(rows, start=1)))
-
-    def to_json(self) -> str:
-        """Return the patch as JSON; floats keep every bit."""
-        return json.dumps(self.to_list(), allow_nan=False)
-
-    @classmethod
-    def from_json(cls, text: str, where: str = "The patch") -> "ModelPatch":
-        """Return the patch of a JSON text; raises `InvalidPatchError`."""
-        try:
-            rows = json.loads(text)
-        except json.JSONDecodeError as cause:
-            raise InvalidPatchError(f"{where} is not JSON ({cause}).") from cause
-        return cls.from_list(rows, where)
 
 
 def _primitive(row: object, where: str) -> Primitive:

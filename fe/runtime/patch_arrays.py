@@ -6,7 +6,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 from dataclasses import dataclass
 from math import inf, isfinite
 from sys import float_info
-from typing import ClassVar
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -90,38 +90,37 @@ class PatchArrays(RegionArrays):
 
     what = "a wing for patches"
     layout = ("patch_format", 2)
-    kinds: ClassVar = {"strip_stiffness": np.float32, "strip_of": np.int64, "term_of": np.int64}
 
-    validity_box: FloatArray
+    validity_box: Annotated[FloatArray, "chosen", 2]
     largest_loss: float
     largest_compliance: float
     largest_mass: float
-    stiffness: FloatArray
-    mass: FloatArray
-    strip_lines: FloatArray
-    strip_stiffness: npt.NDArray[np.float32]
-    strip_of: npt.NDArray[np.int64]
-    term_of: npt.NDArray[np.int64]
-    flap_row: FloatArray
+    stiffness: Annotated[FloatArray, "terms", "basis", "basis"]
+    mass: Annotated[FloatArray, 3, "basis", "basis"]
+    strip_lines: Annotated[FloatArray, "lines"]
+    strip_stiffness: Annotated[npt.NDArray[np.float32], "parts", "triangle"]
+    strip_of: Annotated[npt.NDArray[np.int64], "parts"]
+    term_of: Annotated[npt.NDArray[np.int64], "parts"]
+    flap_row: Annotated[FloatArray, "basis"]
     flap_spring: float
     semi_span: float
     root_chord: float
     tip_chord: float
     straight_chord_line: float
     load_place: float
-    stations: FloatArray
-    line_chord: FloatArray
-    line_rows: FloatArray
-    station_weights: FloatArray
-    load_tip: FloatArray
-    load_lift: FloatArray
-    lift_rows: FloatArray
-    weight: FloatArray
-    strain_rows: FloatArray
-    gauge_stations: FloatArray
+    stations: Annotated[FloatArray, "stations"]
+    line_chord: Annotated[FloatArray, "chords"]
+    line_rows: Annotated[FloatArray, "directions", "stations", "basis"]
+    station_weights: Annotated[FloatArray, "stations"]
+    load_tip: Annotated[FloatArray, "basis"]
+    load_lift: Annotated[FloatArray, "basis"]
+    lift_rows: Annotated[FloatArray, "stations", "basis"]
+    weight: Annotated[FloatArray, "basis"]
+    strain_rows: Annotated[FloatArray, 3, "gauges", "basis"]
+    gauge_stations: Annotated[FloatArray, "gauges"]
     gauge_length: float
-    tip_row: FloatArray
-    start_shapes: FloatArray
+    tip_row: Annotated[FloatArray, "basis"]
+    start_shapes: Annotated[FloatArray, "basis", "started"]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -150,29 +149,15 @@ class PatchArrays(RegionArrays):
                 "The stations of a wing for patches must rise from the root to the tip; build it anew."
             )
 
-    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
-        n, p, t = self.stiffness.shape[-1], len(self.stations), len(self.strip_of)
+    def _lengths(self) -> dict[str | int, int]:
+        size, chords = self.stiffness.shape[-1], len(self.line_chord)
         return {
-            "validity_box": (len(wing_names(self.regions)), 2),
-            "stiffness": (len(self.regions) + 2, n, n),
-            "mass": (3, n, n),
-            "strip_lines": (len(self.strip_lines),),
-            "strip_stiffness": (t, n * (n + 1) // 2),
-            "strip_of": (t,),
-            "term_of": (t,),
-            "flap_row": (n,),
-            "stations": (p,),
-            "line_chord": (max(len(self.line_chord), 2),),
-            "line_rows": (len(self.line_chord) + 2, p, n),
-            "station_weights": (p,),
-            "load_tip": (n,),
-            "load_lift": (n,),
-            "lift_rows": (p, n),
-            "weight": (n,),
-            "strain_rows": (3, self.strain_rows.shape[1], n),
-            "gauge_stations": (self.strain_rows.shape[1],),
-            "tip_row": (n,),
-            "start_shapes": (n, self.start_shapes.shape[-1]),
+            "chosen": len(wing_names(self.regions)),
+            "terms": len(self.regions) + 2,
+            "triangle": size * (size + 1) // 2,
+            "parts": len(self.strip_of),
+            "chords": max(chords, 2),
+            "directions": chords + 2,
         }
 
     def __repr__(self) -> str:

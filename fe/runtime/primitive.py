@@ -3,6 +3,7 @@
 Standard library and relative imports only: this file is copied into the FMU.
 """
 
+import re
 from dataclasses import asdict, dataclass, field, fields
 from math import inf, isfinite
 from typing import Any, ClassVar, NamedTuple
@@ -30,7 +31,8 @@ class Primitive:
     With `windows` it acts within these only, and in no trial that they do not name; without, always.
     """
 
-    kind: ClassVar[str] = ""
+    kind: ClassVar[str]
+    """Name of the class in a file: its own name in lower case, words apart by underscores."""
     units: ClassVar[dict[str, str]] = {}
     """Unit of each real number; at a port, "of one that is displaced or one that turns"."""
     in_windows: ClassVar[bool] = False
@@ -39,6 +41,9 @@ class Primitive:
     """Which of its texts are formulas in `time`."""
 
     windows: tuple[Window, ...] = field(default=(), kw_only=True)
+
+    def __init_subclass__(cls) -> None:
+        cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
     def __post_init__(self) -> None:
         if self.windows and not self.in_windows:

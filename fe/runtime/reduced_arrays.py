@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
-from typing import Any, ClassVar
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,11 @@ MOST_ANCHORS = 16
 """Largest number of approximate dual solutions of a reduced model."""
 
 
+def _words(key: str) -> "cached_property[tuple[str, ...]]":
+    """Declare the names that a text of a record holds, parted by spaces."""
+    return cached_property(lambda arrays: tuple(getattr(arrays, key).split()))
+
+
 @dataclass(frozen=True, repr=False)
 class RegionArrays(KeptArrays):
     """Arrays of a structure with K damage regions, 1 to 8.
@@ -29,15 +34,13 @@ class RegionArrays(KeptArrays):
     Attributes
     ----------
     region_names : str
-        Names of the damage regions in the order of their stiffness terms, parted by spaces.
+        Names of the damage regions in the order of their stiffness terms, parted by spaces; `regions` parts
+        them.
     """
 
     region_names: str
 
-    @cached_property
-    def regions(self) -> tuple[str, ...]:
-        """Names of the K damage regions."""
-        return tuple(self.region_names.split())
+    regions = _words("region_names")
 
     def losses(self, stiffness_loss: Mapping[str, float] | Iterable[float]) -> Losses:
         """Return one stiffness loss for each region, in their order; see `fe.runtime.state.losses_of`."""
@@ -68,11 +71,12 @@ class ReducedArrays(RegionArrays):
     name : str
         Of the structure.
     parameter_names, mass_names, control_names : str
-        Parted by spaces; each may be empty.
+        Parted by spaces; each may be empty. `parameters`, `masses` and `controls` part them.
     control_units : str
         Unit of each control, parted by spaces.
     gauge_names, displacement_names, acceleration_names : str
-        Names of the outputs, parted by spaces; each may be empty.
+        Names of the outputs, parted by spaces; each may be empty. `gauges`, `displacements` and
+        `accelerations` part them.
     nominal : (V,) ndarray
         Nominal value of all that can be chosen; zero for the losses.
     damping : (2,) ndarray
@@ -133,11 +137,12 @@ class ReducedArrays(RegionArrays):
 
     what = "a reduced model"
     layout = ("format", 4)
-    kinds: ClassVar[Mapping[str, type[Any]]] = {
-        "dual_counts": np.int64,
-        "stiffness_factors": np.int64,
-        "load_factors": np.int64,
-    }
+    parameters = _words("parameter_names")
+    masses = _words("mass_names")
+    controls = _words("control_names")
+    gauges = _words("gauge_names")
+    displacements = _words("displacement_names")
+    accelerations = _words("acceleration_names")
 
     name: str
     parameter_names: str
@@ -147,32 +152,32 @@ class ReducedArrays(RegionArrays):
     gauge_names: str
     displacement_names: str
     acceleration_names: str
-    nominal: FloatArray
-    damping: FloatArray
-    stiffness_factors: npt.NDArray[np.int64]
-    load_factors: npt.NDArray[np.int64]
+    nominal: Annotated[FloatArray, "chosen"]
+    damping: Annotated[FloatArray, 2]
+    stiffness_factors: Annotated[npt.NDArray[np.int64], "terms", 2]
+    load_factors: Annotated[npt.NDArray[np.int64], "loads", 2]
     mode_count: int
-    followed_shapes: FloatArray
-    validity_box: FloatArray
-    static_stiffness: FloatArray
-    static_load: FloatArray
-    static_output: FloatArray
-    bound_reference: FloatArray
-    residual_load: FloatArray
-    residual_stiffness: FloatArray
+    followed_shapes: Annotated[FloatArray, "followed", "modal"]
+    validity_box: Annotated[FloatArray, "chosen", 2]
+    static_stiffness: Annotated[FloatArray, "terms", "static", "static"]
+    static_load: Annotated[FloatArray, "loads", "static"]
+    static_output: Annotated[FloatArray, "outputs", "static"]
+    bound_reference: Annotated[FloatArray, "varied terms"]
+    residual_load: Annotated[FloatArray, "residual", "loads"]
+    residual_stiffness: Annotated[FloatArray, "residual", "terms", "static"]
     residual_allowance: float
     rounding_allowance: float
-    dual_counts: npt.NDArray[np.int64]
-    dual_split: FloatArray
-    dual_correction: FloatArray
-    dual_residual: FloatArray
-    dual_stiffness: FloatArray
-    dual_output: FloatArray
-    modal_stiffness: FloatArray
-    modal_mass: FloatArray
-    modal_load: FloatArray
-    modal_output: FloatArray
-    cross_mass: FloatArray
+    dual_counts: Annotated[npt.NDArray[np.int64], "regions"]
+    dual_split: Annotated[FloatArray, "splits"]
+    dual_correction: Annotated[FloatArray, "duals", "outputs", "residual"]
+    dual_residual: Annotated[FloatArray, "anchors", "outputs", "dual rows", "dual columns"]
+    dual_stiffness: Annotated[FloatArray, "outputs", "terms", "functions", "functions"]
+    dual_output: Annotated[FloatArray, "outputs", "functions"]
+    modal_stiffness: Annotated[FloatArray, "terms", "modal", "modal"]
+    modal_mass: Annotated[FloatArray, "masses", "modal", "modal"]
+    modal_load: Annotated[FloatArray, "loads", "modal"]
+    modal_output: Annotated[FloatArray, "all outputs", "modal"]
+    cross_mass: Annotated[FloatArray, "masses", "modal", "static"]
 
     def __post_init__(self) -> None:
         counts = self.dual_counts
@@ -212,36 +217,6 @@ class ReducedArrays(RegionArrays):
             )
 
     @cached_property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return tuple(self.parameter_names.split())
-
-    @cached_property
-    def masses(self) -> tuple[str, ...]:
-        """Names of the free masses."""
-        return tuple(self.mass_names.split())
-
-    @cached_property
-    def controls(self) -> tuple[str, ...]:
-        """Names of the controls."""
-        return tuple(self.control_names.split())
-
-    @cached_property
-    def gauges(self) -> tuple[str, ...]:
-        """Names of the gauges."""
-        return tuple(self.gauge_names.split())
-
-    @cached_property
-    def displacements(self) -> tuple[str, ...]:
-        """Names of the displacement outputs."""
-        return tuple(self.displacement_names.split())
-
-    @cached_property
-    def accelerations(self) -> tuple[str, ...]:
-        """Names of the acceleration outputs."""
-        return tuple(self.acceleration_names.split())
-
-    @cached_property
     def chosen(self) -> tuple[str, ...]:
         """Names of all that can be chosen: the rows of `validity_box`."""
         return (*self.parameters, *self.regions, *self.masses, *self.controls)
@@ -251,36 +226,23 @@ class ReducedArrays(RegionArrays):
         """Number O' of gauges and displacements."""
         return len(self.gauges) + len(self.displacements)
 
-    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
-        n, m, r = self.static_stiffness.shape[-1], self.modal_stiffness.shape[-1], self.residual_load.shape[0]
-        k, chosen, outputs = len(self.regions), len(self.chosen), self.static_count
-        terms, loads, masses = len(self.stiffness_factors), len(self.load_factors), len(self.masses)
-        anchors = int(self.dual_counts.prod())
-        functions, factor = self.dual_output.shape[-1], (terms, terms)
-        if functions:
-            factor = (self.dual_residual.shape[-2], 1 + terms * functions)
+    def _lengths(self) -> dict[str | int, int]:
+        terms, masses, regions = len(self.stiffness_factors), len(self.masses), len(self.regions)
+        anchors, functions = int(self.dual_counts.prod()), self.dual_output.shape[-1]
+        factor = (self.dual_residual.shape[-2], 1 + terms * functions) if functions else (terms, terms)
         return {
-            "nominal": (chosen,),
-            "damping": (2,),
-            "stiffness_factors": (terms, 2),
-            "load_factors": (loads, 2),
-            "followed_shapes": (len(self.followed_shapes), m),
-            "validity_box": (chosen, 2),
-            "static_stiffness": (terms, n, n),
-            "static_load": (loads, n),
-            "static_output": (outputs, n),
-            "bound_reference": (terms - 1,),
-            "residual_load": (r, loads),
-            "residual_stiffness": (r, terms, n),
-            "dual_counts": (k,),
-            "dual_split": (int(self.dual_counts.sum()) - k,),
-            "dual_correction": (functions or anchors, outputs, r),
-            "dual_residual": (anchors, outputs, *factor),
-            "dual_stiffness": (outputs, terms, functions, functions),
-            "dual_output": (outputs, functions),
-            "modal_stiffness": (terms, m, m),
-            "modal_mass": (1 + masses, m, m),
-            "modal_load": (loads, m),
-            "modal_output": (outputs + len(self.accelerations), m),
-            "cross_mass": (1 + masses, m, n),
+            "chosen": len(self.chosen),
+            "terms": terms,
+            "varied terms": terms - 1,
+            "static": self.static_stiffness.shape[-1],
+            "modal": self.modal_stiffness.shape[-1],
+            "outputs": self.static_count,
+            "all outputs": self.static_count + len(self.accelerations),
+            "regions": regions,
+            "splits": int(self.dual_counts.sum()) - regions,
+            "anchors": anchors,
+            "duals": functions or anchors,
+            "functions": functions,
+            **dict(zip(("dual rows", "dual columns"), factor, strict=True)),
+            "masses": 1 + masses,
         }

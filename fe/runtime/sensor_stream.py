@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InvalidPatchError
-from .patch import EVERY_CHANNEL, SENSORS, Clock, HighPass, LoggerClock, ModelPatch, SensorRotation
-from .sensors import SensorRecord, apply_sensors
+from .patch import SENSORS, Clock, HighPass, LoggerClock, ModelPatch, SensorRotation
+from .sensors import SensorRecord, apply_sensors, columns_of
 
 FloatArray = NDArray[np.float64]
 
@@ -88,17 +88,6 @@ class SensorStream:
                     f"{LARGEST_ORDER} stages, but {item} was given."
                 )
 
-    @property
-    def memory_size(self) -> int:
-        """Number of values that are remembered."""
-        if not self.dynamic:
-            return 0
-        return sum(
-            (1 + int(item.order)) * len(self._columns(item))
-            for item in self.patch
-            if isinstance(item, HighPass)
-        )
-
     def read(
         self, sample: Sample, memory: Sequence[float] | None, duration: float
     ) -> tuple[FloatArray, list[float]]:
@@ -121,15 +110,13 @@ class SensorStream:
         values = sample.values
         after: list[float] = []
         pending = [] if memory is None else list(memory)
-        rotations = tuple(item for item in self.patch if isinstance(item, SensorRotation))
-        if rotations:
-            values = self._apply(rotations, values, sample)
-        others = [
+        active = [
             item
             for item in self.patch
-            if isinstance(item, SENSORS) and not isinstance(item, SensorRotation | Clock | LoggerClock)
+            if isinstance(item, SENSORS) and not isinstance(item, Clock | LoggerClock)
         ]
-        for filtered, group in groupby(others, lambda item: isinstance(item, HighPass)):
+        active.sort(key=lambda item: not isinstance(item, SensorRotation))
+        for filtered, group in groupby(active, lambda item: isinstance(item, HighPass)):
             if not filtered:
                 values = self._apply(tuple(group), values, sample)
                 continue
@@ -154,11 +141,6 @@ class SensorStream:
         shown, _ = apply_sensors(ModelPatch(items), record, values[np.newaxis], None, *across)
         return np.asarray(shown[0])
 
-    def _columns(self, item: HighPass) -> list[int]:
-        if item.channel != EVERY_CHANNEL:
-            return [index for index, (name, _) in enumerate(self.channels) if name == item.channel]
-        return [index for index, (_, own) in enumerate(self.channels) if item.quantity in ("", own)]
-
     def _filter(
         self,
         item: HighPass,
@@ -169,7 +151,7 @@ class SensorStream:
     ) -> FloatArray:
         """Filter the columns of one primitive; take their memory from `pending` and append it to `after`."""
         order, shown = int(item.order), values.copy()
-        for column in self._columns(item):
+        for column in columns_of(item, self.channels):
             signal = float(values[column])
             states = np.zeros(order)
             if pending is not None:

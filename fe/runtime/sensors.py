@@ -161,7 +161,7 @@ def apply_sensors(
     rates = None if rates is None else np.array(rates, dtype=np.float64)
     _rotate(active, record, values, rates, transverse, shear)
     for item in active:
-        columns = _columns(item, record)
+        columns = columns_of(item, record.channels)
         if columns.size and not isinstance(item, SensorRotation):
             before = (values.copy(), None if rates is None else rates.copy()) if item.windows else None
             _apply(item, record, columns, values, rates)
@@ -186,16 +186,16 @@ def _outside_as_before(
         rates[outside] = before[1][outside]
 
 
-def _columns(item: Primitive, record: SensorRecord) -> NDArray[np.intp]:
+def columns_of(item: Primitive, channels: Sequence[tuple[str, str]]) -> NDArray[np.intp]:
     """Return the columns that a primitive acts on; a named channel is meant whatever its quantity."""
     name = getattr(item, "channel", EVERY_CHANNEL)
     if name != EVERY_CHANNEL:
-        chosen = [index for index, (channel, _) in enumerate(record.channels) if channel == name]
+        chosen = [index for index, (channel, _) in enumerate(channels) if channel == name]
     else:
         quantity = (
             STRAIN if isinstance(item, SensorRotation | ThermalStrain) else str(getattr(item, "quantity", ""))
         )
-        chosen = [index for index, (_, own) in enumerate(record.channels) if quantity in ("", own)]
+        chosen = [index for index, (_, own) in enumerate(channels) if quantity in ("", own)]
     return np.array(chosen, dtype=np.intp)
 
 
@@ -211,7 +211,7 @@ def _rotate(
     angles = np.zeros(len(record.channels))
     for item in active:
         if isinstance(item, SensorRotation):
-            angles[_columns(item, record)] += item.angle
+            angles[columns_of(item, record.channels)] += item.angle
     turned = np.flatnonzero(angles)
     if not turned.size:
         return

@@ -6,33 +6,37 @@ into the FMU.
 
 import numpy as np
 
-from .laws import advance, force, parts, slope
+from .laws import advance, parts, pull
 from .motion_arrays import FloatArray, IntArray, Ports, Unnamed
 
 
 def static_forces(
     x: FloatArray, ports: Ports, memory: FloatArray, least: IntArray, forces: FloatArray, slopes: FloatArray
-) -> FloatArray:
-    """Return the memory at positions `x` (J,) reached from `memory`; `forces` and `slopes` (J,) are filled.
+) -> None:
+    """Fill `forces` and `slopes` (J,) at positions `x` (J,) reached from `memory`, which stays as it is.
 
     `least` (J,) is the least number of parts in which a hysteretic law follows the way; laws of speed are
     zero at rest.
     """
-    reached = memory.copy()
     for j in range(len(x)):
         forces[j] = 0.0
         slopes[j] = 0.0
         if ports.of_speed[j] == 0:
             number, values, elements = ports.numbers[j], ports.values[j], ports.elements[j]
-            advance(number, values, elements, reached[j], x[j], least[j])
-            forces[j] = force(number, values, reached[j], x[j])
-            reached[j, 1] = memory[j, 1]  # loading or unloading is seen from where the way began
-            slopes[j] = slope(number, values, elements, reached[j], x[j])
-        reached[j, 1] = x[j]
-        reached[j, 2] = forces[j]
-        reached[j, 3] = 0.0
-        reached[j, 4] = 0.0
-    return reached
+            forces[j], slopes[j] = pull(number, values, elements, memory[j], x[j], 1.0, least[j])
+
+
+def arrive_at_rest(
+    x: FloatArray, ports: Ports, memory: FloatArray, least: IntArray, forces: FloatArray
+) -> None:
+    """Carry the memory to positions `x` (J,) where the laws rest with `forces` (J,)."""
+    for j in range(len(x)):
+        if ports.of_speed[j] == 0:
+            advance(ports.numbers[j], ports.values[j], ports.elements[j], memory[j], x[j], least[j])
+        memory[j, 1] = x[j]
+        memory[j, 2] = forces[j]
+        memory[j, 3] = 0.0
+        memory[j, 4] = 0.0
 
 
 def static_path(
@@ -78,7 +82,7 @@ def static_path(
             for j in range(count):  # fixed during the iteration, so that the force is a smooth function
                 least[j] = parts(ports.numbers[j], ports.values[j], abs(goal[j] - x[j]))
             guess = x.copy()
-            reached = static_forces(guess, ports, memory, least, own, gradient)
+            static_forces(guess, ports, memory, least, own, gradient)
             residual = guess + compliance @ own - goal
             size = np.max(np.abs(residual))
             found = size <= 1e-12 * scale
@@ -93,7 +97,7 @@ def static_path(
                 better = False
                 for _ in range(12):
                     candidate = guess - fraction * move
-                    trial = static_forces(candidate, ports, memory, least, trial_force, trial_slope)
+                    static_forces(candidate, ports, memory, least, trial_force, trial_slope)
                     trial_residual = candidate + compliance @ trial_force - goal
                     trial_size = np.max(np.abs(trial_residual))
                     if trial_size < size:
@@ -102,7 +106,7 @@ def static_path(
                     fraction *= 0.5
                 if not better:
                     break
-                guess, reached, residual, size = candidate, trial, trial_residual, trial_size
+                guess, residual, size = candidate, trial_residual, trial_size
                 own[:] = trial_force
                 gradient[:] = trial_slope
                 found = size <= 1e-12 * scale
@@ -113,7 +117,7 @@ def static_path(
                 found = False
             if found:
                 x[:] = guess
-                memory[:] = reached
+                arrive_at_rest(guess, ports, memory, least, own)
                 done = min(done + step, 1.0)
                 step *= 2.0
             else:

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from .damping import rayleigh_damping_ratio
 from .errors import InvalidStateError
-from .modal_system import ModalSystem, exact_step
+from .modal_system import ModalSystem, exact_step, rayleigh_damping_ratio
 
 if TYPE_CHECKING:
     from .motion import Laws, ModalMotion
@@ -412,14 +411,6 @@ class ModalIntegrator:
     def point_displacement(self, state: TransientState, point: int) -> float:
         """Return the displacement along the load of a number at its point [m]."""
         return float(self.structure.loads[:, point] @ self.displacement(state))
-
-    def energy(self, state: TransientState) -> float:
-        """Return kinetic plus strain energy of the kept modes about the equilibrium under the load [J].
-
-        It never grows while the load stays.
-        """
-        deviation = self._omega * (state.displacement - self._modal_static @ self._still(state))
-        return float(0.5 * (state.velocity @ state.velocity + deviation @ deviation))
 
     def take_over(self, state: TransientState, before: "ModalIntegrator") -> TransientState:
         """Return a state of another integrator in the modes of this one, after a change of health or mass.

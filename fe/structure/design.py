@@ -21,10 +21,94 @@ from reporting.section import checked
 from reporting.toml_file import read_toml
 
 from .matrix_design import MatrixDesign
-from .rosettes import LEAST_SINE, Gauge, Name, Named, Vector, refuse_zero, with_rosettes
-from .tables import MOTIONS, ChosenMass, Commanded, Region, StructureDesign
+from .tables import (
+    MOTIONS,
+    ChosenMass,
+    Commanded,
+    Direction,
+    Given,
+    Name,
+    Named,
+    Region,
+    StructureDesign,
+    Vector,
+)  # fmt: skip
 
 FloatArray = NDArray[np.float64]
+
+LEAST_SINE = 1e-3
+"""Two axes whose angle has a smaller sine do not span a plane."""
+
+
+class Gauge(Named):
+    """Strain gauge on the surface: mean strain along `direction`, positive in tension.
+
+    The mean is over `length` along the direction and `width` across it.
+    """
+
+    point: Vector
+    direction: Direction
+    length: float = Field(default=0.0, ge=0.0)
+    width: float = Field(default=0.0, ge=0.0)
+
+
+class Rosette(Part):
+    """Gauges NAME_a, NAME_b, ... at one point, at `angles` [degrees] from axis 1 towards axis 2.
+
+    Axis 1 is along the first vector of `axes`; axis 2 lies in the plane of both, at right angles to it.
+    """
+
+    name: Annotated[str, Field(max_length=30, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+    point: Vector
+    axes: tuple[Vector, Vector]
+    angles: Annotated[tuple[float, ...], Field(min_length=2, max_length=6)] = (0.0, 45.0, 90.0)
+    length: float = Field(default=0.0, ge=0.0)
+    width: float = Field(default=0.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _spans_a_plane(self) -> "Rosette":
+        first, second = (np.asarray(axis) for axis in self.axes)
+        sizes = float(np.linalg.norm(first) * np.linalg.norm(second))
+        if np.linalg.norm(np.cross(first, second)) <= LEAST_SINE * sizes:
+            raise ValueError("the two axes must point in two directions of the surface")
+        return self
+
+    def gauges(self) -> list[dict[str, Any]]:
+        """Return its gauges as tables of a structure file."""
+        first = np.asarray(self.axes[0]) / np.linalg.norm(self.axes[0])
+        second = np.asarray(self.axes[1]) - (first @ np.asarray(self.axes[1])) * first
+        second /= np.linalg.norm(second)
+        turned = [
+            np.cos(angle) * first + np.sin(angle) * second for angle in np.radians(self.angles).tolist()
+        ]
+        common = {"point": self.point, "length": self.length, "width": self.width}
+        return [
+            {"name": f"{self.name}_{letter}", "direction": tuple(direction.tolist())} | common
+            for letter, direction in zip("abcdef", turned, strict=False)
+        ]
+
+
+def with_rosettes(content: dict[str, Any], source: str, error: type[Exception]) -> dict[str, Any]:
+    """Return the content of a structure file whose rosettes have become gauges, behind its own.
+
+    Raises
+    ------
+    error
+        One sentence that names `source`, the rosette and its fault.
+    """
+    tables = content.get("rosette")
+    if not isinstance(tables, list):
+        return content
+    rosettes = [
+        checked(Rosette, table, f"{source}: rosette[{number}]", error, what="a rosette")
+        for number, table in enumerate(tables, start=1)
+    ]
+    kept = {key: value for key, value in content.items() if key != "rosette"}
+    own = content.get("gauge", [])
+    if not isinstance(own, list):
+        return kept
+    return kept | {"gauge": [*own, *(gauge for rosette in rosettes for gauge in rosette.gauges())]}
+
 
 SetName = Annotated[str, Field(min_length=1, max_length=200)]
 Poisson = Annotated[float, Field(gt=-1.0, lt=0.5)]
@@ -50,7 +134,7 @@ class NamedSet(Part):
         return self
 
 
-class Material(Part):
+class Material(Given):
     """Material of the cells of a set: isotropic, or orthotropic in axes given by two vectors.
 
     An orthotropic material gives three moduli along its axes 1, 2 and 3, Poisson's ratios 12, 13 and 23
@@ -66,24 +150,16 @@ class Material(Part):
     young_moduli: tuple[Modulus, Modulus, Modulus] | None = None
     poisson_ratios: Vector | None = None
     shear_moduli: tuple[Modulus, Modulus, Modulus] | None = None
-    axes: tuple[Vector, Vector] | None = None
+    axes: tuple[Direction, Direction] | None = None
     scaled_by: Name | None = None
+    ways = (
+        ("young_modulus", "poisson_ratio"),
+        ("young_moduli", "poisson_ratios", "shear_moduli", "axes"),
+    )
 
     @model_validator(mode="after")
-    def _one_kind_of_material(self) -> "Material":
-        one = (self.young_modulus, self.poisson_ratio)
-        three = (self.young_moduli, self.poisson_ratios, self.shear_moduli, self.axes)
-        isotropic = all(value is not None for value in one) and all(value is None for value in three)
-        orthotropic = all(value is None for value in one) and all(value is not None for value in three)
-        if not isotropic and not orthotropic:
-            raise ValueError(
-                "either young_modulus and poisson_ratio are expected, or young_moduli, poisson_ratios, "
-                "shear_moduli and axes"
-            )
-        if orthotropic:
-            assert self.axes is not None
-            for axis in self.axes:
-                refuse_zero(axis, "an axis")
+    def _is_stable(self) -> "Material":
+        if self.axes is not None:
             if np.linalg.norm(np.cross(unit_vector(self.axes[0]), unit_vector(self.axes[1]))) < LEAST_SINE:
                 raise ValueError("the two axes must not be parallel")
             if np.linalg.eigvalsh(self.compliance)[0] <= 0.0:
@@ -157,7 +233,7 @@ class Support(Part):
         return self
 
 
-class Load(Commanded):
+class Load(Given, Commanded):
     """A load, constant or times the value of a control.
 
     Either a `force` [N] on a set (shared by area where it holds faces, else equally among its nodes) or at a
@@ -167,27 +243,11 @@ class Load(Commanded):
 
     set: SetName | None = None
     point: Vector | None = None
-    force: Vector | None = None
+    force: Direction | None = None
     pressure: float | None = None
-    acceleration: Vector | None = None
+    acceleration: Direction | None = None
 
-    @model_validator(mode="after")
-    def _one_kind_of_load(self) -> "Load":
-        given = [key for key in ("force", "pressure", "acceleration") if getattr(self, key) is not None]
-        if len(given) != 1:
-            raise ValueError("one of force, pressure and acceleration is expected")
-        refuse_zero(self.force, "force")
-        refuse_zero(self.acceleration, "acceleration")
-        places = [key for key in ("set", "point") if getattr(self, key) is not None]
-        wanted = {"force": "either set or point", "pressure": "set", "acceleration": "no set and no point"}
-        right = {
-            "force": len(places) == 1,
-            "pressure": places == ["set"],
-            "acceleration": not places,
-        }
-        if not right[given[0]]:
-            raise ValueError(f"{wanted[given[0]]} is expected beside {given[0]}")
-        return self
+    ways = (("force", "set"), ("force", "point"), ("pressure", "set"), ("acceleration",))
 
 
 class Damage(Region):
@@ -206,12 +266,7 @@ class PointOutput(Named):
     """Displacement, or acceleration, of a point along a direction."""
 
     point: Vector
-    direction: Vector
-
-    @model_validator(mode="after")
-    def _points_somewhere(self) -> "PointOutput":
-        refuse_zero(self.direction, "direction")
-        return self
+    direction: Direction
 
 
 class MeshDesign(StructureDesign):

@@ -49,18 +49,13 @@ _PRISMATIC = tuple(power for power in _POWERS if power[0] + power[1] <= 1 and po
 _PRISMATIC_QUADRATIC = tuple(power for power in _POWERS if power[0] + power[1] + power[2] // 2 <= 2)
 
 
-def _tetrahedron_rule(order: int) -> Rule:
-    points, weights = get_quadrature(RefTet, order)
-    return np.ascontiguousarray(points.T), np.asarray(weights)
-
-
-def _triangle_rule(order: int) -> Rule:
-    points, weights = get_quadrature(RefTri, order)
+def _simplex_rule(cell: type[RefTet] | type[RefTri], order: int) -> Rule:
+    points, weights = get_quadrature(cell, order)
     return np.ascontiguousarray(points.T), np.asarray(weights)
 
 
 def _wedge_rule(order: int, along: int) -> Rule:
-    flat, line = _triangle_rule(order), gauss_points(along, dimensions=1)
+    flat, line = _simplex_rule(RefTri, order), gauss_points(along, dimensions=1)
     points = [(*place, height) for height in line[0][:, 0] for place in flat[0]]
     return np.array(points), np.outer(line[1], flat[1]).ravel()
 
@@ -169,17 +164,17 @@ class ElementKind:
     def face_rule(self, face: int) -> Rule:
         """Integration points (q, 2) and weights (q,) on a face, exact for its shape functions' products."""
         if len(self.faces[face]) == 3:
-            return _triangle_rule(4)
+            return _simplex_rule(RefTri, 4)
         return gauss_points(3, dimensions=2)
 
 
 TETRAHEDRA_4 = ElementKind(
     "4-node tetrahedra", "tetra", "C3D4", _LINEAR, _TET, (), _TET_FACES,
-    _tetrahedron_rule(1), _tetrahedron_rule(2),
+    _simplex_rule(RefTet, 1), _simplex_rule(RefTet, 2),
 )  # fmt: skip
 TETRAHEDRA_10 = ElementKind(
     "10-node tetrahedra", "tetra10", "C3D10", _QUADRATIC, _TET, _TET_EDGES, _TET_FACES,
-    _tetrahedron_rule(2), _tetrahedron_rule(5),
+    _simplex_rule(RefTet, 2), _simplex_rule(RefTet, 5),
 )  # fmt: skip
 HEXAHEDRA_8 = ElementKind(
     "8-node hexahedra", "hexahedron", "C3D8", _TRILINEAR, _HEX, (), _HEX_FACES,
@@ -233,7 +228,7 @@ def stiffness_blocks(kind: ElementKind, nodes: FloatArray, elasticity: FloatArra
     """
     local, weight = kind.stiffness_rule
     _, slopes = kind.shape_functions(local)
-    jacobian = np.einsum("nai,qaj->nqij", nodes, slopes, optimize=True)
+    jacobian = jacobians(kind, nodes, local)
     B = strain_matrix(slopes[None] @ np.linalg.inv(jacobian))
     measure = weight * np.linalg.det(jacobian)
     n, q = measure.shape

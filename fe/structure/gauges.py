@@ -8,9 +8,9 @@ from scipy import sparse
 
 from fe.runtime.errors import InvalidDesignError
 
+from .design import Gauge, Rosette
 from .location import Locator, SurfacePoint
 from .mesh import StructureMesh
-from .rosettes import Gauge, Rosette
 
 FloatArray = NDArray[np.float64]
 

@@ -22,8 +22,7 @@ from .affine import DesignedStructure, LoadTerm, StiffnessTerm, names_of
 from .design import unit_vector
 from .matrix_design import Extension, MatrixDesign, MatrixMass, NodeOutput
 from .matrix_files import Place, read_matrix, read_unknowns, read_vector
-from .rosettes import Vector
-from .tables import MOTIONS
+from .tables import MOTIONS, Vector
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -4,15 +4,14 @@ The matrices are in newtons, seconds and the unit of length that the file names;
 acceleration in m/s^2 are turned into these units.
 """
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from fe.runtime.state import MOST_REGIONS
 from fe.wing.parts import Part
 
-from .rosettes import Name, Named, Vector, refuse_zero
-from .tables import ChosenMass, Commanded, Region, StructureDesign
+from .tables import ChosenMass, Commanded, Direction, Given, Name, Named, Region, StructureDesign
 
 FileName = Annotated[str, Field(min_length=1)]
 Files = Annotated[tuple[FileName, ...], Field(min_length=1)]
@@ -26,23 +25,7 @@ class MatrixSupport(Part):
     hold: Annotated[tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...], Field(min_length=1)]
 
 
-class _Given(Part):
-    """A table that is given in one of several ways, each a few keys."""
-
-    ways: ClassVar[tuple[tuple[str, ...], ...]]
-
-    @model_validator(mode="after")
-    def _given_in_one_way(self) -> "_Given":
-        given = {key for way in self.ways for key in way if getattr(self, key) is not None}
-        if given not in map(set, self.ways):
-            ways = ", or ".join(" and ".join(way) for way in self.ways)
-            raise ValueError(f"either {ways} is expected")
-        for key in given & {"force", "acceleration", "direction"}:
-            refuse_zero(getattr(self, key), key)
-        return self
-
-
-class StiffnessPart(_Given):
+class StiffnessPart(Given):
     """Share of the stiffness that a parameter scales, a region may lose, or both.
 
     Either its own `matrix`, or that of the whole structure, `changed` by making the part's modulus `times`
@@ -58,18 +41,18 @@ class StiffnessPart(_Given):
     ways = (("matrix",), ("changed", "times"))
 
 
-class MatrixLoad(_Given, Commanded):
+class MatrixLoad(Given, Commanded):
     """A load: a `vector` of its own, a `force` [N] at a node, or an `acceleration` [m/s^2] of all mass."""
 
     vector: FileName | None = None
     node: Node | None = None
-    force: Vector | None = None
-    acceleration: Vector | None = None
+    force: Direction | None = None
+    acceleration: Direction | None = None
 
     ways = (("vector",), ("node", "force"), ("acceleration",))
 
 
-class MatrixMass(_Given, ChosenMass):
+class MatrixMass(Given, ChosenMass):
     """Mass at a `node`, or times the `matrix` of 1 kg."""
 
     node: Node | None = None
@@ -78,23 +61,23 @@ class MatrixMass(_Given, ChosenMass):
     ways = (("node",), ("matrix",))
 
 
-class Extension(_Given, Named):
+class Extension(Given, Named):
     """Strain: a `vector` of its own, or how far two nodes move apart along a direction, over a length."""
 
     vector: FileName | None = None
     nodes: tuple[Node, Node] | None = None
-    direction: Vector | None = None
+    direction: Direction | None = None
     length: float | None = Field(default=None, gt=0.0)
 
     ways = (("vector",), ("nodes", "direction", "length"))
 
 
-class NodeOutput(_Given, Named):
+class NodeOutput(Given, Named):
     """Displacement, or acceleration: a `vector` of its own, or of a node along a direction."""
 
     vector: FileName | None = None
     node: Node | None = None
-    direction: Vector | None = None
+    direction: Direction | None = None
 
     ways = (("vector",), ("node", "direction"))
 

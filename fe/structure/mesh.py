@@ -1,6 +1,6 @@
 """The mesh of a structure: nodes, cells of one kind and named sets, as the file has them, in metres."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -73,7 +73,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class StructureMesh:
+class StructureMesh(FileMesh):
     """Checked mesh in metres; nodes that no cell uses are left out.
 
     Attributes
@@ -98,20 +98,11 @@ class StructureMesh:
         As of `FileMesh`.
     """
 
-    source: str
-    kind: ElementKind
-    points: FloatArray
-    node_numbers: IntArray
-    cells: IntArray
-    cell_numbers: IntArray
-    unit: float
-    unit_name: str
-    node_sets: dict[str, IntArray]
-    cell_sets: dict[str, IntArray]
-    face_sets: dict[str, frozenset[tuple[int, ...]]]
-    loose: IntArray
-    loose_in: dict[str, int]
-    remarks: tuple[str, ...] = ()
+    source: str = field(kw_only=True)
+    unit: float = field(kw_only=True)
+    unit_name: str = field(kw_only=True)
+    loose: IntArray = field(kw_only=True)
+    loose_in: dict[str, int] = field(kw_only=True)
 
     @property
     def unknowns(self) -> int:

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
-from .coordinates import GLOBAL, System, frame
-from .deck import Deck, fail, included, real, shown, whole, words_of
+from .deck import GLOBAL, Deck, System, fail, frame, included, real, shown, whole, words_of
 from .elements import KINDS
 from .mesh import FileMesh
 

@@ -14,13 +14,11 @@ from .affine import DesignedStructure, LoadTerm, StiffnessTerm, names_of
 from .design import MeshDesign, load_structure, structure_hash
 from .elements import BATCH, Rule, mass_blocks, stiffness_blocks
 from .gauges import GaugePlace, gauge_rows
-from .loads import point_shares, surface_load
-from .location import Locator
+from .location import Locator, point_shares, surface_load
 from .matrices import assemble_matrices
 from .matrix_design import MatrixDesign
-from .memory import check_memory
 from .mesh import StructureMesh
-from .mesh_file import read_mesh
+from .mesh_file import check_memory, read_mesh
 from .supports import SupportedUnknowns, supported
 
 FloatArray = NDArray[np.float64]

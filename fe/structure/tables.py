@@ -1,19 +1,48 @@
 """The tables that every structure file has, whether its structure comes from a mesh or from matrices."""
 
 import itertools
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from fe.runtime.state import MOST_REGIONS
 from fe.wing.parts import Part
 
-from .rosettes import Name, Named
+Vector = tuple[float, float, float]
+Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 """Units of length and their size [m]."""
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
 """Of a rigid set: along the axes, then about them."""
+
+
+def _points_somewhere(vector: Vector) -> Vector:
+    if not any(vector):
+        raise ValueError("it must point somewhere, but is (0, 0, 0)")
+    return vector
+
+
+Direction = Annotated[Vector, AfterValidator(_points_somewhere)]
+
+
+class Named(Part):
+    """Something that is chosen or read by its name."""
+
+    name: Name
+
+
+class Given(Part):
+    """A table that is given in one of several ways, each a few keys."""
+
+    ways: ClassVar[tuple[tuple[str, ...], ...]]
+
+    @model_validator(mode="after")
+    def _given_in_one_way(self) -> "Given":
+        given = {key for way in self.ways for key in way if getattr(self, key) is not None}
+        if given not in map(set, self.ways):
+            raise ValueError(f"either {', or '.join(map(' and '.join, self.ways))} is expected")
+        return self
 
 
 class Ranged(Named):
@@ -24,11 +53,13 @@ class Ranged(Named):
 
     usual: ClassVar[tuple[float, float]]
     """Ends of the range where none are given, as multiples of the nominal value."""
+    nominal_key: ClassVar[str] = "nominal"
+    """Which of its numbers is the nominal value."""
 
     @property
     def middle(self) -> float:
         """Nominal value."""
-        raise NotImplementedError
+        return float(getattr(self, self.nominal_key))
 
     @property
     def range(self) -> tuple[float, float]:
@@ -57,11 +88,6 @@ class Parameter(Ranged):
 
     usual = (0.9, 1.1)
 
-    @property
-    def middle(self) -> float:
-        """Nominal value."""
-        return self.nominal
-
 
 class Control(Ranged):
     """What commands loads; a load is its numbers times the value of its control."""
@@ -70,11 +96,6 @@ class Control(Ranged):
     nominal: float = 1.0
 
     usual = (-10.0, 10.0)
-
-    @property
-    def middle(self) -> float:
-        """Nominal value."""
-        return self.nominal
 
     @model_validator(mode="after")
     def _is_not_always_zero(self) -> "Control":
@@ -105,11 +126,7 @@ class ChosenMass(Ranged):
     minimum: float | None = Field(default=None, ge=0.0)
 
     usual = (0.5, 1.5)
-
-    @property
-    def middle(self) -> float:
-        """Nominal value."""
-        return self.mass
+    nominal_key = "mass"
 
 
 class Damping(Part):

@@ -14,8 +14,8 @@ from fe.full.operators import AffineOperators
 from fe.full.statics import Factorisation, static_outputs
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState, Losses
+from fe.structure.field import natural_frequencies, static_responses
 from fe.structure.operators import Structure
-from fe.structure.solution import natural_frequencies, static_responses
 
 from .calculix_deck import CalculixDeck
 from .calculix_job import read_frequencies, read_tables, run_calculix
@@ -331,7 +331,7 @@ def ring_down_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    from fe.reduction.wing_basis import reduce_model
+    from fe.reduction.reduced_basis import reduce_model
     from fe.runtime.transient import ModalIntegrator
 
     model = reduce_model(operators).model

@@ -125,11 +125,8 @@ def rigid_body_check() -> RigidBodyCheck:
     return RigidBodyCheck(int((values < 1e-12).sum()), float(values[5]), float(values[6]))
 
 
-def rigid_body_residual(operators: AffineOperators) -> float:
-    """Largest force that a rigid motion of the wing calls forth, over the sum of its terms.
-
-    The motions are those that the root allows, heave, flap and yaw; the forces of the springs are left out.
-    """
+def _rigid_motions(operators: AffineOperators) -> FloatArray:
+    """Free unknowns (n, 3) of the rigid motions that the root allows: heave, flap and yaw."""
     expansion = operators.expansion
     points = operators.discretisation.node_points
     full = np.zeros((len(points), 3, 3))
@@ -139,6 +136,15 @@ def rigid_body_residual(operators: AffineOperators) -> float:
     scale = np.asarray((expansion.T @ expansion).diagonal())
     free = (expansion.T @ full.reshape(-1, 3)) / scale[:, None]
     free[-3:] = np.eye(3)
+    return np.asarray(free)
+
+
+def rigid_body_residual(operators: AffineOperators) -> float:
+    """Largest force that a rigid motion of the wing calls forth, over the sum of its terms.
+
+    The motions are those that the root allows, heave, flap and yaw; the forces of the springs are left out.
+    """
+    free = _rigid_motions(operators)
     stiffness = operators.stiffness()
     springs = np.zeros((operators.unknowns, 3))
     root = operators.wing_mesh.design.root
@@ -169,18 +175,21 @@ def cantilever_check(cells_along: int = 10) -> CantileverCheck:
     """
     length, side, modulus, force = 2.0, 0.1, 70e9, 100.0
     body = brick((side, length, side), (2, cells_along, 2))
-    stiffness = _uniform_stiffness(body, isotropic_elasticity(modulus, 0.0))
-    points = body.node_points
-    free = np.flatnonzero(np.repeat(points[:, 1] > 1e-9, 3))
-    load = np.zeros(body.unknowns)
-    load[2::3] = force * face_shares(body, length)
-    found = np.zeros(body.unknowns)
-    found[free] = Factorisation(stiffness[free][:, free]).solve(load[free])
     second_moment = side**4 / 12.0
     bending = force * length**3 / (3.0 * modulus * second_moment)
     shear = force * length / (5.0 / 6.0 * 0.5 * modulus * side**2)
-    mean = float(found[2::3] @ face_shares(body, length))
-    return CantileverCheck(mean, bending + shear)
+    bent = force * _end_deflection(body, isotropic_elasticity(modulus, 0.0), length, 2)
+    return CantileverCheck(bent, bending + shear)
+
+
+def _end_deflection(body: Discretisation, elasticity: FloatArray, length: float, component: int) -> float:
+    """Mean displacement of the end y = `length` along a unit force there; the other end is clamped."""
+    stiffness, shares = _uniform_stiffness(body, elasticity), face_shares(body, length)
+    free = np.flatnonzero(np.repeat(body.node_points[:, 1] > 1e-9, 3))
+    load, found = np.zeros(body.unknowns), np.zeros(body.unknowns)
+    load[component::3] = shares
+    found[free] = Factorisation(stiffness[free][:, free]).solve(load[free])
+    return float(found[component::3] @ shares)
 
 
 def face_shares(body: Discretisation, place: float) -> FloatArray:
@@ -221,15 +230,8 @@ def macneal_harder_beam(shape: str, *, across_depth: bool) -> float:
     inside = (line > 0) & (line < 6)
     points[1] += np.where(inside, lean * (points[0] - 0.5 * depth), 0.0)
     body = Discretisation(MeshHex(points, regular.mesh.t))
-    stiffness = _uniform_stiffness(body, isotropic_elasticity(1e7, 0.3))
     component, exact = (0, 0.1081) if across_depth else (2, 0.4321)
-    shares = face_shares(body, length)
-    load = np.zeros(body.unknowns)
-    load[component::3] = shares
-    free = np.flatnonzero(np.repeat(body.node_points[:, 1] > 1e-9, 3))
-    found = np.zeros(body.unknowns)
-    found[free] = Factorisation(stiffness[free][:, free]).solve(load[free])
-    return float(found[component::3] @ shares) / exact
+    return _end_deflection(body, isotropic_elasticity(1e7, 0.3), length, component) / exact
 
 
 @dataclass(frozen=True)
@@ -264,21 +266,17 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> WingBa
     """Mass, reaction and energy sums of the wing at a load factor."""
     mesh = operators.wing_mesh
     design = mesh.design
-    heave = np.zeros(operators.expansion.shape[0])
-    heave[2::3] = 1.0
-    scale = np.asarray((operators.expansion.T @ operators.expansion).diagonal())
-    free = (operators.expansion.T @ heave) / scale
-    free[-3:] = 1.0, 0.0, 0.0
+    heave, flap, _ = _rigid_motions(operators).T
     _, determinant = global_gradients(mesh.corners, _EIGHT_POINTS)
     solution = solve_static(operators, load_factor=load_factor)
     u = solution.displacement
     load = operators.load(load_factor)
     return WingBalance(
-        structural_mass=float(free @ (operators.mass_terms[0] @ free)),
+        structural_mass=float(heave @ (operators.mass_terms[0] @ heave)),
         volume_mass=float((determinant.mean(axis=1) * cell_density(mesh)).sum()),
         lift=design.lift.force * load_factor / design.lift.load_factor,
         spring_force=float(design.root.transverse_spring * u[-3]),
-        lift_moment=float(_rigid_flap(operators) @ load),
+        lift_moment=float(flap @ load),
         spring_moment=float(design.root.flap_spring * u[-2]),
         work=float(0.5 * load @ u),
         strain_energy=float(0.5 * u @ (operators.stiffness() @ u)),
@@ -289,16 +287,6 @@ _HALF = 0.5 / np.sqrt(3.0)
 _EIGHT_POINTS = np.array(
     [[0.5 + a * _HALF, 0.5 + b * _HALF, 0.5 + c * _HALF] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
 )
-
-
-def _rigid_flap(operators: AffineOperators) -> FloatArray:
-    """Free unknowns (n,) of a unit rotation about the root chord line x."""
-    points = operators.discretisation.node_points
-    full = np.zeros((len(points), 3))
-    full[:, 2], full[:, 1] = points[:, 1], -points[:, 2]
-    free = np.asarray(operators.expansion.T @ full.ravel())
-    free[-3:] = 0.0, 1.0, 0.0
-    return free
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
-from .airfoil import four_digit_half_thickness
 from .parts import (
     AddedDensity,
     Airfoil,
@@ -36,6 +35,7 @@ from .parts import (
     Skin,
     TipLoad,
     Web,
+    four_digit_half_thickness,
 )
 
 SHIPPED_DESIGN = Path(__file__).parents[1] / "designs" / "uav_wing.toml"

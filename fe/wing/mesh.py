@@ -16,9 +16,9 @@ from skfem import MeshHex
 
 from fe.runtime.errors import MeshError
 
-from .airfoil import four_digit_half_thickness, four_digit_slope
 from .design import WingDesign, rib_interval
 from .grid import ChordLine, chord_lines, span_lines, web_faces
+from .parts import four_digit_half_thickness, four_digit_slope
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from fe.runtime.damping import rayleigh_damping_ratio
 from fe.runtime.errors import FiniteElementError
+from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 

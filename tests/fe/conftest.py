@@ -3,8 +3,7 @@ from threadpoolctl import threadpool_limits
 
 from fe.full.operators import AffineOperators, assemble
 from fe.full.patch_operators import PatchOperators, assemble_patch_operators
-from fe.reduction.reduced_basis import Reduction
-from fe.reduction.wing_basis import reduce_model
+from fe.reduction.reduced_basis import Reduction, reduce_model
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.wing.design import WingDesign, load_design

@@ -7,11 +7,10 @@ from typing import Any
 from pydantic import Field
 
 from fe.runtime.errors import InvalidDesignError
-from fe.structure.design import MeshDesign, load_structure
+from fe.structure.design import Gauge, MeshDesign, load_structure, with_rosettes
 from fe.structure.gauges import spread_rosettes
 from fe.structure.location import Locator
 from fe.structure.mesh_file import read_mesh
-from fe.structure.rosettes import Gauge, with_rosettes
 from fe.wing.parts import Part
 from reporting.section import checked
 from reporting.toml_file import read_toml

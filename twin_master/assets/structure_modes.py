@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_damping_ratio
 from twin_master.assets.interface import AssetReading, InnerTruth
 from twin_master.network.identified import packed_row
 from twin_master.scenario.modes import ModesSection

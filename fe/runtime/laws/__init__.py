@@ -49,6 +49,6 @@ def _chosen(name: str) -> Callable[..., Any]:
 
 
 (
-    force, slope, advance, parts, pull, settle,
+    advance, parts, pull,
     dry, holds, strength, share, steady, resistance, kick, holding_limit, crossing, held,
 ) = map(_chosen, FUNCTIONS)  # fmt: skip

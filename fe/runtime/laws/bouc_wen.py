@@ -18,43 +18,15 @@ class BoucWen(PortForce):
     `stiffness` is the part of the port's stiffness that is hysteretic ((1 - alpha) k); below yield F is zero.
     """
 
-    kind: ClassVar[str] = "bouc_wen"
     hysteretic: ClassVar[bool] = True
     proportional: ClassVar[tuple[str, ...]] = ("stiffness",)
+    positive: ClassVar[tuple[str, ...]] = ("yield_displacement", "order")
     units: ClassVar[dict[str, str]] = {
         "stiffness": "N/m or N m/rad", "yield_displacement": "m or rad", "order": "1"
     }  # fmt: skip
     stiffness: float
     yield_displacement: float
     order: float
-
-    @property
-    def row(self) -> tuple[float, ...]:
-        """k, z_y, n."""
-        return self.stiffness, self.yield_displacement, self.order
-
-    @property
-    def magnitude(self) -> float:
-        """Stiffness that yields."""
-        return self.stiffness
-
-    def check(self) -> None:
-        """Raise `InvalidPatchError` where a number cannot be."""
-        self.require(
-            positive={"yield_displacement": self.yield_displacement, "order": self.order}, least_zero={}
-        )
-
-
-def force(law: FloatArray, memory: FloatArray, x: float) -> float:
-    """Return the hysteretic force at `x` less that of the spring."""
-    return float(law[0] * (memory[HEAD] - x))
-
-
-def slope(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float) -> float:
-    """Return the derivative of the force on the way that led to x."""
-    z = memory[HEAD] / law[1]
-    loading = z * (x - memory[1]) >= 0.0
-    return float(-law[0] * power(min(abs(z), 1.0), law[2])) if loading else 0.0
 
 
 def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:
@@ -77,30 +49,6 @@ def pull(
     loading = z * (x - memory[1]) > 0.0
     gradient = -law[0] * power(min(abs(z) / law[1], 1.0), law[2]) if loading else 0.0
     return law[0] * (z - x), gradient
-
-
-def settle(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, y: float, r: float, h: float, about: float
-) -> float:
-    """Return F of x + r F(x) = y by Newton's method."""
-    last, part = memory[1], r * law[0]
-    x = y - r * about
-    for turn in range(24):
-        z = _path(law, memory[HEAD], x - last, 1)
-        rest = x + part * (z - x) - y
-        if abs(rest) <= 1e-11 * (abs(x) + law[1]):
-            break
-        gradient = 1.0
-        if z * (x - last) > 0.0:
-            gradient -= part * power(min(abs(z) / law[1], 1.0), law[2])
-        x -= rest / (gradient if gradient > 1e-6 and turn < 12 else 1.0)
-    if r * law[0] > 0.01:  # the solution holds force and memory
-        found = (y - x) / r
-        memory[HEAD] = x + found / law[0]
-        memory[1] = x
-        return found
-    advance(law, elements, memory, x, 1)
-    return force(law, memory, x)
 
 
 def _path(law: FloatArray, begin: float, change: float, least: int) -> float:

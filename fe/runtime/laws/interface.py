@@ -2,7 +2,7 @@
 
 A law is one file of this folder: its primitive, a subclass of `PortForce`, and those functions of this file
 that it answers otherwise. They stand below as a law of nothing answers them. A law of position has the first
-part; a law of speed sets `PortForce.of_speed` and has `pull`, `settle` and the second part.
+part; a law of speed sets `PortForce.of_speed` and has `pull` and the second part.
 
 They are called at every step, in the subset of Python that numba compiles too. What they are given:
 
@@ -16,8 +16,6 @@ memory : (`HEAD` + E,) ndarray
     states of the elements.
 x : float
     Position of the port [m or rad].
-r, y : float
-    Flexibility of the port that the modes leave out, and the position without the force: x + r F(x) = y.
 h, least : float, int
     Duration of the way to x [s], and the least number of parts in which it is followed.
 strength : float
@@ -53,19 +51,23 @@ class PortForce(Primitive):
     hysteretic: ClassVar[bool] = False
     """Whether the force depends on what happened before."""
     proportional: ClassVar[tuple[str, ...]] = ()
-    """The numbers that the force is in proportion to."""
+    """The numbers that the force is in proportion to; without the first there is none."""
+    positive: ClassVar[tuple[str, ...]] = ()
+    """The numbers that must be above zero."""
+    not_negative: ClassVar[tuple[str, ...]] = ()
+    """The numbers that must be zero or above."""
 
     port: str
 
     @property
     def row(self) -> tuple[float, ...]:
-        """Parameters for the functions of the law, `PARAMETERS` at most."""
-        raise NotImplementedError
+        """Parameters for the functions of the law, `PARAMETERS` at most: its numbers, in their order."""
+        return tuple(float(getattr(self, name)) for name, kind in self.values().items() if kind is not str)
 
     @property
     def magnitude(self) -> float:
         """Zero where the law gives no force at all."""
-        raise NotImplementedError
+        return float(getattr(self, self.proportional[0]))
 
     def elements(self) -> FloatArray:
         """Return a parameter (E,) of each hysteretic element."""
@@ -73,15 +75,16 @@ class PortForce(Primitive):
 
     def check(self) -> None:
         """Raise `InvalidPatchError` where a number cannot be."""
+        for name in self.positive:
+            self.require(name, getattr(self, name), positive=True)
+        for name in self.not_negative:
+            self.require(name, getattr(self, name), positive=False)
 
-    def require(self, *, positive: dict[str, float], least_zero: dict[str, float]) -> None:
-        """Raise `InvalidPatchError` for the first of the named numbers that is not as it must be."""
-        for name, value in positive.items():
-            if not value > 0.0:
-                raise InvalidPatchError(f"{name} of {self.kind!r} must be positive, but is {value:g}.")
-        for name, value in least_zero.items():
-            if value < 0.0:
-                raise InvalidPatchError(f"{name} of {self.kind!r} must not be negative, but is {value:g}.")
+    def require(self, name: str, value: float, *, positive: bool) -> None:
+        """Raise `InvalidPatchError` for a number that is not positive, or at least zero."""
+        if value < 0.0 or (positive and not value > 0.0):
+            wanted = "be positive" if positive else "not be negative"
+            raise InvalidPatchError(f"{name} of {self.kind!r} must {wanted}, but is {value:g}.")
 
 
 def power(base: float, exponent: float) -> float:
@@ -98,16 +101,6 @@ def power(base: float, exponent: float) -> float:
 
 
 # ---------------------------------------------------------------- a law of position
-
-
-def force(law: FloatArray, memory: FloatArray, x: float) -> float:
-    """Return the force at `x`, to which the memory has been advanced."""
-    return 0.0
-
-
-def slope(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float) -> float:
-    """Return the derivative of `force` by x on the way from the last position, elements being at `x`."""
-    return 0.0
 
 
 def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:
@@ -127,14 +120,6 @@ def pull(
     Of dry friction the largest force, as if it moved forwards.
     """
     return 0.0, 0.0
-
-
-def settle(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, y: float, r: float, h: float, about: float
-) -> float:
-    """Return F of x + r F(x) = y, about `about`, and carry the memory to that x; r is positive."""
-    memory[1] = y
-    return 0.0
 
 
 # ---------------------------------------------------------------- a law of speed
@@ -222,7 +207,7 @@ def held(law: FloatArray, speed: float, push: float, gain: float, strength: floa
 
 
 FUNCTIONS = (
-    "force", "slope", "advance", "parts", "pull", "settle",
+    "advance", "parts", "pull",
     "dry", "holds", "strength", "share", "steady", "resistance", "kick", "holding_limit", "crossing", "held",
 )  # fmt: skip
 """Functions of a law."""

@@ -27,9 +27,10 @@ class MicroSlip(PortForce):
     single Jenkins element has `element_count` 1 and slips at `slip_force`.
     """
 
-    kind: ClassVar[str] = "micro_slip"
     hysteretic: ClassVar[bool] = True
-    proportional: ClassVar[tuple[str, ...]] = ("slip_force", "stiffness")
+    proportional: ClassVar[tuple[str, ...]] = ("stiffness", "slip_force")
+    positive: ClassVar[tuple[str, ...]] = ("slip_force", "element_count")
+    not_negative: ClassVar[tuple[str, ...]] = ("stiffness",)
     units: ClassVar[dict[str, str]] = {
         "slip_force": "N or N m", "stiffness": "N/m or N m/rad", "chi": "1"
     }  # fmt: skip
@@ -43,25 +44,15 @@ class MicroSlip(PortForce):
         """k, n."""
         return self.stiffness, float(self.element_count)
 
-    @property
-    def magnitude(self) -> float:
-        """Stiffness that slips."""
-        return self.stiffness
-
     def elements(self) -> FloatArray:
         """Return the slip displacements (n,) of the elements."""
         return slip_displacements(self)
 
     def check(self) -> None:
         """Raise `InvalidPatchError` where a number cannot be."""
-        self.require(
-            positive={
-                "slip_force": self.slip_force,
-                "element_count": self.element_count,
-                "1 + chi": 1 + self.chi,
-            },
-            least_zero={"stiffness": self.stiffness, "-chi": -self.chi},
-        )
+        super(MicroSlip, self).check()
+        self.require("1 + chi", 1.0 + self.chi, positive=True)
+        self.require("-chi", -self.chi, positive=False)
         if self.element_count > MOST_ELEMENTS:
             raise InvalidPatchError(
                 f"element_count of {self.kind!r} must be {MOST_ELEMENTS} at most, "
@@ -78,25 +69,6 @@ def slip_displacements(joint: MicroSlip) -> FloatArray:
     part = (np.arange(joint.element_count) + 0.5) / joint.element_count
     slips = part ** (1.0 / (1.0 + joint.chi))
     return np.asarray(slips * (joint.slip_force / joint.stiffness / slips.mean()))
-
-
-def force(law: FloatArray, memory: FloatArray, x: float) -> float:
-    """Return the force of the elements at `x` less that of the spring."""
-    count = int(law[1])
-    total = 0.0
-    for i in range(count):
-        total += memory[HEAD + i]
-    return float(law[0] * (total / count - x))
-
-
-def slope(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float) -> float:
-    """Return the derivative of the force: that of the elements that slip."""
-    count = int(law[1])
-    free = 0
-    for i in range(count):
-        if abs(memory[HEAD + i]) >= elements[i]:
-            free += 1
-    return float(-law[0] * free / count)
 
 
 def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:
@@ -121,32 +93,3 @@ def pull(
         if abs(stretch) >= elements[i]:
             moving += 1
     return law[0] * (total / count - x), -law[0] * moving / count
-
-
-def settle(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, y: float, r: float, h: float, about: float
-) -> float:
-    """Return F of x + r F(x) = y; F is linear between the positions where elements slip."""
-    count = int(law[1])
-    last, part = memory[1], r * law[0] / law[1]
-    gradient = 1.0
-    x = y - r * about
-    for turn in range(24):
-        total = 0.0
-        moving = 0
-        change = x - last
-        for i in range(count):
-            stretch = memory[HEAD + i] + change
-            total += min(max(stretch, -elements[i]), elements[i])
-            if abs(stretch) >= elements[i]:
-                moving += 1
-        rest = x + part * (total - count * x) - y
-        if abs(rest) <= 1e-12 * (abs(x) + elements[0]):
-            break
-        gradient = 1.0 - part * moving
-        # the largest gradient never goes too far
-        x -= rest / (gradient if gradient > 1e-6 and turn < 12 else 1.0)
-    advance(law, elements, memory, x, 1)
-    if r * law[0] > 0.01:
-        return (y - x) / r
-    return force(law, memory, x)

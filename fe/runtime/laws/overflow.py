@@ -17,9 +17,10 @@ from .interface import FloatArray, PortForce, power
 class Overflow(PortForce):
     """F = coefficient ((v - level) / v0)^exponent where v > level, v0 = `reference_velocity`; else zero."""
 
-    kind: ClassVar[str] = "overflow"
     of_speed: ClassVar[bool] = True
     proportional: ClassVar[tuple[str, ...]] = ("coefficient",)
+    positive: ClassVar[tuple[str, ...]] = ("reference_velocity", "exponent")
+    not_negative: ClassVar[tuple[str, ...]] = ("coefficient", "level")
     units: ClassVar[dict[str, str]] = {
         "coefficient": "N or N m", "exponent": "1", "level": "m/s or rad/s",
         "reference_velocity": "m/s or rad/s",
@@ -28,23 +29,6 @@ class Overflow(PortForce):
     exponent: float
     level: float
     reference_velocity: float
-
-    @property
-    def row(self) -> tuple[float, ...]:
-        """c, n, l, v0."""
-        return self.coefficient, self.exponent, self.level, self.reference_velocity
-
-    @property
-    def magnitude(self) -> float:
-        """Flow at v0 above the level."""
-        return self.coefficient
-
-    def check(self) -> None:
-        """Raise `InvalidPatchError` where a number cannot be."""
-        self.require(
-            positive={"reference_velocity": self.reference_velocity, "exponent": self.exponent},
-            least_zero={"coefficient": self.coefficient, "level": self.level},
-        )
 
 
 def pull(
@@ -56,26 +40,6 @@ def pull(
         return 0.0, 0.0
     size = law[0] * power(above / law[3], law[1])
     return size, size * law[1] / (above * h)
-
-
-def settle(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, y: float, r: float, h: float, about: float
-) -> float:
-    """Return F of x + r F((x - last) / h) = y, and carry the memory to that x."""
-    low, high = memory[1] + h * law[2], y
-    found = 0.0
-    if high > low:
-        for _ in range(80):
-            x = 0.5 * (low + high)
-            found = pull(law, elements, memory, x, h, 1)[0]
-            if x + r * found > y:
-                high = x
-            else:
-                low = x
-        y = 0.5 * (low + high)
-    memory[1] = y
-    memory[4] = found
-    return float(found)
 
 
 # ---------------------------------------------------------------- as a law of speed

@@ -22,9 +22,12 @@ class PowerDamping(PortForce):
     x0 = `reference_displacement`.
     """
 
-    kind: ClassVar[str] = "power_damping"
     of_speed: ClassVar[bool] = True
     proportional: ClassVar[tuple[str, ...]] = ("coefficient",)
+    positive: ClassVar[tuple[str, ...]] = ("reference_velocity", "reference_displacement")
+    not_negative: ClassVar[tuple[str, ...]] = (
+        "coefficient", "velocity_exponent", "displacement_exponent"
+    )  # fmt: skip
     units: ClassVar[dict[str, str]] = {
         "coefficient": "N or N m", "velocity_exponent": "1", "displacement_exponent": "1",
         "reference_velocity": "m/s or rad/s", "reference_displacement": "m or rad",
@@ -34,36 +37,6 @@ class PowerDamping(PortForce):
     displacement_exponent: float
     reference_velocity: float
     reference_displacement: float
-
-    @property
-    def row(self) -> tuple[float, ...]:
-        """c, p, a, v0, x0."""
-        return (
-            self.coefficient,
-            self.velocity_exponent,
-            self.displacement_exponent,
-            self.reference_velocity,
-            self.reference_displacement,
-        )
-
-    @property
-    def magnitude(self) -> float:
-        """Force at v0 and x0."""
-        return self.coefficient
-
-    def check(self) -> None:
-        """Raise `InvalidPatchError` where a number cannot be."""
-        self.require(
-            positive={
-                "reference_velocity": self.reference_velocity,
-                "reference_displacement": self.reference_displacement,
-            },
-            least_zero={
-                "coefficient": self.coefficient,
-                "velocity_exponent": self.velocity_exponent,
-                "displacement_exponent": self.displacement_exponent,
-            },
-        )
 
 
 def pull(
@@ -75,67 +48,12 @@ def pull(
     if law[1] == 0.0:
         return size, (size * law[2] / x if x != 0.0 else 0.0)
     if way == 0.0:
-        return 0.0, (size / (h * law[3]) if law[1] == 1.0 else 0.0)
+        return 0.0, (size / (h * law[3]) if law[1] == 1.0 else 1e300 if law[1] < 1.0 else 0.0)
     size *= power(way / (h * law[3]), law[1])
     slope = size * law[1] / way
     if x < memory[1]:
         size = -size
     return size, (slope + size * law[2] / x if x != 0.0 else slope)
-
-
-def settle(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, y: float, r: float, h: float, about: float
-) -> float:
-    """Return F of x + r F(x, (x - last) / h) = y, and carry the memory to that x."""
-    x = _position(law, memory[1], y, r, h)
-    if law[1] == 0.0 and x != memory[1]:
-        level = law[0] * power(abs(x / law[4]), law[2])
-        found = level if x > memory[1] else -level
-    else:
-        found = (y - x) / r
-    memory[1] = x
-    memory[4] = found
-    return float(found)
-
-
-def _position(law: FloatArray, last: float, y: float, r: float, h: float) -> float:
-    """Return x of x + r F(x, (x - `last`) / h) = y: the root nearest to the last position."""
-    way = abs(y - last)
-    if way == 0.0:
-        return last
-    sign = 1.0 if y > last else -1.0
-    p, a = law[1], law[2]
-    if p == 0.0:
-        level = r * law[0] * power(abs(last / law[4]), a)
-        if way <= level:
-            return last  # it sticks
-        if a == 0.0:
-            return float(y - sign * level)
-    # how far it moves, u; for 0 < p < 1 by w = u^p, in which the force has a slope everywhere
-    root = p if 0.0 < p < 1.0 else 1.0
-    low, high = 0.0, power(way, root)
-    w = high
-    for _ in range(60):
-        u = w if root == 1.0 else power(w, 1.0 / root)
-        x = last + sign * u
-        force = r * law[0] * power(u / (h * law[3]), p) * power(abs(x / law[4]), a)
-        rest = u + force - way
-        if abs(rest) <= 1e-13 * way or high - low <= 1e-15 * high:
-            break
-        if rest > 0.0:
-            high = w
-        else:
-            low = w
-        slope = 1.0
-        if x != 0.0:
-            slope += force * a * sign / x
-        if root == 1.0:
-            slope += force * p / u if u > 0.0 else 0.0
-        else:
-            slope = slope * u / (root * w) + force / w if w > 0.0 else 0.0
-        step = w - rest / slope if slope > 0.0 else low
-        w = step if low < step < high else 0.5 * (low + high)
-    return float(last + sign * (w if root == 1.0 else power(w, 1.0 / root)))
 
 
 # ---------------------------------------------------------------- as a law of speed

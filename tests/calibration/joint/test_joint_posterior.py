@@ -27,7 +27,7 @@ from calibration.result.record import STATE, ParameterPrior, prior_samples
 from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import published_measurements
 from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
-from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_damping_ratio
 
 FloatArray = NDArray[np.float64]
 

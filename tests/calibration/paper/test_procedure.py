@@ -25,7 +25,7 @@ from calibration.paper.procedure import (
     fit_masses,
     read_published_results,
 )
-from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_damping_ratio
 
 REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}

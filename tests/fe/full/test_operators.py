@@ -3,13 +3,13 @@ import pytest
 from scipy.sparse.linalg import norm
 
 from fe.full.assembly import Discretisation
-from fe.full.gauges import gauge_output
 from fe.full.operators import (
     ROOT_UNKNOWNS,
     AffineOperators,
     assemble,
     cell_density,
     cell_elasticity,
+    gauge_output,
     modulus_variation,
 )
 from fe.full.statics import tip_stiffness

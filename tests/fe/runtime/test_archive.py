@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fe.runtime.archive import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
+from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
 
 
 @given(

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fe.runtime.damping import rayleigh_coefficients, rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_coefficients, rayleigh_damping_ratio
 
 
 def test_published_coefficients_give_the_measured_damping() -> None:

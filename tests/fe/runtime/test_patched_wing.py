@@ -10,17 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from fe.full.gauges import gauge_output
 from fe.full.operators import (
     AffineOperators,
     assemble,
     cell_elasticity,
+    gauge_output,
     modulus_variation,
     section_displacement,
 )
 from fe.full.patch_operators import PatchOperators, TurnedStrain
 from fe.full.statics import Factorisation
-from fe.full.turn_load import STANDARD_GRAVITY, lift_load
+from fe.full.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load
 from fe.reduction.reduced_basis import Reduction
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
@@ -36,7 +36,6 @@ from fe.runtime.patch import (
     Washout,
 )
 from fe.runtime.patched_wing import PatchedWing
-from fe.wing import lift as lift_module
 from fe.wing.design import WingDesign
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
@@ -321,7 +320,7 @@ def test_washout_is_another_lift_distribution(
     wing, operators = coarse_patched_wing, coarse_operators
     coefficient, factor = 0.15, 3.0
     plan, lift = coarse_design.planform, coarse_design.lift
-    course = lift_module.DISTRIBUTIONS[lift.distribution](plan)
+    course = DISTRIBUTIONS[lift.distribution](plan)
     points, weights = np.polynomial.legendre.leggauss(400)
     eta = 0.5 * (points + 1.0)
     kept = 1.0 - coefficient * factor * eta**exponent
@@ -332,7 +331,7 @@ def test_washout_is_another_lift_distribution(
 
     restriction = operators.expansion.T
     plain = restriction @ lift_load(operators.wing_mesh, operators.discretisation)
-    monkeypatch.setitem(lift_module.DISTRIBUTIONS, lift.distribution, washed)
+    monkeypatch.setitem(DISTRIBUTIONS, lift.distribution, washed)
     changed = restriction @ lift_load(operators.wing_mesh, operators.discretisation) * share
     # what balances the weight is lift of the same course
     z_force = lift.force / lift.load_factor

@@ -14,16 +14,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import fe.runtime.archive
+import fe.runtime.kept_arrays
 from fe.full.modes import eigenmodes
 from fe.full.operators import AffineOperators
 from fe.full.statics import Factorisation, static_outputs, tip_stiffness
 from fe.reduction.reduced_basis import Reduction
-from fe.runtime.archive import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import OutsideModelError, ReducedModelFileError
+from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.reduced import ReducedModel
 
-PACKAGE = Path(fe.runtime.archive.__file__).parent
+PACKAGE = Path(fe.runtime.kept_arrays.__file__).parent
 
 # The corners and edges of the box count most; the rest is anywhere inside.
 young_modulus_factors = st.sampled_from((0.9, 1.0, 1.1)) | st.floats(0.9, 1.1)
@@ -361,7 +361,7 @@ def test_failed_write_leaves_the_old_file(
     def full_disk(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(fe.runtime.archive.os, "fsync", full_disk)
+    monkeypatch.setattr(fe.runtime.kept_arrays.os, "fsync", full_disk)
     with pytest.raises(OSError, match="No space left"):
         model.save(path)
     assert path.read_bytes() == b"old"

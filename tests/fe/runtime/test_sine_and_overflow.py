@@ -5,21 +5,23 @@ import pytest
 
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import overflow, sine_force
-from fe.runtime.motion import laws_of
+from fe.runtime.motion import laws_of, static_solution
 from fe.runtime.patch import ModelPatch, Overflow, SineForce
 
 
 @pytest.mark.parametrize("y", [-2.0, 0.3, 5.0])
-def test_a_sine_settles_where_flexibility_and_force_meet(y: float) -> None:
-    law = np.array([*SineForce("p", 2.0, 3.0, 0.4).row, 0.0, 0.0])
-    memory = np.zeros(5)
-    found = sine_force.settle(law, np.zeros(1), memory, y, 0.1, 0.01, y)
-    x = memory[1]
-    assert x + 0.1 * found == pytest.approx(y, abs=1e-12)
-    assert found == pytest.approx(2.0 * np.sin(3.0 * x + 0.4), abs=1e-12)
-    step = 1e-6
-    slope = (sine_force.force(law, memory, x + step) - sine_force.force(law, memory, x - step)) / (2.0 * step)
-    assert sine_force.slope(law, np.zeros(1), memory, x) == pytest.approx(slope, rel=1e-6)
+def test_a_sine_rests_where_flexibility_and_force_meet(y: float) -> None:
+    laws = laws_of(ModelPatch((SineForce("p", 2.0, 3.0, 0.4),)), ("p",))
+    found = static_solution(laws, np.array([[y]]), np.array([[0.1]]))
+    x, own = found.positions[0, 0], found.forces[0, 0]
+    assert x + 0.1 * own == pytest.approx(y, abs=1e-12)
+    assert own == pytest.approx(2.0 * np.sin(3.0 * x + 0.4), abs=1e-11)
+    step, memory = 1e-6, np.zeros(5)
+    less, more = (
+        sine_force.pull(laws.values[0], np.zeros(1), memory, x + way, 1.0, 1)[0] for way in (-step, step)
+    )
+    slope = sine_force.pull(laws.values[0], np.zeros(1), memory, x, 1.0, 1)[1]
+    assert slope == pytest.approx((more - less) / (2.0 * step), rel=1e-6)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5])

@@ -11,9 +11,8 @@ from scipy.linalg import expm
 from fe.full.operators import AffineOperators
 from fe.full.statics import Factorisation
 from fe.reduction.reduced_basis import Reduction
-from fe.runtime.damping import rayleigh_damping_ratio
 from fe.runtime.errors import InvalidStateError, OutsideModelError
-from fe.runtime.modal_system import exact_step
+from fe.runtime.modal_system import exact_step, rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator, TransientState
@@ -172,6 +171,14 @@ def test_step_in_load_overshoots_as_in_closed_form(integrator: ModalIntegrator) 
     assert tip > 1.2 * integrator.outputs(integrator.at_rest((3.0, 0.0)))[-1]
 
 
+def energy_of(integrator: ModalIntegrator, state: TransientState) -> float:
+    """Kinetic plus strain energy of the kept modes about the equilibrium under the load [J]."""
+    omega, structure = 2.0 * np.pi * integrator.modes.frequency, integrator.structure
+    rest = structure.shapes.T @ structure.loads @ state.load / omega**2
+    deviation = omega * (state.displacement - rest)
+    return float(0.5 * (state.velocity @ state.velocity + deviation @ deviation))
+
+
 @given(
     durations=st.lists(st.floats(1e-4, 1.0), min_size=1, max_size=20),
     tip=st.floats(-0.05, 0.05),
@@ -182,11 +189,11 @@ def test_energy_never_grows_under_constant_load(
 ) -> None:
     integrator = wing_integrator(model, **{**HEALTHY, "damping_alpha": 0.0, "damping_beta": beta})
     state = integrator.released(tip, (2.0, 0.0), TIP_FORCE)
-    energy = begin = integrator.energy(state)
+    energy = begin = energy_of(integrator, state)
     for duration in durations:
         state = integrator.advance(state, duration, (2.0, 0.0))
-        assert integrator.energy(state) <= energy * (1 + 1e-12) + 1e-15
-        energy = integrator.energy(state)
+        assert energy_of(integrator, state) <= energy * (1 + 1e-12) + 1e-15
+        energy = energy_of(integrator, state)
     if beta == 0.0:
         assert energy == pytest.approx(begin, rel=1e-9, abs=1e-15)
 
@@ -273,7 +280,7 @@ def test_damage_in_flight_keeps_motion_and_changes_strain(
     np.testing.assert_allclose(damaged.outputs(late)[:-1], static.strain, rtol=1e-6)
     # from rest, damage sets the wing moving about its new, lower-stiffness equilibrium
     jolted = damaged.take_over(integrator.at_rest((3.0, 0.0)), integrator)
-    assert damaged.energy(jolted) > 0.0
+    assert energy_of(damaged, jolted) > 0.0
 
 
 def test_no_change_of_health_creates_energy_in_free_vibration(
@@ -281,7 +288,7 @@ def test_no_change_of_health_creates_energy_in_free_vibration(
 ) -> None:
     damaged = wing_integrator(model, **{**HEALTHY, "stiffness_loss": (0.6, 0.6)})
     state = integrator.advance(integrator.released(0.03, (0.0, 0.0), TIP_FORCE), 0.02, (0.0, 0.0))
-    assert damaged.energy(damaged.take_over(state, integrator)) <= integrator.energy(state)
+    assert energy_of(damaged, damaged.take_over(state, integrator)) <= energy_of(integrator, state)
 
 
 def test_bad_input_is_refused(model: ReducedModel, integrator: ModalIntegrator) -> None:

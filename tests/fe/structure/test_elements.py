@@ -14,14 +14,13 @@ from skfem.helpers import ddot, sym_grad
 from skfem.models.elasticity import lame_parameters, linear_stress
 
 from fe.full.assembly import isotropic_elasticity
+from fe.structure.design import Gauge
 from fe.structure.elements import KINDS, jacobians, mass_blocks, stiffness_blocks
 from fe.structure.gauges import gauge_rows
-from fe.structure.loads import area_shares, area_vectors
-from fe.structure.location import Locator
+from fe.structure.location import Locator, area_shares, area_vectors
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import assembled
-from fe.structure.rosettes import Gauge
 
 SKFEM: dict[str, Any] = {
     "tetra": ElementTetP1(),

@@ -13,10 +13,10 @@ import pytest
 
 from fe.runtime.errors import MeshError
 from fe.structure.elements import KINDS, meshio_with_wedges
+from fe.structure.field import static_responses
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import load_and_assemble
-from fe.structure.solution import static_responses
 
 DECKS = Path("/usr/share/doc/calculix-ccx-test/examples/test")
 

@@ -11,11 +11,9 @@ import pytest
 
 from fe.runtime.errors import InvalidDesignError, InvalidStateError, MeshError
 from fe.structure.elements import KINDS
-from fe.structure.field import write_structure_vtu
-from fe.structure.memory import analysed_estimate, check_memory, upper_estimate
-from fe.structure.mesh_file import read_mesh
+from fe.structure.field import natural_frequencies, static_responses, weighed, write_structure_vtu
+from fe.structure.mesh_file import analysed_estimate, check_memory, read_mesh, upper_estimate
 from fe.structure.operators import Structure, load_and_assemble
-from fe.structure.solution import natural_frequencies, static_responses, weighed
 
 INNER, OUTER = 1.0, 2.0
 RING = """

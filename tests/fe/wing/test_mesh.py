@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from fe.full.assembly import gauss_points, jacobians, positions
 from fe.runtime.errors import InvalidDesignError, MeshError
-from fe.wing.airfoil import four_digit_half_thickness
 from fe.wing.grid import chord_lines
 from fe.wing.mesh import build_mesh, straight_edged
+from fe.wing.parts import four_digit_half_thickness
 
 RIB = {"thickness": 0.003, "young_modulus": 6e9, "poisson_ratio": 0.3, "density": 500.0}
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.slaves.base import Contents, Slave
 from fmu_asset.slaves.behaviour import StructureBehaviour, later_outputs
