@@ -88,10 +88,11 @@ def _share(share: ForceShare) -> ShareOfForce:
 
 def shown_force(problem: Problem, search: Search, fit: CandidateFit) -> MissingForce | None:
     """Return the missing force, with the law of a verdict drawn through it; None where none can be seen."""
-    terms, ports = fit.candidate.terms, problem.model.ports()
-    if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
-        return None
+    terms = fit.candidate.terms
     try:
+        ports = problem.model.ports()
+        if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
+            return None
         force, found = _along(problem, search, fit)
         return missing_force(force, force.whole if found is None else found)
     except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # a picture that cannot be is left out

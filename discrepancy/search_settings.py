@@ -152,16 +152,16 @@ class SearchSettings:
 
     # ---------------------------------------------------------------- weighed with a remainder
     weighed_sets: tuple[int, ...] = (8, 4, 2)
-    """Sets of one, two and three effects whose remainders are looked at."""
+    """Sets of one, two and three effects that may be fitted under the wider noise of what is left."""
     weighed_fits: int = 7
-    """Of these, how many are fitted with them at most."""
+    """Of these, how many are at most."""
     weighed_within: float = 60.0
-    """Log evidence below the best one from which on they are not: a fit with its remainder moves by less."""
+    """Log evidence below the best one from which on they are not: such a fit moves by less."""
     least_share: float = 0.5
-    """Lower end of the explained share that a name in part needs."""
+    """Share that the interval of a name in part must reach; its lower end too where readings are compared."""
     widened: float = 2.0
     """How many times wider the priors of calibrated parameters and gains count for a name in part: they take
-    up what is left, and are those of the model with its remainder."""
+    up what is left."""
     told_by_data: float = 0.8
     """Prior deviations below which a shape is known from the data, so that a verdict tells it."""
     sliver: float = 0.004
@@ -170,7 +170,7 @@ class SearchSettings:
     """By how much evidence and prior of a set with such an effect must be above those of the set without it:
     it was chosen among all that may stand there."""
     stand_in_range: float = 3.0
-    """Prior deviations beyond which a stand-in (clock, gain, drift, line) names nothing in part."""
+    """Prior deviations beyond which a calibrated parameter is told as far off."""
 
     # ---------------------------------------------------------------- what is judged is computed finely
     solver_share: float = 0.1

@@ -89,23 +89,20 @@ def _dependent(problem: Problem, fit: CandidateFit) -> FloatArray:
     return np.ones(len(problem.channel_names)) if left is None else np.where(left.of_noise, left.factor, 1.0)
 
 
-def prior_tests(
-    problem: Problem, fit: CandidateFit, widened: float = 1.0, *, own: bool = False
-) -> list[tuple[str, float]]:
+def prior_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
     """Return name and p-value of the tests that unknowns stayed within their priors.
 
     A wrong model can fit by leaving what was calibrated, and a law by becoming another one: a joint that
     slips at nothing is a soft one. An effect's size may be what it will. Conservative: estimates scatter less
-    than the prior. `widened`: how many times wider the priors of what was calibrated are taken; `own`: the
-    effects' unknowns alone.
+    than the prior.
     """
     count = len(problem.shared.parameter_mean)
     proper = problem.shared.gain_precision > 0.0
-    groups = {} if own else {
+    groups = {
         "calibrated parameters beside their priors": fit.point.shared[:count],
         "gains beside their priors": fit.point.shared[count:][proper],
-    }  # fmt: skip
-    tests = [(name, float(chi2.sf(u @ u / widened**2, u.size))) for name, u in groups.items() if u.size]
+    }
+    tests = [(name, float(chi2.sf(u @ u, u.size))) for name, u in groups.items() if u.size]
     for term, part in zip(fit.candidate.terms, fit.candidate.parts(fit.point.effect), strict=True):
         count = len(term.effect.parameters)
         forms = zip(term.effect.parameters, part[:count].tolist(), strict=True)

@@ -29,6 +29,8 @@ SWINGS = -0.25
 """Autocorrelation at its first minimum below which a process swings."""
 LIKE_RECORD = 3.0
 """Deviations within which the correlation of a noise record is that of what is left."""
+LEAST_WHITE = 1e-12
+"""Least share of what is left that is taken for noise where none is recorded."""
 STEPS = 12
 """Steps of a hypothesis under the wider noise."""
 
@@ -54,14 +56,15 @@ def left_by(problem: Problem, found: CandidateFit) -> Remainder:
             continue
         rho, chance = _autocorrelation(series)
         of_noise[channel] = not larger and _is_of_record(problem, name, interval, float(rho[0]), counted)
-        level = 1.0 if of_noise[channel] else left
+        level = 1.0 if of_noise[channel] else max(left, 1.0) if known > 0.0 else left
         factor[channel] = np.sqrt(level * max(1.0 + 2.0 * float(np.sum(rho**2 - chance)), 1.0))
         beside = left / noise_of[channel] - 1.0
         if of_noise[channel] or beside <= 0.0:
             continue
-        own = rho * (1.0 + beside) / beside
+        ratio = (1.0 + beside) / beside
+        own = rho * ratio
         size[channel] = np.sqrt(beside)
-        time[channel] = interval * max(1.0 + 2.0 * float(np.sum(own**2 - chance)), 1.0)
+        time[channel] = interval * max(1.0 + 2.0 * float(np.sum(own**2 - ratio**2 * chance)), 1.0)
         first = int(np.argmax(np.diff(own) > 0.0))  # the first minimum
         if own[first] < SWINGS:
             frequency[channel] = 0.5 / ((first + 1) * interval)
@@ -81,7 +84,7 @@ def noise_levels(problem: Problem, found: CandidateFit) -> FloatArray:
         quick = [np.diff(item, 2) for item in series]
         white = sum(float(item @ item) for item in quick) / 6.0 / max(sum(len(item) for item in quick), 1)
         at_rest = 1.0 / problem.precisions(found.sums)[channel]
-        levels[channel] = min(white, total) if total > 0.0 else at_rest
+        levels[channel] = min(max(white, LEAST_WHITE * total), total) if total > 0.0 else at_rest
     return levels
 
 
@@ -90,17 +93,18 @@ def widened(problem: Problem, remainder: Remainder) -> Problem:
     return problem.widened(remainder.factor) if remainder.acts else problem
 
 
-def refitted(problem: Problem, wide: Problem, found: CandidateFit) -> CandidateFit:
+def refitted(problem: Problem, wide: Problem, found: CandidateFit) -> CandidateFit | None:
     """Return a hypothesis at its maximum under a wider noise, with evidence and covariance of that.
 
-    All else of it is told against the recorded noise, with what it leaves.
+    All else of it is told against the recorded noise, with what it leaves. None where it cannot be fitted so:
+    evidence under two noises is not compared.
     """
     if wide is problem:
         return found
     again = attempt(wide, found.candidate, found.point, iterations=STEPS)
     here = None if again is None else attempt(problem, found.candidate, again.point, iterations=0)
     if again is None or here is None:
-        return found
+        return None
     left = left_by(problem, here)
     return replace(
         here, log_evidence=again.log_evidence, covariance=again.covariance, converged=again.converged,

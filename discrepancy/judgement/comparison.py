@@ -17,19 +17,20 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.fitting import fit as fit_to
-from discrepancy.fits.gates import SHAPE_GAIN
+from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.wider_noise import noise_levels, refitted
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.hypotheses import key_of
+from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.naming import Explained
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShare, ForceShares
 from discrepancy.models.port_units import port_unit
 from discrepancy.search.starting_points import acts_within, are_related
 from discrepancy.search.strategy import Search
+from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate
 
 from .consistency_gate import consistency_gate
@@ -59,9 +60,13 @@ H = TypeVar("H", bound=Hypothetic)
 
 
 class Comparison(Protocol[H]):
-    """A way to compare hypotheses."""
+    """A way to compare hypotheses.
+
+    `least_end`: lower end of a share that a name needs.
+    """
 
     problem: Problem
+    least_end: float
 
     @property
     def ranked(self) -> Sequence[H]:
@@ -86,6 +91,12 @@ class Comparison(Protocol[H]):
     def followed(self, candidate: Candidate, effect: FloatArray) -> H | None:
         """Return a further hypothesis, begun at values (E,) of its unknowns; None: it cannot be."""
 
+    def freed(self, item: H) -> H | None:
+        """Return a single law with a shape of its own, where that was compared."""
+
+    def gate(self, item: H) -> Gate:
+        """Return how well the simulation beside a name leaves noise alone."""
+
     def against(self, item: H) -> str:
         """Return what else speaks against a name; empty: nothing."""
 
@@ -105,6 +116,7 @@ class ByForce:
 
     problem: Problem
     found: Search
+    least_end: float = SEARCH.least_end
 
     def __post_init__(self) -> None:
         assert self.found.force is not None
@@ -140,6 +152,16 @@ class ByForce:
     def followed(self, candidate: Candidate, effect: FloatArray) -> Explained | None:
         """Return a further hypothesis, begun at values (E,) of its unknowns; None: it cannot be."""
         return self.search.followed(self.search.whole, candidate, effect)
+
+    def freed(self, item: Explained) -> Explained | None:
+        """Return a single law with a shape of its own, where that was compared."""
+        (term,) = item.candidate.terms
+        key = key_of(Candidate((replace(term, free_shape=True),)))
+        return next((one for one in self.ranked if key_of(one.candidate) == key), None)
+
+    def gate(self, item: Explained) -> Gate:
+        """Return how well the best simulation leaves noise alone."""
+        return absolute_gate(self.problem, self.found.best())
 
     def against(self, item: Explained) -> str:
         """Return what else speaks against a name: nothing."""
@@ -178,7 +200,9 @@ class ByReadings:
 
     problem: Problem
     found: Search
-    _sets: dict[int, ResidualSet] = field(default_factory=dict)
+    least_end: float = SEARCH.least_share
+    _sets: dict[int, tuple[CandidateFit, ResidualSet]] = field(default_factory=dict)
+    _free: dict[Key, CandidateFit] = field(default_factory=dict)
 
     @property
     def ranked(self) -> Sequence[CandidateFit]:
@@ -206,8 +230,8 @@ class ByReadings:
     def residuals(self, item: CandidateFit) -> ResidualSet:
         """Return fitted and held-out trials beside their predictions."""
         if id(item) not in self._sets:
-            self._sets[id(item)] = residual_set(self.problem, item, sensitivities=False)
-        return self._sets[id(item)]
+            self._sets[id(item)] = item, residual_set(self.problem, item, sensitivities=False)
+        return self._sets[id(item)][1]
 
     @cached_property
     def _noise(self) -> Mapping[str, float]:
@@ -261,12 +285,22 @@ class ByReadings:
         for item in singles.values():
             free = free_shape(self.problem, item, 0)
             free = None if free is None else refitted(self.problem, wide, free)
+            if free is not None:
+                self._free[key_of(item.candidate)] = free
             if free is not None and free.log_evidence > best.log_evidence + SHAPE_GAIN:
                 joined[key_of(free.candidate)] = free
         self.found.judge(joined)
 
     def _acts(self, item: CandidateFit) -> bool:
         return all(acts_within(term.effect, self.problem.setting) for term in item.candidate.terms)
+
+    def freed(self, item: CandidateFit) -> CandidateFit | None:
+        """Return a single law with a shape of its own, where that was compared."""
+        return item if item.candidate.is_family else self._free.get(key_of(item.candidate))
+
+    def gate(self, item: CandidateFit) -> Gate:
+        """Return how well the simulation of a hypothesis leaves noise alone."""
+        return absolute_gate(self.problem, item)
 
     def against(self, item: CandidateFit) -> str:
         """Return what else speaks against a name: sizes that follow the trial, a gate that noise fails."""

@@ -62,7 +62,7 @@ class Court(Generic[H]):
             return "it describes readings, causes nothing and leaves more than noise"
         if item.candidate.is_family and len(item.candidate.terms) > 1:
             return "beside another law a shape of its own imitates nearly anything"
-        least = SEARCH.least_end
+        least = self.way.least_end
         inside = self.share(item, held_out=False)
         if _is_little(inside, least):
             return f"it is {part(inside)} where it was fitted"
@@ -111,10 +111,16 @@ class Court(Generic[H]):
         kept = [number for number, within in enumerate(acts) if within]
         candidate = Candidate(tuple(item.candidate.terms[number] for number in kept))
         known = next((one for one in self.ranked if key_of(one.candidate) == key_of(candidate)), None)
-        if known is None:
+        if known is not None:
+            return known
+        if key_of(candidate) not in self._followed:
             values = np.concatenate([parts[number] for number in kept])
-            known = self.way.followed(candidate, values)
-        return known
+            self._followed[key_of(candidate)] = self.way.followed(candidate, values)
+        return self._followed[key_of(candidate)]
+
+    @cached_property
+    def _followed(self) -> dict[Key, H | None]:
+        return {}
 
     def slimmed(self, best: H) -> H:
         """Return the simplest hypothesis that is as much of the missing force."""

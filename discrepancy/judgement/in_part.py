@@ -114,7 +114,10 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
             continue
         if own == kept or found.score(item) > found.score(whole) - SEARCH.sliver_gain:
             said = _Said(problem, found, first, way)
-            return said.in_part(item, said.court.probability(item))
+            probability = said.court.probability(item)
+            if said.court.against(item) or probability < SEARCH.sure:
+                return said.unexplained(item, probability)
+            return said.in_part(item, probability)
     found.judge({})
     return first, found, fit
 
@@ -187,6 +190,8 @@ class _Said(Generic[H]):
         probability = sum(court.probability(item) for item in members)
         if 1 < len(members) <= SEARCH.largest_group:
             return self.group(members, probability)
+        if len(members) > SEARCH.largest_group:
+            return self.unexplained(best, court.probability(best), len(members) - 1)
         if probability < SEARCH.sure or self.way.gain(members[0]) < SEARCH.bayes_factor:
             return self.unexplained(members[0], probability)
         return self.in_part(members[0], probability)
@@ -208,7 +213,7 @@ class _Said(Generic[H]):
         )
         return self._verdict(
             VerdictKind.NAMED_IN_PART, sentence, probability, best, [best], effects=effects, family=family,
-            gates=(absolute_gate(self.problem, self.found.best()),),
+            gates=(self.way.gate(best),),
         )  # fmt: skip
 
     def group(self, members: Sequence[H], probability: float) -> Outcome:
@@ -227,13 +232,13 @@ class _Said(Generic[H]):
             VerdictKind.GROUP, sentence, min(probability, 1.0), members[0], members,
             effects=tuple(effect for item in members for effect in self.effects(item)),
             group=tuple(" + ".join(sorted(plain_names(item.candidate.identifiers))) for item in members),
-            gates=(absolute_gate(self.problem, self.found.best()),),
+            gates=(self.way.gate(members[0]),),
         )  # fmt: skip
 
-    def unexplained(self, close: H | None = None, probability: float = 0.0) -> Outcome:
+    def unexplained(self, close: H | None = None, probability: float = 0.0, rivals: int = 0) -> Outcome:
         """Return the verdict that a force is missing which has no name: how large, and what orders it.
 
-        `close`: what has a probability that is too small for a name.
+        `close`: what has a probability that is too small for a name, or more rivals than tell anything.
         """
         court = self.court
         failed = next((gate.reason for gate in self.first.gates if gate.passed is False), "")
@@ -247,7 +252,9 @@ class _Said(Generic[H]):
             sentence += " No hypothesis is a tenth of it."
         else:
             share, why = court.told(shown), court.against(shown)
-            if close is not None:
+            if rivals:
+                why = f"{rivals} others are as much of it: that tells nothing"
+            elif close is not None and not why:
                 why = f"its probability is {probability:.2g}: a name needs {SEARCH.sure:g}"
             sentence += (
                 f" The best hypothesis, {_words(self.effects(shown))}, is {part(share)} {_where(share)}"
@@ -269,10 +276,11 @@ class _Said(Generic[H]):
         **more: Any,
     ) -> Outcome:
         court = self.court
-        scores = np.array([self.way.score(item) for item in court.ranked])
+        ranked = [*court.ranked, *(item for item in first if not any(item is one for one in court.ranked))]
+        scores = np.array([self.way.score(item) for item in ranked])
         weights = np.exp(scores - logsumexp(scores)).tolist()
         rows = sorted(
-            zip(weights, court.ranked, strict=True),
+            zip(weights, ranked, strict=True),
             key=lambda row: (not any(row[1] is item for item in first), -row[0]),
         )
         inclusion: dict[str, float] = {}
@@ -327,10 +335,8 @@ class _Said(Generic[H]):
     def _shape(self, best: H) -> str:
         """Return the sentence on the free shape of one law, unless trials not fitted speak against it."""
         (term, *others), told = best.candidate.terms, self.court.told
-        freed = replace(term, free_shape=True)
-        ranked = self.court.ranked
-        free = next((item for item in ranked if item.candidate.terms == (freed,)), None)
-        if others or free is None or told(free).value < told(best).value - SEARCH.slim:
+        free = None if others else self.way.freed(best)
+        if free is None or told(free).value < told(best).value - SEARCH.slim:
             return ""
         spread = np.sqrt(np.diag(self.way.covariance(free)))[len(free.shared) + len(term.effect.parameters) :]
         shown = [

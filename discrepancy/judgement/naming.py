@@ -7,7 +7,7 @@ import numpy as np
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
 from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.posterior import with_draws
@@ -56,7 +56,8 @@ def name(
     if found.force is None or first[0].kind is not VerdictKind.UNEXPLAINED:
         return first
     tell("nothing follows the missing force: comparing whole simulations")
-    second = Search(problem, found.effects, found.none, tell=tell)
+    again = attempt(problem, Candidate(), found.none.point)  # time steps may be finer by now
+    second = Search(problem, found.effects, again or found.none, tell=tell)
     second.run()
     other = _named(problem, second)
     second.force, second.forces = found.force, found.forces
@@ -97,13 +98,10 @@ def _named(problem: Problem, found: Search) -> tuple[Verdict, Search, CandidateF
         gate.name in ("absolute fit", "held-out trials") and gate.passed is False for gate in verdict.gates
     )
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
-    if verdict.kind is VerdictKind.GROUP and found.force is not None:
+    open_group = verdict.kind is VerdictKind.GROUP and found.force is not None
+    if open_group or (not stands and (misfits or verdict.kind in open_kinds)):
         return judged_in_part(problem, found, verdict)
-    if stands or not (misfits or verdict.kind in open_kinds):
-        return verdict, found, fit
-    if found.force is not None:
-        return judged_in_part(problem, found, verdict)
-    return judged_in_part(problem, found, verdict)
+    return verdict, found, fit
 
 
 def _without_readings(

@@ -4,7 +4,7 @@ The search itself goes by the noise as recorded: how far a fit is from the truth
 hypothesis leaves noise, thousands of nats separate what a model of a real thing cannot separate.
 """
 
-from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.wider_noise import left_by, refitted, widened
 from discrepancy.missing_force.hypotheses import Key, key_of
@@ -41,17 +41,27 @@ def _judged(found: Search, wide: Problem, chosen: list[CandidateFit]) -> dict[Ke
     ranked = sorted(chosen, key=lambda item: _promised(found, wide, item), reverse=True)
     least = _promised(found, wide, ranked[0]) - SEARCH.weighed_within if ranked else 0.0
     able = [item for item in ranked[: SEARCH.weighed_fits] if _promised(found, wide, item) > least]
-    judged: dict[Key, CandidateFit] = {(): refitted(found.problem, wide, found.none)}
+    judged: dict[Key, CandidateFit] = {}
+    _add(judged, found, wide, found.none)
     for number, item in enumerate(able):
         words = " and ".join(item.candidate.identifiers)
         found.tell(f"weighing {words} with its remainder, {len(able) - number - 1} more")
-        judged[key_of(item.candidate)] = refitted(found.problem, wide, found.exactly(item))
+        _add(judged, found, wide, found.exactly(item))
     leading = max(judged.values(), key=found.score).candidate.identifiers
     for item in list(found.all().values()):  # what the leading set holds is asked for by itself
         key, names = key_of(item.candidate), item.candidate.identifiers
         if names and set(names) < set(leading) and key not in judged:
-            judged[key] = refitted(found.problem, wide, found.exactly(item))
+            _add(judged, found, wide, found.exactly(item))
     return judged
+
+
+def _add(judged: dict[Key, CandidateFit], found: Search, wide: Problem, item: CandidateFit) -> None:
+    """Add a hypothesis under a wider noise, if it can be fitted so; no effect at all as it stands if not."""
+    again = refitted(found.problem, wide, item)
+    if again is None and not item.candidate.terms:
+        again = attempt(wide, item.candidate, item.point, iterations=0)
+    if again is not None:
+        judged[key_of(item.candidate)] = again
 
 
 def _promised(found: Search, wide: Problem, item: CandidateFit) -> float:

@@ -53,6 +53,20 @@ def test_white_noise_has_no_remainder(kit, freedom: float) -> None:  # type: ign
     assert wrong <= 1
 
 
+def test_white_noise_beyond_its_record_forgets_at_once(kit) -> None:  # type: ignore[no-untyped-def]
+    """Noise a fifth above its record: of some size, and no time over which it forgets."""
+    generator = np.random.default_rng(4)
+    problem = kit.closed_problem(
+        seed=3, kinds=("ringdown",), samples=600,
+        extra=lambda rows: 0.02 * np.sqrt(0.2) * generator.standard_normal(len(rows)),
+    )  # fmt: skip
+    left = left_by(problem, none_of(problem))
+    first = problem.channel_names.index("y1")
+    assert left.size[first] == pytest.approx(np.sqrt(0.2), rel=0.3)
+    assert left.time[first] < 0.05
+    assert np.all(left.factor >= 1.0)
+
+
 @pytest.mark.parametrize(("size", "tau", "frequency"), [(3.0, 0.15, 0.0), (2.0, 1.5, 9.0)])
 def test_size_time_and_frequency_are_found(kit, size: float, tau: float, frequency: float) -> None:  # type: ignore[no-untyped-def]
     extra = coloured(size, tau, frequency)
