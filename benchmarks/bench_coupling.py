@@ -13,7 +13,7 @@ from benchmarks.measurement import Measurement, median_seconds
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.companions.build import build_companion
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.layout import Layout
+from fmu_asset.coupling.layout import parts_of
 from fmu_asset.coupling.roles import resolve_roles
 from fmu_asset.coupling.structure import Component, Connector, Setting, SystemStructure, expand_connection
 from fmu_asset.coupling.wiring import Wiring
@@ -77,17 +77,17 @@ def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, 
 
     The FMUs alone have the bindings and inputs that they have in the system, and nothing passes between them.
     """
-    layout = Layout(wiring, binding, resolve_roles(wiring, binding))
+    parts = parts_of(wiring, binding, resolve_roles(wiring, binding))
     loads = itertools.cycle((2.0, 3.0))
     assets, inputs = [], []
     with CoupledAsset(wiring, binding, isolated=False) as coupled:
         try:
-            for index, component in enumerate(wiring.structure.components):
-                own = layout.component_binding(index)
-                asset = FmiAsset(component.fmu, own, isolated=False, parameters=layout.settings[index])
+            for component in wiring.structure.components:
+                part = parts[component.name]
+                asset = FmiAsset(component.fmu, part.binding, isolated=False, parameters=part.settings)
                 asset.reset()
                 assets.append(asset)
-                inputs.append(dict.fromkeys(own.load, 0.0))
+                inputs.append(dict.fromkeys(part.binding.load, 0.0))
 
             def one_by_one() -> None:
                 load = next(loads)

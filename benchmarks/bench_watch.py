@@ -17,7 +17,6 @@ from reporting.progress import SilentProgress
 from twin_master.assets.resolution import Overrides
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario
-from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begin_watch, resume_watch
@@ -54,7 +53,7 @@ def taken_up(folder: Path, log: Path) -> tuple[float, float]:
     watch, lock = resume_watch(folder, None, SilentProgress())
     prepared = time.process_time()
     try:
-        last_decision(journal, watch.scenario, watch.models[-1].knowledge.model)
+        watch.last_decision()
         watch.run(file_feed(log, watch.scenario, follow=True), told)
     except _Told:
         end = time.process_time()

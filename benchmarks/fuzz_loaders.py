@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fmu_asset.coupling.declared import read_declared
 from rich.console import Console
 from rich.table import Table
 
@@ -45,6 +44,7 @@ from discrepancy.models.lumped import LumpedModel
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import load_design
+from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import load_binding
 from fmu_asset.door.history_file import read_histories
 from fmu_asset.packing.patch_file import load_patch
@@ -57,8 +57,8 @@ from twin_master.report.reading import read_run as read_record
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario_check import check_scenario
+from twin_master.store.outcome import finished_run
 from twin_master.store.writing import read_run
-from twin_master.workflow import finished_run
 
 CPU_SECONDS = 20
 MEMORY = 4 * 1024**3
@@ -127,7 +127,7 @@ LOADERS: dict[str, Loader] = {
         "histories.csv", lambda path: read_histories(path, load_binding(binding_files()["uav_wing"])), TEXT
     ),
     "SSP": Loader("system.ssp", lambda path: read_ssp(path, path.parent / "fmus"), ARCHIVE),
-    "FMU": Loader("pump.fmu", read_declared, ARCHIVE),
+    "FMU": Loader("pump.fmu", read_fmu, ARCHIVE),
     "reduced model": Loader("reduced.npz", ReducedModel.load, ARCHIVE),
     "wing for patches": Loader("patched.npz", PatchArrays.load, ARCHIVE),
 }
