@@ -78,6 +78,8 @@ def plain_record(calibration: Calibration) -> dict[str, Any]:
             "names": [prior.name for prior in calibration.priors],
             "matrix": calibration.correlation.tolist(),
         },
+        # JSON is written with sorted keys, and pages list the quantities in the order of the calibration
+        "names": {"quantities": [figure.name for figure in calibration.quantities]},
     }
 
 

@@ -93,16 +93,19 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
         # what is flown starts at the mean of the calibration
         true_value = _table(_table(kept, "state"), record.parameter_name).get("mean")
     data = _table(kept, "data")
+    # the second of two keys is that of runs of earlier versions
     return CalibrationView(
         parameter=record.parameter_name,
         unit=record.parameter_unit,
         draws=draws,
         true_value=float(true_value) if isinstance(true_value, int | float) else None,
         prior=_moments(_table(kept, "prior")),
-        posterior=_arrays(_table(kept, "posterior"), "grid", "density"),
-        pairs=_arrays(data, "load", "displacement"),
+        posterior=_arrays(_table(kept, "exact") or _table(kept, "posterior"), "grid", "density"),
+        pairs=_arrays(data, "load", "displacement") or _arrays(data, "load_N", "displacement_m"),
         stiffness=_moments(
-            _table(kept, "tip_stiffness") or _table(_table(kept, "quantities"), "tip_stiffness")
+            _table(kept, "tip_stiffness_exact")
+            or _table(kept, "tip_stiffness")
+            or _table(_table(kept, "quantities"), "tip_stiffness")
         ),
         wing=str(kept.get("asset") or ""),
         campaign=str(kept.get("campaign") or ""),
@@ -121,9 +124,11 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
 def _figure_names(kept: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
     """Return the tables of calibrated figures with the names in them, in the order of the calibration."""
     names = _table(kept, "correlation").get("names")
+    # runs of earlier versions keep no order of the quantities
+    quantities = _table(kept, "names").get("quantities") or list(_table(kept, "quantities"))
     return [
-        ("state", [str(name) for name in names] if isinstance(names, list) else []),
-        ("quantities", list(_table(kept, "quantities"))),
+        (group, [str(name) for name in found] if isinstance(found, list) else [])
+        for group, found in (("state", names), ("quantities", quantities))
     ]
 
 

@@ -287,7 +287,7 @@ def test_a_calibration_file_shows_its_wing(
     view = report_calibration.calibration_view(flown)
     assert view is not None
     assert view.true_value == wing.mean("young_modulus_factor")  # the FMU starts at the mean
-    assert [figure.unit for figure in view.figures][:5] == ["1", "kg", "kg", "1/s", "s"]
+    assert [figure.unit for figure in view.figures][:6] == ["1", "kg", "kg", "1/s", "s", "N/m"]
     servo = view.figures[1]
     assert (servo.mean, servo.standard_deviation) == pytest.approx(
         (wing.mean("servo_mass"), wing.standard_deviation("servo_mass"))
