@@ -16,7 +16,7 @@ DEFAULT_PARTICLE_COUNT = 1_000_000
 """Particles, and samples of each measured pair, in the authors' script."""
 
 CELLS_PER_BANDWIDTH = 16
-"""Cells of a kernel density within one bandwidth; binning raises the kernel's variance by 0.03 %."""
+"""Cells of a kernel density within one bandwidth; binning raises the kernel's variance by less than 0.1 %."""
 
 _KERNEL_REACH = 8.0  # bandwidths; the kernel beyond holds 1e-15
 _MEDIAN_DEVIATION_OF_GAUSSIAN = 0.6745  # of a standard Gaussian, as rounded in the rule
@@ -95,17 +95,25 @@ def kernel_density(
     window: tuple[float, float],
     weights: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return grid (N,) and Gaussian kernel density (N,) of samples (n,), counted in cells, over a window."""
+    """Return grid (N,) and Gaussian kernel density (N,) of samples (n,) over a window.
+
+    A sample is shared by the grid points beside it: counted at one, few samples would be 2 % off.
+    """
     reach = _KERNEL_REACH * bandwidth
-    low, high = window[0] - reach, window[1] + reach
-    cells = math.ceil((high - low) / bandwidth * CELLS_PER_BANDWIDTH)
-    counted, edges = np.histogram(samples, bins=cells, range=(low, high), weights=weights)
-    spacing = (high - low) / cells
-    total = float(samples.size if weights is None else weights.sum())
+    low, spacing = window[0] - reach, bandwidth / CELLS_PER_BANDWIDTH
+    count = math.ceil((window[1] + reach - low) / spacing) + 1
+    shares = np.full(samples.size, 1.0 / samples.size) if weights is None else weights / weights.sum()
+    place = (samples - low) / spacing
+    near = (place >= 0.0) & (place < count - 1)
+    place, shares = place[near], shares[near]
+    cell = place.astype(np.int64)
+    right = np.bincount(cell, (place - cell) * shares, count)
+    mass = np.bincount(cell, shares, count) - right
+    mass[1:] += right[:-1]
     density = gaussian_filter1d(
-        counted / (total * spacing), bandwidth / spacing, mode="constant", truncate=_KERNEL_REACH
+        np.maximum(mass, 0.0) / spacing, CELLS_PER_BANDWIDTH, mode="constant", truncate=_KERNEL_REACH
     )
-    return 0.5 * (edges[1:] + edges[:-1]), density
+    return low + spacing * np.arange(count), density
 
 
 def particle_filter(
