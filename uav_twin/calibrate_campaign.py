@@ -73,23 +73,25 @@ def _record(result: "Calibration") -> dict[str, Any]:
 
     from reporting.record_json import plain
 
+    def posterior(name: str) -> dict[str, Any]:
+        return {
+            "posterior_mean": result.mean(name),
+            "posterior_deviation": result.standard_deviation(name),
+            "interval_90": list(result.interval(name)),
+        }
+
     return {
         "asset": result.asset,
         "model": result.model,
-        "campaign": result.source,
+        "campaign" if result.design is None else "laboratory": result.source,
         "procedure": result.procedure,
         "explained": result.explained,
         "seed": result.seed,
         "parameters": [
-            asdict(prior)
-            | {
-                "posterior_mean": result.mean(prior.name),
-                "posterior_deviation": result.standard_deviation(prior.name),
-                "interval_90": list(result.interval(prior.name)),
-                "prior_left": result.kept_share(prior.name),
-            }
+            asdict(prior) | posterior(prior.name) | {"prior_left": result.kept_share(prior.name)}
             for prior in result.priors
         ],
+        "quantities": [asdict(figure) | posterior(figure.name) for figure in result.quantities],
         "correlation": result.correlation.tolist(),
         "information_nat": result.information,
         "readings": plain(result.readings),

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -42,7 +43,7 @@ def calibrate_ringdown(
         trials = refine_by_extremes(trials)
     headings = ("figure", "unit", "found", "between trials", "standard error", "paper")
     rows = [
-        (f"mode {mode + 1}, {name}", unit, *(f"{value:.5g}" for value in (*found(mode), published[mode])))
+        (f"mode {mode + 1}, {name}", unit, (*found(mode), published[mode]))
         for mode in (0, 1)
         for name, unit, found, published in (
             ("natural frequency", "Hz", trials.frequency, PUBLISHED_FREQUENCIES),
@@ -50,15 +51,19 @@ def calibrate_ringdown(
         )
     ]
     console = terminal.console()
-    console.print(console_table(headings, rows, console.width))
+    console.print(console_table(headings, _cells(rows, ".5g"), console.width))
     if out is not None:
         from calibration.dynamics.figures import ring_down_figure
         from reporting.figures import to_png, to_svg
         from reporting.files import atomic_write_bytes, atomic_write_text
 
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows((headings, *rows))
+        csv.writer(text, lineterminator="\n").writerows((headings, *_cells(rows, ".10g")))
         atomic_write_text(out / "ringdown.csv", text.getvalue())
         figure = ring_down_figure(trials)
         atomic_write_bytes(out / "figures" / "ringdown.svg", to_svg(figure))
         atomic_write_bytes(out / "figures" / "ringdown.png", to_png(figure))
+
+
+def _cells(rows: Sequence[tuple[str, str, tuple[float, ...]]], digits: str) -> list[tuple[str, ...]]:
+    return [(figure, unit, *(format(value, digits) for value in values)) for figure, unit, values in rows]

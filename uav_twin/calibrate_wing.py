@@ -56,7 +56,8 @@ def calibrate_wing(
 ) -> None:
     """Tailor the model to one wing: planform, stiffness, masses and damping, in this order.
 
-    With a sub-command, one step alone.
+    A lab folder may hold one step alone; the sub-commands fit ring-downs, make a lab folder of a virtual
+    wing, and calibrate any model from a campaign.
     """
     given = (data, out, asset, design, measured)
     if context.invoked_subcommand is not None:
