@@ -220,13 +220,13 @@ def quantities_of(model: ReducedModel, samples: Float) -> Float:
     OutsideValidityError
         If a sample lies where the model does not hold.
     """
-    for name, column in zip(STATE[:3], samples.T, strict=False):
-        low, high = model.validity[name]
-        outside = column[~((column >= low) & (column <= high))]
+    for prior, column in zip(wing_priors(model.validity)[:3], samples.T, strict=False):
+        outside = column[~((column >= prior.low) & (column <= prior.high))]
         if outside.size:
+            unit = "" if prior.unit == "1" else f" {prior.unit}"
             raise OutsideValidityError(
-                f"a sample of {name} is {outside[0]:.4g}, but the model holds for {low:g} to {high:g}; check "
-                "the measurements."
+                f"a sample of the {prior.title} is {outside[0]:.4g}{unit}, but the model holds for "
+                f"{prior.low:g} to {prior.high:g}{unit}; check the measurements."
             )
     found = np.empty((len(samples), len(QUANTITIES)))
     for row, (factor, servo, pitot, alpha, beta) in enumerate(samples[:, : len(STATE)].tolist()):

@@ -28,6 +28,9 @@ SOURCE = (
 FIGURE_NAMES = ("load_test", "residuals", "procedure", "modes", "ring_down")
 """All that a wing's page has beyond that of any calibration, the last where there are records."""
 
+_EARLIER_FIGURES = ("masses", "quantities")
+"""What earlier versions drew; it would show another calibration than the file beside it."""
+
 LOAD_FACTOR = 3.0
 """Of the turn in which `wing.vtu` shows the wing."""
 
@@ -63,7 +66,7 @@ def write_wing_folder(
         report=report,
         figures=lambda: {} if fields is None else _figures(calibration, fields),
         extra=lambda page, drawings: _add_sections(page, calibration, drawings),
-        companions=[WING_FIELDS, MODE_FIELDS, *drawing_names(FIGURE_NAMES)],
+        companions=[WING_FIELDS, MODE_FIELDS, *drawing_names((*FIGURE_NAMES, *_EARLIER_FIGURES))],
         write_others=write_others,
     )
 
