@@ -53,6 +53,7 @@ def test_ringdown(
     out = tmp_path / "out"
     assert call(monkeypatch, "ringdown", "--data", str(plots), "--out", str(out), *options) == 0
     found = figures(out / "ringdown.csv")
+    assert all(len(str(value)) > 8 for value in found.values())  # the console has five digits
     assert found["mode 1, natural frequency"] == pytest.approx(5.65, rel=5e-3)
     assert found["mode 2, natural frequency"] == pytest.approx(29.9, rel=2e-2)
     assert (out / "figures" / "ringdown.svg").is_file()

@@ -250,6 +250,14 @@ def test_calibration_shows_draws_posterior_and_measurements(
     }
     view = report_calibration.calibration_view(replace(record, calibration=kept))
     assert view is not None
+    earlier = {
+        "prior": kept["prior"],
+        "exact": kept["posterior"],
+        "data": {"load_N": kept["data"]["load"], "displacement_m": kept["data"]["displacement"]},
+        "tip_stiffness_exact": kept["tip_stiffness"],
+    }
+    told = report_calibration.calibration_view(replace(record, calibration=earlier))
+    assert repr(told) == repr(view)  # a run of an earlier version
     figure = report_calibration.calibration_figure(view)
     assert_allclose(line(figure.axes[0], "measured"), [[2.5, 4.0], [5.0, 8.0], [7.5, 11.0]])
     assert_allclose(line(figure.axes[0], "calibrated")[1], [8.1, 1e3 * 8.1 / 681.1])
