@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import numpy as np
 import pytest
 
-from calibration.errors import ExperimentFileError
+from calibration.errors import ExperimentFileError, OutsideValidityError
+from calibration.result.record import STATE
+from calibration.wing.calibrate import quantities_of
 from calibration.wing.lab_data import published_data, read_lab_folder
+from fe.runtime.reduced import ReducedModel
 
 AUTHORS = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 
@@ -78,3 +84,12 @@ def test_a_weighed_mass(tmp_path: Path) -> None:
 def test_records_that_are_asked_for_must_be_there(tmp_path: Path) -> None:
     with pytest.raises(ExperimentFileError, match="no ring-down record, and --measured asks for them"):
         read_lab_folder(folder_with(tmp_path, "", 1, 2), "measured")
+
+
+def test_a_sample_beyond_the_model_is_told_with_its_unit() -> None:
+    model = cast(
+        ReducedModel,
+        SimpleNamespace(validity=dict.fromkeys(STATE[:3], (0.1, 0.2)) | {STATE[0]: (0.85, 1.15)}),
+    )
+    with pytest.raises(OutsideValidityError, match=r"mass of each servo is 0\.25 kg, .* 0\.1 to 0\.2 kg"):
+        quantities_of(model, np.array([[1.0, 0.25, 0.15, 1.0, 1e-3]]))
