@@ -28,6 +28,7 @@ RESULTS_FILE = "massoptimizationresults.csv"
 
 _RESULT_COLUMNS = (
     "e_sample", "mass_servo_1", "mass_pitot", "freq_1", "freq_2", "zeta_1", "zeta_2",
+    "target_freq_1", "target_freq_2",
 )  # fmt: skip
 
 FloatArray = NDArray[np.float64]
@@ -169,7 +170,7 @@ def read_published_results(path: Path) -> PaperSamples:
     """
     table = read_table(find_lab_file(Path(path), STEP_FOLDER / RESULTS_FILE), LAB_ERRORS)
     columns = np.array([table.positive_numbers(name, "the authors' step 3") for name in _RESULT_COLUMNS])
-    first, second = columns[5:, 0].tolist()
+    first, second = columns[5:7, 0].tolist()
     pairs = columns[3:5].T
     damping = [damping_coefficients((f1, f2), (first, second)) for f1, f2 in pairs.tolist()]
     return PaperSamples(np.column_stack([columns[:3].T, damping]), pairs)
