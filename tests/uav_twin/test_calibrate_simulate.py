@@ -25,7 +25,9 @@ def simulate(monkeypatch: pytest.MonkeyPatch, out: Path, *arguments: object) -> 
     )
 
 
-def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_folder_with_its_truth(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     out = tmp_path / "lab"
     given = ("--e", 0.99, "--servo-mass", 0.18, "--pitot-mass", 0.11, "--alpha", 0.9, "--beta", 5e-4)
     assert simulate(monkeypatch, out, *given) == 0
@@ -51,7 +53,13 @@ def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert simulate(monkeypatch, tmp_path / "again", *given) == 0
     for file in sorted(path for path in out.rglob("*") if path.is_file()):
         assert file.read_bytes() == (tmp_path / "again" / file.relative_to(out)).read_bytes()
-    # a reader of the command line takes it
+    # the command line takes it
+    capsys.readouterr()
+    assert call(monkeypatch, "calibrate", "--data", out, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["laboratory"].startswith("step1/geometry_data.csv read")
+    assert [item["name"] for item in told["quantities"]][:2] == ["tip_stiffness", "frequency_1"]
+    assert {"weighed_mass", "frequency_1"} <= {reading["name"] for reading in told["readings"]}
     assert call(monkeypatch, "calibrate", "ringdown", "--data", out, "--fitted") == 0
 
 
