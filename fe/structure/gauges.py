@@ -127,7 +127,7 @@ def spread_rosettes(locator: Locator, count: int) -> list[Rosette]:
     locator : Locator
         Of the mesh.
     count : int
-        Rosettes; on a surface of fewer faces one on each.
+        At most how many rosettes; fewer where several would come to lie on one face.
     """
     from scipy.cluster.vq import kmeans2, vq
 

@@ -2,13 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from pydantic import Field
 
 from fe.runtime.errors import InvalidDesignError
-from fe.structure.design import Gauge, MeshDesign, load_structure, with_rosettes
-from fe.structure.gauges import spread_rosettes
+from fe.structure.design import Gauge, MeshDesign, load_structure, parse_structure, with_rosettes
+from fe.structure.gauges import gauge_rows, spread_rosettes
 from fe.structure.location import Locator
 from fe.structure.mesh_file import read_mesh
 from fe.wing.parts import Part
@@ -27,14 +26,16 @@ class _Gauges(Part):
 
 
 def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenario:
-    """Return a scenario whose structure has more gauges, which are sensors behind those that it had.
+    """Return a scenario whose structure has more gauges, which are sensors.
+
+    In their order they stand behind the gauges that the file had and before those of its rosettes.
 
     Parameters
     ----------
     scenario : Scenario
         Its paths absolute.
     candidates : str
-        A number of rosettes that are spread over the surface, or a TOML file with tables `gauge` and
+        At most how many rosettes are spread over the surface, or a TOML file with tables `gauge` and
         `rosette` as a structure file has them.
     folder : Path
         Where the structure file with the gauges is put.
@@ -42,7 +43,8 @@ def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenar
     Raises
     ------
     MissionInputError
-        What is believed is no structure from a mesh, or the sensors are no strain gauges that are all alike.
+        What is believed is no structure from a mesh, the sensors are no strain gauges that are all alike, no
+        place is asked for, or the structure file has its gauges in a list.
     InvalidDesignError
         The candidates are wrong; the sentence names the place.
     """
@@ -53,13 +55,22 @@ def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenar
     own = isinstance(belief, StructureBelief) and load_structure(belief.all_files()[MODEL_COPY])
     if not isinstance(belief, StructureBelief) or not isinstance(own, MeshDesign):
         raise MissionInputError("--candidates needs a structure from a mesh as what is believed.")
+    if candidates.isdecimal() and not int(candidates):
+        raise MissionInputError("--candidates needs at least one place.")
     keep_files(folder, read_files(belief.all_files()))
     file = folder / MODEL_COPY
+    source = Path(belief.all_files()[MODEL_COPY]).parent / own.mesh  # this one stays
+    locator = Locator(read_mesh(source, own.unit, own.length_unit))
+    gauges = _gauges(candidates, locator)
     with file.open("a", encoding="utf-8") as text:
-        for gauge in _gauges(candidates, own, file.parent):
-            rows = (f"{key} = {json.dumps(value)}\n" for key, value in gauge.items())
+        for gauge in gauges:
+            rows = (f"{key} = {json.dumps(value)}\n" for key, value in gauge.model_dump().items())
             text.write("".join(("\n[[gauge]]\n", *rows)))
-    before, names = ([part.name for part in design.gauge] for design in (own, _design(file)))
+    before, names = ([part.name for part in design.gauge] for design in (own, _joined(file, candidates)))
+    try:
+        gauge_rows(locator.mesh, locator, gauges)
+    except InvalidDesignError as error:
+        raise InvalidDesignError(f"--candidates {candidates}: {error}") from error
     known = dict(zip(before, observation.titles or before, strict=True))
     chosen, titles = scenario.rewards.health_sensors, tuple(known.get(name, name) for name in names)
     limited = range(1, len(before) + 1) if chosen == "all" else chosen
@@ -75,17 +86,22 @@ def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenar
     )
 
 
-def _design(file: Path) -> MeshDesign:
-    design = load_structure(file)
+def _joined(file: Path, candidates: str) -> MeshDesign:
+    """Return the structure with the gauges; its file is a copy, so that what is wrong names the option."""
+    try:
+        content = read_toml(file, InvalidDesignError)
+    except InvalidDesignError as error:  # it could be read before
+        raise MissionInputError(
+            "--candidates needs the gauges of the structure file as tables [[gauge]], not in a list."
+        ) from error
+    design = parse_structure(content, f"--candidates {candidates}")
     assert isinstance(design, MeshDesign)
     return design
 
 
-def _gauges(candidates: str, design: MeshDesign, folder: Path) -> list[dict[str, Any]]:
-    """Return the candidates as tables of a structure file."""
+def _gauges(candidates: str, locator: Locator) -> tuple[Gauge, ...]:
     if candidates.isdecimal():
-        mesh = read_mesh(folder / design.mesh, design.unit, design.length_unit)
-        return [gauge for one in spread_rosettes(Locator(mesh), int(candidates)) for gauge in one.gauges()]
+        spread = spread_rosettes(locator, int(candidates))
+        return tuple(Gauge(**gauge) for one in spread for gauge in one.gauges())
     content = with_rosettes(read_toml(candidates, InvalidDesignError), candidates, InvalidDesignError)
-    found = checked(_Gauges, content, candidates, InvalidDesignError, what="a file of gauges")
-    return [gauge.model_dump() for gauge in found.gauge]
+    return checked(_Gauges, content, candidates, InvalidDesignError, what="a file of gauges").gauge

@@ -109,7 +109,7 @@ def resolved(library: Path, path: Path | str = "model_mismatch") -> Scenario:
 
 
 @pytest.mark.long
-def test_the_twin_may_believe_a_plain_record(
+def test_the_twin_may_believe_a_calibrated_wing(
     library_file: Path, tmp_path: Path, make_calibration: Callable[..., Calibration]
 ) -> None:
     file = save_calibration(make_calibration(), tmp_path / "wing.nc")
