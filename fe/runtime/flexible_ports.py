@@ -9,6 +9,8 @@ Written in the subset of Python that numba compiles too. NumPy and relative impo
 into the FMU.
 """
 
+import numpy as np
+
 from .laws import advance, dry, pull
 from .motion_arrays import FIRST_PARTS, Acting, Course, IntArray, Ports, State
 
@@ -123,6 +125,7 @@ def settle_port(
     # the root lies that way from the last position, if the structure is stable
     low, high = last, last + sign * 1e300
     x, rest, steep = last + sign * max(abs(push) - r * level, 0.0), 0.0, port
+    at = x
     for _ in range(80):
         total, slope, steepest = 0.0, 1.0, -1.0
         for j in range(count):
@@ -136,7 +139,7 @@ def settle_port(
             slope += r * change
             if change > steepest:
                 steep, steepest = j, change
-        rest = x + r * total - y
+        rest, at = x + r * total - y, x
         if abs(rest) <= 1e-13 * abs(push) + tolerance * (abs(x) + abs(y)):
             return float(x)
         if sign * rest > 0.0:
@@ -152,6 +155,10 @@ def settle_port(
             x = low + 0.1 * (high - low)
         else:
             x += sign * abs(rest)
+    # where neither the rest nor the bracket is small no root is found: the check for overflow says so
+    if not (abs(rest) <= 1e-6 * (abs(at) + abs(y)) or abs(high - low) <= 1e-15 * abs(at)):
+        state.current[steep] = np.nan
+        return np.nan
     if r > 0.0:  # a force that rises within rounding gives what is missing
         state.current[steep] -= rest / r
-    return float(x)
+    return float(at)

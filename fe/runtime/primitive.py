@@ -43,7 +43,8 @@ class Primitive:
     windows: tuple[Window, ...] = field(default=(), kw_only=True)
 
     def __init_subclass__(cls) -> None:
-        cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+        if "kind" not in cls.__dict__:
+            cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
     def __post_init__(self) -> None:
         if self.windows and not self.in_windows:

@@ -56,6 +56,7 @@ def test_samples_are_the_rows_of_the_whole_record(kind: str) -> None:
         sample = Sample(values[row], start + since[row], temperature[row], across[row], shear[row])
         read, memory = stream.read(sample, memory, interval)
         shown.append(read)
+        assert len(memory) == (7 if dynamic else 0)  # signal and stages: 3 of one gauge, then 2 of each gauge
     np.testing.assert_allclose(shown, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
 
 

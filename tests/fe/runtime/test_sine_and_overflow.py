@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from fe.runtime.errors import InvalidPatchError
+from fe.runtime.flexible_ports import settle_port
 from fe.runtime.laws import overflow, sine_force
 from fe.runtime.motion import laws_of, static_solution
+from fe.runtime.motion_arrays import State
 from fe.runtime.patch import ModelPatch, Overflow, SineForce
 
 
@@ -15,13 +17,29 @@ def test_a_sine_rests_where_flexibility_and_force_meet(y: float) -> None:
     found = static_solution(laws, np.array([[y]]), np.array([[0.1]]))
     x, own = found.positions[0, 0], found.forces[0, 0]
     assert x + 0.1 * own == pytest.approx(y, abs=1e-12)
-    assert own == pytest.approx(2.0 * np.sin(3.0 * x + 0.4), abs=1e-11)
+    assert own == pytest.approx(2.0 * np.sin(3.0 * x + 0.4), abs=1e-12)
     step, memory = 1e-6, np.zeros(5)
     less, more = (
         sine_force.pull(laws.values[0], np.zeros(1), memory, x + way, 1.0, 1)[0] for way in (-step, step)
     )
     slope = sine_force.pull(laws.values[0], np.zeros(1), memory, x, 1.0, 1)[1]
     assert slope == pytest.approx((more - less) / (2.0 * step), rel=1e-6)
+
+
+@pytest.mark.parametrize("flexibility", [0.1, 0.16, 10.0])  # from 1/6 N/m on there is more than one root
+def test_a_sine_on_flexibility_is_settled_or_not_a_number(flexibility: float) -> None:
+    laws = laws_of(ModelPatch((SineForce("p", 2.0, 3.0, 0.4),)), ("p",))
+    ports = laws.at(np.zeros((1, 0)), np.array([flexibility]), 0.0, np.zeros((2, 1)))
+    found = []
+    for y in np.linspace(-9.0, 9.0, 91):
+        state = State(np.zeros(0), np.zeros(0), laws.memory(), np.zeros(1))
+        x = settle_port(0, np.zeros(1, dtype=np.int64), ports, state, y, flexibility, 1.0, 1)
+        near = 1e-11 * (abs(x) + abs(y))
+        found.append(bool(abs(x + flexibility * state.current[0] - y) <= near))
+        assert found[-1] == np.isfinite(x)
+        if found[-1]:
+            assert flexibility * abs(state.current[0] - 2.0 * np.sin(3.0 * x + 0.4)) <= near
+    assert all(found) == (flexibility < 1.0 / 6.0)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5])
