@@ -25,8 +25,8 @@ _STEP = 1e-12
 """What a bound improves by at least."""
 _DEEPEST = 1000
 """Turns that a descent looks ahead at most."""
-MOST_BELIEFS = 250
-"""Beliefs to improve the bounds at, where the gap stays wider than asked for."""
+MOST_BELIEFS, MOST_UNSETTLED = 250, 1000
+"""Beliefs to improve the bounds at, where the gap stays wider than asked for; where they cannot settle."""
 _SHARE = 0.9
 """Of the gap of the prior that a descent leaves alone, so that it is short while the gap is wide."""
 _INFORMED = 200
@@ -39,6 +39,8 @@ _FIRST, _GROWTH = 32, 1.6
 """Beliefs that are visited before the bounds settle at all of them, and their growth until they do again."""
 _LARGEST = 1e9
 """Products that are summed up to compose all beliefs once, at most."""
+_MOST_PARTS = 5e7
+"""Parts of composed beliefs that are kept while the bounds settle, at most; each takes some 50 bytes."""
 _PASSES, _SWEEPS, _RAISED = 6, 15, 3
 """How often beliefs are composed anew then, sweeps in between, and sweeps of the lower bound."""
 
@@ -214,13 +216,19 @@ class _Upper:
                 self._value[same] = np.minimum(self._value[same], self.look(point))
         self._index()
 
+    def settles(self) -> bool:
+        """Return whether time and memory allow to compose what follows all beliefs."""
+        rows = len(self._point) * sum(len(table) for table in self._problem.likelihood)
+        looked = rows * len(self._corner)
+        return looked * self._point.shape[1] <= _LARGEST and looked * _PARTS <= _MOST_PARTS
+
     def settle(self) -> None:
         """Improve the bound at all beliefs at once, until what each has of the others has gone round.
 
         Where there is too much to compose the bound is left as it is.
         """
         problem, controls = self._problem, len(self._corner)
-        if len(self._point) * sum(table.size for table in problem.likelihood) * controls > _LARGEST:
+        if not self.settles():
             return
         certain = np.flatnonzero(self._point.max(axis=1) == 1.0)
         corners = np.argmax(self._point[certain], axis=1)
@@ -343,7 +351,7 @@ def plan_on_belief(
     *,
     first: int | None = None,
     gap: float = 0.005,
-    most_beliefs: int = MOST_BELIEFS,
+    most_beliefs: int | None = None,
 ) -> BeliefPlan:
     """Plan until the bounds of the return from the prior are close, or enough beliefs have been visited.
 
@@ -354,19 +362,22 @@ def plan_on_belief(
         Control of the first turn, where that is not decided on.
     gap : float
         Between the bounds at the end, as a share of the return.
-    most_beliefs : int
-        Beliefs to improve the bounds at, counted each time.
+    most_beliefs : int, optional
+        Beliefs to improve the bounds at, counted each time; if left out 250, or 1000 where there is too much
+        for the bounds to settle.
     """
     bounds, visited, trials, settled = _Bounds(problem), list[Float](), 0, _FIRST
     lower, upper = bounds.at(problem.prior, first)
-    while upper - lower > gap * max(abs(lower), abs(upper)) and len(visited) < most_beliefs:
+    most = most_beliefs or MOST_BELIEFS
+    while upper - lower > gap * max(abs(lower), abs(upper)) and len(visited) < most:
         path = bounds.descend(problem.prior, first, _SHARE * (upper - lower))
         for belief in reversed(path):
             bounds.raise_at(belief)
             bounds.upper.improve(belief)
         visited += path
         trials += 1
-        if len(visited) >= min(settled, most_beliefs):
+        most = most_beliefs or (MOST_BELIEFS if bounds.upper.settles() else MOST_UNSETTLED)
+        if len(visited) >= min(settled, most):
             settled = int(_GROWTH * len(visited))
             bounds.upper.settle()
             for belief in visited * _RAISED:
