@@ -1,13 +1,14 @@
 """`CoupledAsset`: several FMUs flown as one, with the face of `FmiAsset`."""
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Unpack
 
 import numpy as np
 
 from fmu_asset.door.binding import Binding
-from fmu_asset.door.exchange import Inputs, Values
+from fmu_asset.door.exchange import Inputs, Values, check_roles
 from fmu_asset.door.reading import Observation
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.simulation import ObservationHistory, SteppedAsset
@@ -161,6 +162,7 @@ class CoupledAsset(SteppedAsset):
         The components are initialised in the order of `schedule`; each takes the initial outputs of those
         before it. An input whose source comes later starts at the FMU's own start value.
         """
+        check_roles(inputs)
         if parameters is not None:
             self._take_parameters(parameters)
         self._held = {name: dict(part.constants) for name, part in self._parts.items()}
@@ -234,10 +236,14 @@ class CoupledAsset(SteppedAsset):
 
         Raises
         ------
+        FmuInputError
+            If `steps` is below 1.
         FmuError
             As `step`.
         """
-        count, seen, ended = steps or 1, [], ""
+        count, seen, ended = 1 if steps is None else operator.index(steps), [], ""
+        if count < 1:
+            raise FmuInputError(f"steps must be at least 1, but is {count}.")
         with (progress or SilentProgress()).stage("Simulating", total=count, unit="steps") as stage:
             for _ in range(count):
                 try:

@@ -8,6 +8,7 @@ stands a state, whose value at the beginning of the step can be used.
 
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from heapq import heappop, heappush
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -125,20 +126,30 @@ def strong_components(graph: Mapping[Node, Collection[Node]]) -> list[tuple[Node
     edges = [(number[node], number[successor]) for node in nodes for successor in graph[node]]
     begins, ends = zip(*edges, strict=True) if edges else ((), ())
     matrix = coo_array((np.ones(len(edges)), (begins, ends)), shape=(len(nodes), len(nodes)))
-    _, part_of = connected_components(matrix, connection="strong")
+    part_of = connected_components(matrix, connection="strong")[1].tolist()
     parts: dict[int, list[Node]] = {}
-    for node, part in zip(nodes, part_of, strict=True):
+    first: dict[int, int] = {}  # place of a part's first node
+    for index, (node, part) in enumerate(zip(nodes, part_of, strict=True)):
         parts.setdefault(part, []).append(node)
-    before: dict[int, set[int]] = {part: set() for part in parts}
+        first.setdefault(part, index)
+    behind: dict[int, set[int]] = {part: set() for part in parts}
     for begin, end in edges:
-        before[part_of[end]] |= {part_of[begin]} - {part_of[end]}
-    waiting, done = list(parts), dict[int, None]()
-    while waiting:
-        # the first one that follows nothing but what is there already
-        part = next(part for part in waiting if before[part] <= done.keys())
-        waiting.remove(part)
-        done[part] = None
-    return [tuple(parts[part]) for part in done]
+        behind[part_of[begin]].add(part_of[end])
+    before = dict.fromkeys(parts, 0)
+    for part, others in behind.items():
+        others.discard(part)
+        for other in others:
+            before[other] += 1
+    ready = [(first[part], part) for part, count in before.items() if not count]
+    order = []
+    while ready:  # in the order of the mapping, and so a heap
+        _, part = heappop(ready)
+        order.append(tuple(parts[part]))
+        for other in behind[part]:
+            before[other] -= 1
+            if not before[other]:
+                heappush(ready, (first[other], other))
+    return order
 
 
 def shortest_circle(graph: Mapping[Node, Collection[Node]], part: Sequence[Node]) -> tuple[Node, ...]:

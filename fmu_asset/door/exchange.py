@@ -42,6 +42,13 @@ class Inputs(TypedDict, total=False):
     port: Values | None
 
 
+def check_roles(inputs: Inputs) -> None:
+    """Refuse a misspelt keyword, which would pass where it stands for nothing; raises `TypeError`."""
+    for role in inputs:
+        if role not in Inputs.__annotations__:
+            raise TypeError(f"Inputs are {', '.join(Inputs.__annotations__)}, and {role!r} came.")
+
+
 def plain_values(values: Values) -> dict[str, float | list[float]]:
     """Return values as floats and lists of floats in the order of their names, to be kept as JSON."""
     arrays = {name: np.asarray(value, dtype=np.float64) for name, value in sorted(values.items())}
@@ -183,11 +190,12 @@ class Exchange:
                 )
             positions = [position for place in found for position in self._inputs.positions(place)]
             for position in positions:
-                if taken.setdefault(position, label) != label:
+                if position in taken:
                     raise BindingError(
                         f"In the binding {self._binding.name}, {label} and {taken[position]} set the same "
                         f"value of {found[0].variable.name!r}; keep one."
                     )
+                taken[position] = label
             self._slots[role][name] = self._slot(label, item, found[0].variable, positions)
         # A float within these limits is sent as it is; NaN and infinities are not within them.
         self._direct = {

@@ -22,7 +22,7 @@ from fmu_asset.instances.base import STATUS_NAMES
 from fmu_asset.worker.client import WorkerInstance
 
 from .binding import Binding, load_binding
-from .exchange import Exchange, Inputs, Values, plain_values
+from .exchange import Exchange, Inputs, Values, check_roles, plain_values
 from .placement import Housing, Instance, ResetTrial, Start, limits_of
 from .reading import Observation, Reader
 from .saved_state import StateMethod
@@ -157,6 +157,7 @@ class OpenedFmu(SteppedAsset):
         FmuCallError, FmuWorkerError, FmuTimeoutError
             If the FMU or its worker fails.
         """
+        check_roles(inputs)
         if parameters is not None:
             self._settings = self._exchange.settings(parameters)
             self._parameters = plain_values(parameters)
@@ -179,6 +180,7 @@ class OpenedFmu(SteppedAsset):
         FmuError
             If the FMU fails.
         """
+        check_roles(inputs)
         try:
             self._housing.renew()
         except FmuError as error:

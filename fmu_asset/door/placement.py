@@ -229,7 +229,10 @@ class Housing:
         self._start: Start | None = None
 
     def sibling(self) -> "Housing":
-        """Return an empty housing beside this one, which shares the extracted FMU as long as it is in use."""
+        """Return an empty housing beside this one, which shares the extracted FMU.
+
+        The folder stays until every sibling that was made of it is closed or collected, used or not.
+        """
         other = Housing(self._description, self._plan, self._limits, isolated=self._isolated)
         other._extraction, other.reset_trial = self._extraction, self.reset_trial
         return other

@@ -61,9 +61,9 @@ def meaning_of(text: str) -> Meaning | None:
     tokens = deque(item.groups(default="") for item in found)
     try:
         meaning = _product(tokens)
-    except (ValueError, IndexError, OverflowError):
+    except (ValueError, IndexError, ArithmeticError, RecursionError):
         return None
-    return None if tokens else meaning
+    return None if tokens or not 0.0 < meaning.factor < math.inf else meaning
 
 
 def _symbol(text: str) -> Meaning | None:

@@ -78,7 +78,9 @@ def checked_target(
     if target.suffix != suffix:
         raise error(f"{what} must have the suffix {suffix}, but {target} was given.")
     if target.exists() and not replace:
-        raise error(f"{target} exists: choose another --out or give --replace.")
+        raise error(
+            f"{target} exists: choose another --out or give --replace, in Python another path or replace."
+        )
     return target
 
 

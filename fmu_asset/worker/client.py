@@ -354,9 +354,10 @@ class WorkerInstance:
 def _resident_memory(process: int) -> int | None:
     """Return the resident memory of a process [bytes], or None if it is gone or the system does not say.
 
-    `RLIMIT_AS` would refuse FMUs that reserve address space and never use it (Java, .NET, CUDA, the stacks of
-    threads); under either limit an allocation fails inside the FMU, which then crashes, and nobody could say
-    why.
+    The limit of memory is of resident memory, and the twin keeps it: it looks at the worker while it waits
+    for a long call, and now and then between short ones. `RLIMIT_AS` would refuse FMUs that reserve address
+    space and never use it (Java, .NET, CUDA, the stacks of threads); under a resource limit an allocation
+    fails inside the FMU, which then crashes, and nobody could say why.
     """
     try:
         with open(f"/proc/{process}/statm", "rb") as file:  # noqa: PTH123 - half the time of Path.open

@@ -350,12 +350,29 @@ def test_what_cannot_be_bound_is_named(foreign_fmu: Any, variable: str, sentence
         FmiAsset(foreign_fmu("array3"), binding(1.0, **roles))
 
 
-def test_one_value_is_set_by_one_input(foreign_fmu: Any) -> None:
-    roles = {
-        "load": {"all": {"variable": "u", "unit": "1"}, "one": {"variable": "u[2]", "unit": "1"}},
-        "observation": {"y": {"variables": "y", "unit": "mm"}},
-    }
-    with pytest.raises(BindingError, match=r"load\.one and load\.all set the same value of 'u'; keep one"):
+@pytest.mark.parametrize(
+    ("inputs", "sentence"),
+    [
+        (
+            {"load": {"all": {"variable": "u", "unit": "1"}, "one": {"variable": "u[2]", "unit": "1"}}},
+            r"load\.one and load\.all set the same value of 'u'; keep one",
+        ),
+        (
+            {
+                "port": {
+                    "p": {
+                        "force": {"variables": ["u[2]", "u[2]"], "unit": "N"},
+                        "displacement": {"variables": ["y[1]", "y[2]"], "unit": "mm"},
+                    }
+                }
+            },
+            r"port\.p\.force and port\.p\.force set the same value of 'u'; keep one",
+        ),
+    ],
+)
+def test_one_value_is_set_by_one_input(foreign_fmu: Any, inputs: dict[str, Any], sentence: str) -> None:
+    roles = {**inputs, "observation": {"y": {"variables": "y", "unit": "mm"}}}
+    with pytest.raises(BindingError, match=sentence):
         FmiAsset(foreign_fmu("array3"), binding(1.0, **roles))
 
 

@@ -113,6 +113,18 @@ def test_several_steps_in_one(state_fmu: Path, linear_fmu: Path) -> None:
     np.testing.assert_allclose(results[0], results[1], rtol=1e-12)
 
 
+def test_what_is_no_number_of_steps_or_no_role_is_refused(state_fmu: Path, linear_fmu: Path) -> None:
+    pair, binding = oscillator(state_fmu, linear_fmu), watch("first.y1", step_size=0.1)
+    with CoupledAsset(pair, binding, isolated=False) as asset:
+        for steps in (0, -1):
+            with pytest.raises(FmuInputError, match=f"steps must be at least 1, but is {steps}"):
+                asset.simulate(steps=steps)
+        assert len(asset.simulate().time) == 1
+        with pytest.raises(TypeError, match="Inputs are control, health, load, port, and 'contrl' came"):
+            asset.reset(contrl={})  # type: ignore[call-arg]
+        assert asset.step_index == 1
+
+
 def test_a_chain_gives_in_one_step_what_one_system_would(linear_fmu: Path) -> None:
     """Direct feedthrough through three FMUs, written backwards, arrives in the same step."""
     parts = [

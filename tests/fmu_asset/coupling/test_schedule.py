@@ -121,3 +121,10 @@ def test_a_shortest_loop_is_named() -> None:
     (loop,) = algebraic_loops(links, through_all)
     assert {end.component for end in loop} == {"a", "b"}
     assert len(loop) == 5
+
+
+def test_a_long_chain_is_put_in_order_and_the_rest_stays_as_it_stood() -> None:
+    count = 30_000
+    chain = {node: [node - 1] if node else [] for node in range(count)}
+    found = strong_components(chain | {-1: [], -2: [-1]})
+    assert found == [(node,) for node in (*reversed(range(count)), -2, -1)]

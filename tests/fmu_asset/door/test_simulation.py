@@ -236,6 +236,13 @@ def test_the_limit_is_that_of_a_step_and_not_of_the_run(spring_mass: Path, sprin
         assert asset.simulate({"push": 1.0}, steps=count).extra["steps"][-1] == count
 
 
+def test_a_misspelt_keyword_is_refused(spring_mass: Path, spring_binding: Binding) -> None:
+    with FmiAsset(spring_mass, spring_binding, isolated=False) as asset:
+        for again in (asset.reset, asset.renew):
+            with pytest.raises(TypeError, match="Inputs are control, health, load, port, and 'loads' came"):
+                again(loads={})  # type: ignore[call-arg]
+
+
 def test_inputs_that_are_refused(spring_mass: Path, spring_binding: Binding) -> None:
     wrong: list[tuple[Inputs, type[FmuError], str]] = [
         ({"control": {"pull": 1.0}}, BindingError, r"has no control 'pull'; it has push"),

@@ -49,6 +49,10 @@ def si(**exponents: int) -> tuple[int, ...]:
         ("m)", None, 0.0, 0.0),
         ("", None, 0.0, 0.0),
         ("2", None, 0.0, 0.0),
+        ("pm40", None, 0.0, 0.0),
+        ("m/(pm40)", None, 0.0, 0.0),
+        ("Gm40", None, 0.0, 0.0),
+        pytest.param("(" * 3000 + "m" + ")" * 3000, None, 0.0, 0.0, id="nested"),
     ],
 )
 def test_unit_texts(text: str, exponents: tuple[int, ...] | None, factor: float, offset: float) -> None:
