@@ -113,7 +113,7 @@ def kernel_density(
     density = gaussian_filter1d(
         np.maximum(mass, 0.0) / spacing, CELLS_PER_BANDWIDTH, mode="constant", truncate=_KERNEL_REACH
     )
-    return low + spacing * np.arange(count), density
+    return low + spacing * np.arange(count, dtype=np.float64), density
 
 
 def particle_filter(
