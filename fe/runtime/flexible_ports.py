@@ -142,10 +142,7 @@ def settle_port(
         rest, at = x + r * total - y, x
         if abs(rest) <= 1e-13 * abs(push) + tolerance * (abs(x) + abs(y)):
             return float(x)
-        if sign * rest > 0.0:
-            high = x
-        else:
-            low = x
+        low, high = (low, x) if sign * rest > 0.0 else (x, high)
         if abs(high - low) <= 1e-15 * abs(x):
             break
         step = x - rest / slope if slope > 1e-6 else high
