@@ -9,8 +9,6 @@ Written in the subset of Python that numba compiles too. NumPy and relative impo
 into the FMU.
 """
 
-import numpy as np
-
 from .laws import advance, dry, pull
 from .motion_arrays import FIRST_PARTS, Acting, Course, IntArray, Ports, State
 
@@ -152,10 +150,6 @@ def settle_port(
             x = low + 0.1 * (high - low)
         else:
             x += sign * abs(rest)
-    # where neither the rest nor the bracket is small no root is found: the check for overflow says so
-    if not (abs(rest) <= 1e-6 * (abs(at) + abs(y)) or abs(high - low) <= 1e-15 * abs(at)):
-        state.current[steep] = np.nan
-        return np.nan
     if r > 0.0:  # a force that rises within rounding gives what is missing
         state.current[steep] -= rest / r
     return float(at)

@@ -26,20 +26,16 @@ def test_a_sine_rests_where_flexibility_and_force_meet(y: float) -> None:
     assert slope == pytest.approx((more - less) / (2.0 * step), rel=1e-6)
 
 
-@pytest.mark.parametrize("flexibility", [0.1, 0.16, 10.0])  # from 1/6 N/m on there is more than one root
-def test_a_sine_on_flexibility_is_settled_or_not_a_number(flexibility: float) -> None:
+@pytest.mark.parametrize("flexibility", [0.1, 0.16])  # from 1/6 m/N on there is more than one root
+def test_a_sine_on_flexibility_is_settled(flexibility: float) -> None:
     laws = laws_of(ModelPatch((SineForce("p", 2.0, 3.0, 0.4),)), ("p",))
     ports = laws.at(np.zeros((1, 0)), np.array([flexibility]), 0.0, np.zeros((2, 1)))
-    found = []
     for y in np.linspace(-9.0, 9.0, 91):
         state = State(np.zeros(0), np.zeros(0), laws.memory(), np.zeros(1))
         x = settle_port(0, np.zeros(1, dtype=np.int64), ports, state, y, flexibility, 1.0, 1)
         near = 1e-11 * (abs(x) + abs(y))
-        found.append(bool(abs(x + flexibility * state.current[0] - y) <= near))
-        assert found[-1] == np.isfinite(x)
-        if found[-1]:
-            assert flexibility * abs(state.current[0] - 2.0 * np.sin(3.0 * x + 0.4)) <= near
-    assert all(found) == (flexibility < 1.0 / 6.0)
+        assert abs(x + flexibility * state.current[0] - y) <= near
+        assert flexibility * abs(state.current[0] - 2.0 * np.sin(3.0 * x + 0.4)) <= near
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5])
