@@ -25,7 +25,7 @@ _STEP = 1e-12
 """What a bound improves by at least."""
 _DEEPEST = 1000
 """Turns that a descent looks ahead at most."""
-MOST_BELIEFS, MOST_UNSETTLED = 250, 1000
+MOST_BELIEFS, MOST_UNSETTLED = 180, 1000
 """Beliefs to improve the bounds at, where the gap stays wider than asked for; where they cannot settle."""
 _SHARE = 0.9
 """Of the gap of the prior that a descent leaves alone, so that it is short while the gap is wide."""
@@ -363,7 +363,7 @@ def plan_on_belief(
     gap : float
         Between the bounds at the end, as a share of the return.
     most_beliefs : int, optional
-        Beliefs to improve the bounds at, counted each time; if left out 250, or 1000 where there is too much
+        Beliefs to improve the bounds at, counted each time; if left out 180, or 1000 where there is too much
         for the bounds to settle.
     """
     bounds, visited, trials, settled = _Bounds(problem), list[Float](), 0, _FIRST
