@@ -10,7 +10,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.force import ForceCourse, MissingForce, missing_force
 from discrepancy.missing_force.hypotheses import key_of, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import OF_PREDICTIONS, ForceShare, ForceShares, orders
+from discrepancy.missing_force.shares import OF_PREDICTIONS, ForceShares, Share, orders
 from discrepancy.models.port_units import port_unit
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
@@ -81,7 +81,7 @@ def _along(problem: Problem, search: Search, fit: CandidateFit) -> tuple[ForceSe
     return force, found
 
 
-def _share(share: ForceShare) -> ShareOfForce:
+def _share(share: Share) -> ShareOfForce:
     sizes = (share.value, *share.interval, share.left, share.whole)
     return ShareOfForce(*sizes, ahead=share.of == OF_PREDICTIONS, trials=share.trials, tested=share.tested)
 

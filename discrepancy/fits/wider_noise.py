@@ -93,7 +93,7 @@ def widened(problem: Problem, remainder: Remainder) -> Problem:
     return problem.widened(remainder.factor) if remainder.acts else problem
 
 
-def refitted(problem: Problem, wide: Problem, found: CandidateFit) -> CandidateFit | None:
+def refitted(problem: Problem, wide: Problem, found: CandidateFit, steps: int = STEPS) -> CandidateFit | None:
     """Return a hypothesis at its maximum under a wider noise, with evidence and covariance of that.
 
     All else of it is told against the recorded noise, with what it leaves. None where it cannot be fitted so:
@@ -101,7 +101,7 @@ def refitted(problem: Problem, wide: Problem, found: CandidateFit) -> CandidateF
     """
     if wide is problem:
         return found
-    again = attempt(wide, found.candidate, found.point, iterations=STEPS)
+    again = attempt(wide, found.candidate, found.point, iterations=steps)
     here = None if again is None else attempt(problem, found.candidate, again.point, iterations=0)
     if again is None or here is None:
         return None

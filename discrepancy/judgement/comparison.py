@@ -26,7 +26,7 @@ from discrepancy.fits.wider_noise import noise_levels, refitted
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.naming import Explained
-from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShare, ForceShares
+from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share
 from discrepancy.models.port_units import port_unit
 from discrepancy.search.starting_points import acts_within, are_related
 from discrepancy.search.strategy import Search
@@ -85,7 +85,7 @@ class Comparison(Protocol[H]):
     def sizes(self, item: H) -> tuple[float, float, float]:
         """Return log evidence [nat], chi^2 of the readings and its degrees of freedom; nan: not known."""
 
-    def share(self, item: H, *, held_out: bool) -> ForceShare:
+    def share(self, item: H, *, held_out: bool) -> Share:
         """Return the share that a hypothesis is of what is missing."""
 
     def followed(self, candidate: Candidate, effect: FloatArray) -> H | None:
@@ -106,7 +106,7 @@ class Comparison(Protocol[H]):
     def fitted(self, item: H) -> CandidateFit:
         """Return the simulation that stands for a hypothesis."""
 
-    def left(self, item: H, share: ForceShare) -> str:
+    def left(self, item: H, share: Share) -> str:
         """Return in words what is left beside a hypothesis."""
 
 
@@ -145,7 +145,7 @@ class ByForce:
         """Return log evidence [nat]; readings are not compared."""
         return item.evidence, nan, nan
 
-    def share(self, item: Explained, *, held_out: bool) -> ForceShare:
+    def share(self, item: Explained, *, held_out: bool) -> Share:
         """Return the share that a hypothesis is of the missing force."""
         return self._shares.of(item, held_out=held_out)
 
@@ -179,7 +179,7 @@ class ByForce:
             return self.found.none
         return replace(shown, covariance=item.told_covariance)
 
-    def left(self, item: Explained, share: ForceShare) -> str:
+    def left(self, item: Explained, share: Share) -> str:
         """Return in words what is left beside a hypothesis."""
         unit = self.unit(item)
         return f"{share.left:.3g} of {share.whole:.3g} {unit} (rms) are left and unexplained"
@@ -238,7 +238,7 @@ class ByReadings:
         levels = noise_levels(self.problem, self.found.best())
         return dict(zip(self.problem.channel_names, levels.tolist(), strict=True))
 
-    def share(self, item: CandidateFit, *, held_out: bool) -> ForceShare:
+    def share(self, item: CandidateFit, *, held_out: bool) -> Share:
         """Return the share of the gap that a hypothesis closes; sizes are over the noise."""
         sets = [self.residuals(one) for one in (self.found.none, item)]
         parts = [one.held_out if held_out else one.fitted for one in sets]
@@ -256,7 +256,7 @@ class ByReadings:
         before, after, noise = np.array(rows).T
         left, whole = (float(np.sqrt(max(one.sum() / noise.sum() - 1.0, 0.0))) for one in (after, before))
         trials = len(parts[0].trials)
-        return ForceShare(before, after, noise, held_out, trials, left, whole, OF_READINGS, tested=True)
+        return Share(before, after, noise, held_out, trials, left, whole, OF_READINGS, tested=True)
 
     def followed(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
         """Return a further hypothesis, begun at values (E,) of its unknowns; None: it cannot be."""
@@ -318,7 +318,7 @@ class ByReadings:
         """Return the simulation that stands for a hypothesis: itself."""
         return item
 
-    def left(self, item: CandidateFit, share: ForceShare) -> str:
+    def left(self, item: CandidateFit, share: Share) -> str:
         """Return in words what is left beside a hypothesis."""
         if share.left <= 0.0:
             return "nothing is left beyond the noise"

@@ -13,7 +13,7 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import ABSOLUTE_LEVEL
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import Key, key_of
-from discrepancy.missing_force.shares import ForceShare
+from discrepancy.missing_force.shares import Share
 from discrepancy.search.starting_points import acts_within
 from discrepancy.search_settings import SEARCH
 
@@ -36,17 +36,17 @@ class Court(Generic[H]):
         return self.way.ranked
 
     @cached_property
-    def _known(self) -> dict[tuple[int, bool], tuple[H, ForceShare]]:
+    def _known(self) -> dict[tuple[int, bool], tuple[H, Share]]:
         return {}
 
-    def share(self, item: H, *, held_out: bool) -> ForceShare:
+    def share(self, item: H, *, held_out: bool) -> Share:
         """Return the share that a hypothesis is of what is missing."""
         key = (id(item), held_out)
         if key not in self._known:
             self._known[key] = item, self.way.share(item, held_out=held_out)
         return self._known[key][1]
 
-    def told(self, item: H) -> ForceShare:
+    def told(self, item: H) -> Share:
         """Return the share that counts: in trials not fitted, if there are any that can test it."""
         if self.way.has_held_out:
             outside = self.share(item, held_out=True)
@@ -183,7 +183,7 @@ class Court(Generic[H]):
         return found
 
 
-def _is_little(share: ForceShare, least: float) -> bool:
+def _is_little(share: Share, least: float) -> bool:
     low, high = share.interval
     return high < SEARCH.least_share or low < least
 
@@ -205,12 +205,12 @@ def _freedom(item: Hypothetic) -> tuple[int, int]:
     return len(item.candidate.terms), sum(term.free_shape for term in item.candidate.terms)
 
 
-def percent(share: ForceShare) -> str:
+def percent(share: Share) -> str:
     """Return a share with its interval."""
     low, high = share.interval
     return f"{100.0 * share.value:.3g} % ({100.0 * low:.3g} to {100.0 * high:.3g})"
 
 
-def part(share: ForceShare) -> str:
+def part(share: Share) -> str:
     """Return a share with its interval, and what it is one of."""
     return f"{percent(share)} of {share.of}"

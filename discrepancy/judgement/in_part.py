@@ -19,7 +19,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import key_of
-from discrepancy.missing_force.shares import ForceShare, orders
+from discrepancy.missing_force.shares import Share, orders
 from discrepancy.search.honest_evidence import weigh_with_remainders
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
@@ -347,7 +347,7 @@ class _Said(Generic[H]):
         return f" With a shape of its own: {', '.join(shown)}." if shown else ""
 
 
-def explained_share(share: ForceShare) -> ExplainedShare:
+def explained_share(share: Share) -> ExplainedShare:
     """Return the record of a share of the missing force."""
     before, after, noise = (float(column.sum()) for column in (share.before, share.after, share.noise))
     of_noise = min(noise / before, 1.0)
@@ -358,7 +358,7 @@ def explained_share(share: ForceShare) -> ExplainedShare:
     )  # fmt: skip
 
 
-def _where(share: ForceShare) -> str:
+def _where(share: Share) -> str:
     kind = "not fitted" if share.held_out else "fitted"
     return (
         f"in {share.trials} trials that were {kind}" if share.trials > 1 else f"in one trial that was {kind}"

@@ -34,8 +34,8 @@ LEAST_ORDER, ALIKE = 0.3, 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class ForceShare:
-    """A share of the missing force: 1 - mean square of what is left over mean square of the force.
+class Share:
+    """A share of what is missing: 1 - mean square of what is left over mean square of all of it.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class ForceShare:
         times = np.random.default_rng(SEED).multinomial(count, np.full(count, 1.0 / count), DRAWS)
         return _share(times @ self.before, times @ self.after, times @ self.noise)
 
-    def told_from(self, other: "ForceShare") -> bool:
+    def told_from(self, other: "Share") -> bool:
         """Whether this share is larger than that of another hypothesis beyond chance (5 %)."""
         return bool(np.quantile(self.drawn() - other.drawn(), 0.05) > 0.0)
 
@@ -116,7 +116,7 @@ class ForceShares:
         """Whether there are trials in motion that were not fitted."""
         return self._outside is not None
 
-    def of(self, found: Explained, *, held_out: bool) -> ForceShare:
+    def of(self, found: Explained, *, held_out: bool) -> Share:
         """Return the share that a hypothesis is, of trials that were fitted or of those held out.
 
         Of the forces, or of what they do to predictions, whichever tells more: fast forces hardly move a free
@@ -158,7 +158,7 @@ class ForceShares:
             )
         )
         shares = [
-            ForceShare(
+            Share(
                 table[0],
                 table[1],
                 table[2],

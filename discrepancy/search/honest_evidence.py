@@ -4,7 +4,7 @@ The search itself goes by the noise as recorded: how far a fit is from the truth
 hypothesis leaves noise, thousands of nats separate what a model of a real thing cannot separate.
 """
 
-from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.wider_noise import left_by, refitted, widened
 from discrepancy.missing_force.hypotheses import Key, key_of
@@ -59,7 +59,7 @@ def _add(judged: dict[Key, CandidateFit], found: Search, wide: Problem, item: Ca
     """Add a hypothesis under a wider noise, if it can be fitted so; no effect at all as it stands if not."""
     again = refitted(found.problem, wide, item)
     if again is None and not item.candidate.terms:
-        again = attempt(wide, item.candidate, item.point, iterations=0)
+        again = refitted(found.problem, wide, item, steps=0)
     if again is not None:
         judged[key_of(item.candidate)] = again
 

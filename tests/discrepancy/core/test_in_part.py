@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.judgement.in_part import explained_share
 from discrepancy.judgement.naming import name
-from discrepancy.missing_force.shares import OF_READINGS, ForceShare
+from discrepancy.missing_force.shares import OF_READINGS, Share
 from discrepancy.verdict import VerdictKind
 
 FloatArray = NDArray[np.float64]
@@ -106,9 +106,9 @@ def test_shares_and_their_interval() -> None:
     noise = np.full(40, 10.0)
     gap = generator.uniform(50.0, 150.0, 40)
 
-    def shares(after: FloatArray) -> ForceShare:
+    def shares(after: FloatArray) -> Share:
         sizes = (True, 4, 1.0, 2.0)
-        return ForceShare(noise + gap, after, noise, *sizes, OF_READINGS, tested=True)
+        return Share(noise + gap, after, noise, *sizes, OF_READINGS, tested=True)
 
     half = shares(noise + 0.5 * gap * generator.uniform(0.8, 1.2, 40))
     found = explained_share(half)

@@ -20,7 +20,7 @@ from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.force import MissingForce, missing_force
 from discrepancy.missing_force.naming import ForceSearch
-from discrepancy.missing_force.shares import ForceShare, ForceShares, order_of
+from discrepancy.missing_force.shares import ForceShares, Share, order_of
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
 from discrepancy.models.acting import refined
@@ -391,10 +391,10 @@ def test_a_verdict_that_is_no_law_at_a_port_shows_no_force(tmp_path: Path) -> No
 def test_shares_of_the_missing_force_are_those_of_a_law_that_is_half_of_it() -> None:
     """A share is one less what is left over what was, where noise is taken from both."""
     before, after, noise = np.full(6, 5.0), np.full(6, 3.0), np.full(6, 1.0)
-    share = ForceShare(before, after, noise, False, 1, 1.0, 2.0, False, True)
+    share = Share(before, after, noise, False, 1, 1.0, 2.0, False, True)
     assert share.value == pytest.approx(0.5)
     assert share.interval == pytest.approx((0.5, 0.5))
-    nothing = ForceShare(noise, noise, noise, False, 1, 1.0, 1.0, False, True)
+    nothing = Share(noise, noise, noise, False, 1, 1.0, 1.0, False, True)
     assert nothing.value == 0.0
     assert share.told_from(nothing)
     assert not nothing.told_from(share)
