@@ -63,6 +63,30 @@ def _synchronise(path: Path) -> None:
         os.close(descriptor)
 
 
+def refuse_existing(path: Path | None, *, replace: bool, option: str = "--out") -> None:
+    """Refuse a file that is there and may not be replaced, before anything is computed for it.
+
+    Raises
+    ------
+    FileNotWrittenError
+        `path` exists, and `replace` is not set.
+    """
+    if path is not None and path.exists() and not replace:
+        raise FileNotWrittenError(f"{path} exists: choose another {option} or give --replace.")
+
+
+def refuse_filled(folder: Path | None, option: str = "--out") -> None:
+    """Refuse a folder to write that holds something, or that is a file.
+
+    Raises
+    ------
+    FileNotWrittenError
+        `folder` exists and is not an empty folder.
+    """
+    if folder is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileNotWrittenError(f"{folder} exists and is not an empty folder: choose another {option}.")
+
+
 @contextmanager
 def atomic_file(path: str | os.PathLike[str], *, make_folder: bool = True) -> Iterator[Path]:
     """Give a temporary path to write to, and move it to `path` when the block ends without an exception.

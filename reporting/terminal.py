@@ -8,7 +8,7 @@ import functools
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,21 +43,42 @@ loudness = Loudness()
 """Of the command that runs."""
 
 
-def console(*, silent: bool = False) -> "Console":
-    """Return the console for results; with `--quiet`, or where `silent`, it prints nothing.
+def console() -> "Console":
+    """Return the console for results; with `--quiet` it prints nothing.
 
     In a pipe or a file nothing is cut or wrapped, unless COLUMNS says how wide it is.
     """
     from rich.console import Console
 
     width = None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDTH_OF_A_PIPE
-    return Console(highlight=False, markup=False, width=width, quiet=silent or loudness.quiet)
+    return Console(highlight=False, markup=False, width=width, quiet=loudness.quiet)
 
 
-def say(text: str) -> None:
+def say(text: str, *, bold: bool | None = None) -> None:
     """Print a line of the result, unless `--quiet`."""
     if not loudness.quiet:
-        typer.echo(text)
+        typer.secho(text, bold=bold)
+
+
+def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], colours: Iterable[str] = ()) -> None:
+    """Print a table of the result, unless `--quiet`.
+
+    Parameters
+    ----------
+    headings : sequence of str
+        One for each column; a column without any text is left out.
+    rows : iterable of sequence of str
+        Cells.
+    colours : iterable of str
+        The style of each row, where rows have one.
+    """
+    from reporting.console_table import console_table
+
+    shown = console()
+    table = console_table(headings, rows, shown.width)
+    for row, colour in zip(table.rows, colours, strict=False):
+        row.style = colour
+    shown.print(table)
 
 
 def progress() -> "Progress":

@@ -102,15 +102,13 @@ def _record(result: "Calibration") -> dict[str, Any]:
 
 def _show(result: "Calibration") -> None:
     from calibration.result import text
-    from uav_twin.console_table import console_table
 
-    console = terminal.console()
-    console.print(text.headline(result), soft_wrap=True)
-    console.print(console_table(text.HEADINGS, text.parameter_rows(result), console.width))
+    terminal.say(text.headline(result))
+    terminal.print_table(text.HEADINGS, text.parameter_rows(result))
     for line in text.correlation_lines(result):
-        console.print(line, soft_wrap=True)
+        terminal.say(line)
     if result.readings:
-        console.print(console_table(text.READING_HEADINGS, text.reading_rows(result), console.width))
-    console.print(console_table(text.CHANNEL_HEADINGS, text.channel_rows(result), console.width))
+        terminal.print_table(text.READING_HEADINGS, text.reading_rows(result))
+    terminal.print_table(text.CHANNEL_HEADINGS, text.channel_rows(result))
     for sentence in result.findings:
-        console.print(f"- {sentence}", soft_wrap=True)
+        terminal.say(f"- {sentence}")

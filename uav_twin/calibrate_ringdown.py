@@ -35,7 +35,6 @@ def calibrate_ringdown(
         PUBLISHED_FREQUENCIES,
         fit_trials,
     )
-    from uav_twin.console_table import console_table
 
     procedure = Frequencies.FITTED if fitted else Frequencies.PEAKS
     trials = fit_trials(read_records(data), procedure, start=FIRST_PEAK if start is None else start)
@@ -50,8 +49,7 @@ def calibrate_ringdown(
             ("damping ratio", "1", trials.damping_ratio, PUBLISHED_DAMPING_RATIOS),
         )
     ]
-    console = terminal.console()
-    console.print(console_table(headings, _cells(rows, ".5g"), console.width))
+    terminal.print_table(headings, _cells(rows, ".5g"))
     if out is not None:
         from calibration.dynamics.figures import ring_down_figure
         from reporting.figures import to_png, to_svg

@@ -85,7 +85,6 @@ def calibrate_wing(
     from calibration.wing.page import write_wing_folder
     from fe.wing.design import load_design
     from uav_twin.calibrate_campaign import show
-    from uav_twin.console_table import console_table
 
     drawn = load_design(design)
     name = drawn.name if asset is None else asset
@@ -100,8 +99,7 @@ def calibrate_wing(
     progress = terminal.progress()
     calibration = calibrate(lab, drawn, asset=name, procedure=procedure.value, seed=seed, progress=progress)
     if not json:
-        console = terminal.console()
         rows = [row.cells for row in calibration.table_1]
-        console.print(console_table(HEADINGS, rows, console.width))
+        terminal.print_table(HEADINGS, rows)
     written = None if out is None else write_wing_folder(calibration, out, progress, report=not no_report)
     show(calibration.result, written, json=json, report=not no_report)

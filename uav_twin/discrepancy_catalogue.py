@@ -8,7 +8,6 @@ import typer
 
 from reporting import terminal
 from reporting.words import counted
-from uav_twin.console_table import console_table
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -30,22 +29,19 @@ def effects(
     from discrepancy.report.text import formula
 
     catalogue = load_catalogue(add or ())
-    console = terminal.console()
     if show is not None:
-        _show(effect_by_identifier(show, catalogue), console)
+        _show(effect_by_identifier(show, catalogue))
         return
     rows = [(effect.identifier, effect.name, effect.family, formula(effect.equation)) for effect in catalogue]
-    console.print(console_table(("id", "name", "family", "equation"), rows, console.width))
-    console.print(f"{counted(len(catalogue), 'effect')}; --show ID tells everything about one.")
+    terminal.print_table(("id", "name", "family", "equation"), rows)
+    terminal.say(f"{counted(len(catalogue), 'effect')}; --show ID tells everything about one.")
 
 
-def _show(effect: "Effect", console: object) -> None:
-    from rich.console import Console
+def _show(effect: "Effect") -> None:
     from rich.table import Table
 
     from discrepancy.report.text import formula, unit_text
 
-    assert isinstance(console, Console)
     facts = Table(box=None, show_header=False)
     facts.add_column(no_wrap=True)
     facts.add_column(overflow="fold")
@@ -60,7 +56,7 @@ def _show(effect: "Effect", console: object) -> None:
         ("reference", effect.reference),
     ):
         facts.add_row(name, value)
-    console.print(facts)
+    terminal.console().print(facts)
     rows = []
     for item in effect.parameters:
         prior = f"{item.prior.low:g} to {item.prior.high:g}, {item.prior.shape.replace('_', '-')}"
@@ -69,7 +65,7 @@ def _show(effect: "Effect", console: object) -> None:
         freed = f"{shape.canonical:g}; freed: {shape.prior.low:g} to {shape.prior.high:g}"
         rows.append((shape.name, shape.symbol, freed, "", shape.description))
     headings = ("parameter", "symbol", "prior (90 %)", "unit", "meaning")
-    console.print(console_table(headings, rows, console.width))
+    terminal.print_table(headings, rows)
 
 
 def example(
@@ -97,10 +93,9 @@ def example(
     from discrepancy.model_choice import choose_model
     from discrepancy.sources.examples import plan_of, write_example
     from fe.runtime.patch import ModelPatch
-    from reporting.errors import FileNotWrittenError
+    from reporting.files import refuse_filled
 
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileNotWrittenError(f"{out} exists and is not empty: choose another folder.")
+    refuse_filled(out, "folder")
     choice = choose_model(model, terminal.progress())
     plan = plan_of(choice.model)
     patch = ModelPatch()

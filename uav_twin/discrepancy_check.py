@@ -96,19 +96,16 @@ def _show(
         untested_lines,
     )
     from reporting.words import counted
-    from uav_twin.console_table import console_table
 
-    console = terminal.console()
     held = [trial.name for trial in data.trials if trial.held_out]
-    console.print(
+    terminal.say(
         f"{data.name}: {counted(len(data.trials), 'trial')}, {counted(len(data.channels), 'channel')}, "
-        f"beside {model}; held out: {', '.join(held) or 'none'}.",
-        soft_wrap=True,
+        f"beside {model}; held out: {', '.join(held) or 'none'}."
     )
     for fault in faults:
-        console.print(f"{'Fault' if fault.fatal else 'Limit'}: {fault.sentence}", soft_wrap=True)
+        terminal.say(f"{'Fault' if fault.fatal else 'Limit'}: {fault.sentence}")
     for remark in data.remarks:
-        console.print(f"Note: {remark}", soft_wrap=True)
+        terminal.say(f"Note: {remark}")
     if able is None:
         return
     shown = [at for at, title in enumerate(HEADINGS) if title not in ("testable", "confused with")]
@@ -117,7 +114,7 @@ def _show(
         for row, item in zip(rows_of(able), able.detectability, strict=True)
         if not item.reason
     ]
-    console.print(console_table([HEADINGS[at] for at in shown], rows, console.width))
+    terminal.print_table([HEADINGS[at] for at in shown], rows)
     told = group_lines(able, "to which is said above")
     for line in (*untested_lines(able), *confused_lines(able), *told, *needs(able, data, catalogue)):
-        console.print(line, soft_wrap=True)
+        terminal.say(line)

@@ -10,7 +10,6 @@ import typer
 
 from reporting import terminal
 from reporting.words import counted
-from uav_twin.console_table import console_table
 
 if TYPE_CHECKING:
     from discrepancy.campaign.importing import Understanding
@@ -59,11 +58,10 @@ def import_files(
     from discrepancy.campaign.importing import OF_COLUMNS, OF_FILES, Understanding
     from discrepancy.campaign.sheet import read_sheet
     from discrepancy.campaign.writing import write_campaign
-    from reporting.errors import FileNotWrittenError
+    from reporting.files import refuse_filled
 
     folder = out or Path(files[0].stem)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FileNotWrittenError(f"{folder} exists and is not empty: choose another folder by --out.")
+    refuse_filled(folder)
     given = (column, unit, quantity, kind, release, load_place, decimal)
     answers = {
         option: {about: value for about, _, value in (item.rpartition("=") for item in said or ())}
@@ -109,11 +107,10 @@ def _asked(found: "Understanding") -> "Understanding":
 
 
 def _show(found: "Understanding") -> None:
-    console = terminal.console()
     for sheet in found.sheets:
         mark = {".": "points", ",": "commas"}.get(found.decimals[sheet.name], "?")
         kind = found.kinds[sheet.name] or "?"
-        console.print(f"{sheet.name}: {kind}; {sheet.remark}; decimal {mark}", soft_wrap=True)
+        terminal.say(f"{sheet.name}: {kind}; {sheet.remark}; decimal {mark}")
     rows = []
     for item in found.columns:
         cells = item.sheet.columns[item.sheet.heads.index(item.head)]
@@ -123,4 +120,4 @@ def _show(found: "Understanding") -> None:
         known = (item.unit or "?", item.role or "?", item.quantity or "")
         rows.append((item.sheet.name, item.head, *known, cells[told], value))
     headings = ("file", "column", "unit", "is", "quantity", "a cell", "in SI")
-    console.print(console_table(headings, rows, console.width))
+    terminal.print_table(headings, rows)

@@ -11,8 +11,6 @@ import typer
 from reporting import terminal
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from discrepancy.campaign.records import Campaign
     from discrepancy.files.document import Origin
     from discrepancy.model_choice import ModelChoice
@@ -71,9 +69,11 @@ def run(
     json: terminal.Json = False,
 ) -> None:
     """Find out what the model lacks: verdict, report, patch, residuals."""
+    from discrepancy.application import gives
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.errors import CampaignFileError
     from discrepancy.judgement.separability import separability
+    from discrepancy.verdict import VerdictKind
     from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
     from discrepancy.workflow import investigate
 
@@ -99,9 +99,15 @@ def run(
         if calibrate is not None:
             tried = _calibrated(found, choice, catalogue, calibrate, seed, progress)
     command = _command(
-        source, None if model is None else choice.file, seed, effects or [], calibrate,
-        turns=None if from_run is None else (from_turn, to_turn),
-    )  # fmt: skip
+        source,
+        effects or [],
+        from_run is not None,
+        from_turn=from_turn,
+        to_turn=to_turn,
+        model=None if model is None else choice.file,
+        seed=seed,
+        calibrate=calibrate,
+    )
     pack = None if choice.design is None else _packing(choice, progress)
     origin = _origin(data, choice, command, seed, effects or [])
     content = VerdictContent(found, origin, able, tried, choice.design, pack=pack)
@@ -109,7 +115,19 @@ def run(
         place = write_verdict_folder(folder, content, replace_it=replace, report=not no_report)
     if json:
         terminal.print_json(_record(folder, report=None if no_report else place))
-    _conclude(found, tried, folder, f"{'Verdict' if no_report else 'Report'}: {place}", silent=json)
+    if found.verdict.kind is VerdictKind.DATA_ERROR:
+        for sentence in (found.verdict.sentence, *(fault.sentence for fault in found.faults[1:])):
+            typer.secho(sentence, fg="red", err=True)
+    elif not json:
+        _show(found, folder)
+        if tried is not None:
+            terminal.say(_trials_sentence(tried))
+    if not json:
+        terminal.say(f"{'Verdict' if no_report else 'Report'}: {place}")
+    if found.verdict.kind is VerdictKind.DATA_ERROR:
+        raise typer.Exit(1)
+    if not json and gives(found.verdict):
+        terminal.say(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}")
 
 
 def _compared(
@@ -153,15 +171,17 @@ def _origin(
     data: "Campaign", choice: "ModelChoice", command: str, seed: int, effects: list[Path]
 ) -> "Origin":
     from discrepancy.files.document import Origin
-    from reporting.provenance import collect_provenance
+    from reporting.provenance import collect_provenance, hash_file
 
+    inputs = {"campaign": data.data_hash, "model": choice.source_hash}
+    inputs |= {f"effects {path.name}": hash_file(path) for path in effects}
     return Origin(
         data.name,
         choice.model.name,
         data.data_hash,
         choice.source_hash,
         command,
-        collect_provenance(seed, input_hashes=_inputs(data.data_hash, choice, effects)),
+        collect_provenance(seed, input_hashes=inputs),
         choice.file,
     )
 
@@ -174,28 +194,6 @@ def _record(folder: Path, report: Path | None) -> dict[str, Any]:
 
     record: dict[str, Any] = json.loads((folder / VERDICT_NAME).read_text(encoding="utf-8"))
     return {"folder": str(folder), "report": None if report is None else str(report)} | record
-
-
-def _conclude(
-    found: "Investigation", tried: "SelfCalibration | None", folder: Path, place: str, *, silent: bool
-) -> None:
-    """Print the conclusion; data at fault end the command with 1."""
-    from discrepancy.application import gives
-    from discrepancy.verdict import VerdictKind
-
-    console = terminal.console(silent=silent)
-    if found.verdict.kind is VerdictKind.DATA_ERROR:
-        typer.secho(found.verdict.sentence, fg="red", err=True)
-        for fault in found.faults[1:]:
-            typer.secho(fault.sentence, fg="red", err=True)
-        console.print(place, soft_wrap=True)
-        raise typer.Exit(1)
-    _show(found, folder, console)
-    if tried is not None:
-        _show_trials(tried, console)
-    console.print(place, soft_wrap=True)
-    if gives(found.verdict):
-        console.print(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}", soft_wrap=True)
 
 
 def _calibrated(
@@ -216,35 +214,14 @@ def _calibrated(
         )  # fmt: skip
 
 
-def _command(
-    source: Path, model: str | None, seed: int, effects: list[Path], calibrate: int | None, *,
-    turns: tuple[int | None, int | None] | None,
-) -> str:  # fmt: skip
+def _command(source: Path, effects: list[Path], from_run: bool, **options: int | str | None) -> str:
     """Return the command that does the same in any folder: with absolute paths."""
-    words = [
-        "uav-twin",
-        "discrepancy",
-        "run",
-        *([] if turns is None else ["--from-run"]),
-        str(source.resolve()),
-    ]
-    for option, turn in zip(("--from-turn", "--to-turn"), turns or (), strict=False):
-        words += [] if turn is None else [option, str(turn)]
-    if model is not None:
-        words += ["--model", model]
-    words += ["--seed", str(seed)]
+    words = ["uav-twin", "discrepancy", "run", *["--from-run"] * from_run, str(source.resolve())]
+    for name, value in options.items():
+        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
     for path in effects:
         words += ["--effects", str(path.resolve())]
-    if calibrate is not None:
-        words += ["--calibrate", str(calibrate)]
     return shlex.join(words)
-
-
-def _inputs(data_hash: str, choice: "ModelChoice", effects: list[Path]) -> dict[str, str]:
-    from reporting.provenance import hash_file
-
-    found = {"campaign": data_hash, "model": choice.source_hash}
-    return found | {f"effects {path.name}": hash_file(path) for path in effects}
 
 
 def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
@@ -268,7 +245,7 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
 # ---------------------------------------------------------------- summary
 
 
-def _show(found: "Investigation", folder: Path, console: "Console") -> None:
+def _show(found: "Investigation", folder: Path) -> None:
     from discrepancy.files.patch import PATCH_NAME, read_patch
     from discrepancy.judgement.when import when_sentence
     from discrepancy.report.sizes import size_sentence
@@ -283,26 +260,25 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
         unit_text,
     )
     from discrepancy.verdict import VerdictKind
-    from uav_twin.console_table import console_table
 
     verdict, proof = found.verdict, found.proof
-    console.print(f"Verdict: {verdict.kind.value}", style="bold")
-    console.print(headline(verdict), soft_wrap=True)
+    terminal.say(f"Verdict: {verdict.kind.value}", bold=True)
+    terminal.say(headline(verdict))
     if (patch_file := folder / PATCH_NAME).is_file():
         stored = read_patch(patch_file)
         if sizes := size_sentence(found, stored.effects, [effect.intervals for effect in stored.effects]):
-            console.print(sizes, soft_wrap=True)
+            terminal.say(sizes)
     force = force_sentence(verdict.force) if verdict.force else ""
     for sentence in (force, shares_sentence(verdict), remainders_sentence(verdict)):
         if sentence:
-            console.print(sentence, soft_wrap=True)
+            terminal.say(sentence)
     when = when_sentence(verdict.windows)
     if when and when not in verdict.sentence:
-        console.print(when, soft_wrap=True)
+        terminal.say(when)
     if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
         against = f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
         none = verdict.kind is VerdictKind.NOTHING_MISSING
-        console.print(f"Probability {probability_text(verdict.probability)}{'' if none else against}.")
+        terminal.say(f"Probability {probability_text(verdict.probability)}{'' if none else against}.")
     if verdict.effects:
         headings = ("effect", "place", "parameter", "value", "90 % interval", "unit")
         rows = [
@@ -313,23 +289,21 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
             for effect in verdict.effects
             for item in (*effect.parameters, *effect.shape)
         ]  # fmt: skip
-        console.print(console_table(headings, rows, console.width))
+        terminal.print_table(headings, rows)
     if proof is not None:
         explained = None if rests_on_force(verdict) else verdict.explained
-        _show_proof(proof, explained, found.campaign, console)
+        terminal.say(_proof_sentence(proof, explained, found.campaign))
     for experiment in verdict.next_experiments[:SHOWN_EXPERIMENTS]:
-        console.print(f"Next: {experiment.description} ({experiment.information:.2f} nat)", soft_wrap=True)
+        terminal.say(f"Next: {experiment.description} ({experiment.information:.2f} nat)")
     for fault in found.faults:
-        console.print(f"Data: {fault.sentence}", soft_wrap=True)
+        terminal.say(f"Data: {fault.sentence}")
     said = {fault.sentence for fault in found.faults}
     for remark in verdict.remarks:
         if remark not in said:
-            console.print(f"Note: {remark}", soft_wrap=True)
+            terminal.say(f"Note: {remark}")
 
 
-def _show_proof(
-    proof: "Proof", explained: "ExplainedShare | None", campaign: "Campaign", console: "Console"
-) -> None:
+def _proof_sentence(proof: "Proof", explained: "ExplainedShare | None", campaign: "Campaign") -> str:
     from discrepancy.report.text import number, percent, residual_sizes
 
     first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
@@ -338,24 +312,23 @@ def _show_proof(
         where = f"held-out trials ({', '.join(trial.name for trial in campaign.held_out)})"
     if explained is not None:
         before, after = residual_sizes(explained)
-        text = f"Residuals on {where}: rms of {before} noise deviations before, {after} with the effect."
-        console.print(text, soft_wrap=True)
-        return
+        return f"Residuals on {where}: rms of {before} noise deviations before, {after} with the effect."
+    if not isfinite(first.chi_square_per_dof):
+        return proof.remaining
     closed = f", {percent(proof.gap_closed)} % of the gap closed" if isfinite(proof.gap_closed) else ""
     why = f" {proof.gap_reason}" if proof.held_out_before is not None and proof.gap_reason else ""
-    scores = (
+    return (
         f"χ²/dof on {where}: {number(first.chi_square_per_dof)} before, "
         f"{number(second.chi_square_per_dof)} with the effect{closed}.{why}"
     )
-    console.print(scores if isfinite(first.chi_square_per_dof) else proof.remaining, soft_wrap=True)
 
 
-def _show_trials(tried: "SelfCalibration", console: "Console") -> None:
+def _trials_sentence(tried: "SelfCalibration") -> str:
     from reporting.words import counted
 
     right, wrong = tried.share("right"), tried.share("wrong")
     false = tried.share("wrong", null=True)
-    console.print(
+    return (
         f"Simulated campaigns: {right.count} of {right.total} hidden effects named, {wrong.count} "
         f"wrongly; {counted(false.count, 'false name')} where nothing was hidden ({false.total})."
     )

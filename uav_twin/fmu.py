@@ -166,7 +166,6 @@ def info(
     """Say what an FMU is: version, capabilities, variables with units and ranges."""
     from fmu_asset.archive.declared import describe_fmu
     from fmu_asset.archive.fmu_file import inspect_fmu
-    from uav_twin.console_table import console_table
 
     description, obstacle = inspect_fmu(file)
     record = describe_fmu(description)
@@ -175,8 +174,7 @@ def info(
         return
     if obstacle:
         terminal.say(f"It cannot be flown here: {obstacle}")
-    console = terminal.console()
-    console.print(str(file), soft_wrap=True)
+    terminal.say(str(file))
     facts = [
         (name.replace("_", " "), str(value))
         for name, value in record.items()
@@ -189,7 +187,7 @@ def info(
             f"{row['name'].split('.')[1]} ({'on' if float(row['start']) else 'off'})" for row in switches
         )
         facts.append(("effects", ", ".join(effects)))
-    console.print(console_table(("fact", "value"), facts, console.width))
+    terminal.print_table(("fact", "value"), facts)
     if variables:
         keys = ("name", "causality", "unit", "minimum", "maximum", "start", "description")
         rows = [
@@ -197,7 +195,7 @@ def info(
             for row in record["variables"]
         ]
         headings = ("variable", "causality", "unit", "least", "largest", "start", "description")
-        console.print(console_table(headings, rows, console.width))
+        terminal.print_table(headings, rows)
 
 
 fmu_app.command("bind")(bind)

@@ -24,11 +24,9 @@ def bind(
 
     from fmu_asset.archive.fmu_file import read_fmu
     from fmu_asset.door.draft import draft_binding
-    from fmu_asset.errors import BindingError
-    from reporting.files import atomic_write_text
+    from reporting.files import atomic_write_text, refuse_existing
 
-    if out is not None and out.exists() and not replace:
-        raise BindingError(f"{out} exists: choose another --out or give --replace.")
+    refuse_existing(out, replace=replace)
     gc.disable()  # of 100,000 variables nothing is garbage, and looking for it takes a third of the time
     try:
         text = draft_binding(read_fmu(file), step_size=step_size)

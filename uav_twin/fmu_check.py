@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
+from reporting.words import counted
 
 _COLOURS = {"ok": "green", "warning": "yellow", "problem": "red", "skipped": "dim"}
 
@@ -33,7 +34,6 @@ def check(
     from dataclasses import asdict
 
     from fmu_asset.check import check_fmu
-    from uav_twin.console_table import console_table
 
     result = check_fmu(
         file,
@@ -48,16 +48,12 @@ def check(
         findings = [asdict(finding) for finding in result.findings]
         terminal.print_json({"file": str(file), "passed": result.passed, "findings": findings})
     else:
-        console = terminal.console()
-        console.print(str(file), soft_wrap=True)
+        terminal.say(str(file))
         rows = [(found.check, found.verdict, found.text) for found in result.findings]
-        table = console_table(("check", "verdict", "found"), rows, console.width)
-        for row, finding in zip(table.rows, result.findings, strict=True):
-            row.style = _COLOURS[finding.verdict]
-        console.print(table)
+        colours = [_COLOURS[found.verdict] for found in result.findings]
+        terminal.print_table(("check", "verdict", "found"), rows, colours)
     if not result.passed:
-        count = len(result.problems)
-        typer.secho(f"{file}: {count} problem{'' if count == 1 else 's'}.", fg="red", err=True)
+        typer.secho(f"{file}: {counted(len(result.problems), 'problem')}.", fg="red", err=True)
         raise typer.Exit(1)
     if not json:
         terminal.say(f"{file}: no problem found.")

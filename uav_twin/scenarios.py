@@ -19,7 +19,6 @@ def list_scenarios() -> None:
     """List the scenarios that are shipped."""
     from scenarios import scenario_files
     from twin_master.scenario.reading import load_scenario
-    from uav_twin.console_table import console_table
 
     rows = []
     for name, path in scenario_files().items():
@@ -33,11 +32,8 @@ def list_scenarios() -> None:
                 ", ".join(scenario.control_names),
             )
         )
-    console = terminal.console()
-    console.print(console_table(("scenario", "title", "turns", "states", "controls"), rows, console.width))
-    console.print(
-        f"The files, to copy and change: {next(iter(scenario_files().values())).parent}", soft_wrap=True
-    )
+    terminal.print_table(("scenario", "title", "turns", "states", "controls"), rows)
+    terminal.say(f"The files, to copy and change: {next(iter(scenario_files().values())).parent}")
 
 
 @scenario_app.command("check")

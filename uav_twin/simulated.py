@@ -35,12 +35,12 @@ _MOST_PANELS, _MOST_LINES = 8, 10
 def refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
     """Refuse files that cannot be written, before anything is simulated."""
     from fmu_asset.errors import FmuInputError
+    from reporting.files import refuse_existing
 
     for path, suffixes, option in ((out, (".csv", ".nc"), "--out"), (plot, (".png", ".svg"), "--plot")):
         if path is not None and path.suffix not in suffixes:
             raise FmuInputError(f"{path} must end in {' or '.join(suffixes)}: choose another {option}.")
-        if path is not None and path.exists() and not replace:
-            raise FmuInputError(f"{path} exists: choose another {option} or give --replace.")
+        refuse_existing(path, replace=replace, option=option)
 
 
 def values_of(texts: list[str]) -> dict[str, float | list[float]]:
@@ -90,15 +90,12 @@ def say(
     if history.ended:
         terminal.say(history.ended)
     if not where:
-        from uav_twin.console_table import console_table
-
         rows = [
             (name, *(f"{value:.6g}" for value in (v[0], v.min(), v.max(), v[-1])), unit)
             for name, unit, v in _columns(asset, history)
         ]
         headings = ("output", "first", "least", "largest", "last", "unit")
-        console = terminal.console()
-        console.print(console_table(headings, rows, console.width))
+        terminal.print_table(headings, rows)
 
 
 def _columns(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
-from uav_twin.console_table import console_table
 from uav_twin.structure_arguments import File, MemoryLimit, assembled, assembled_of_any
 from uav_twin.structure_field import field
 from uav_twin.structure_fmu import fmu
@@ -39,25 +38,24 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
     if json:
         terminal.print_json(record)
         return
-    console = terminal.console()
-    console.print(console_table(("fact", "value", "unit"), _facts(record), console.width))
+    terminal.print_table(("fact", "value", "unit"), _facts(record))
     for remark in record["remarks"]:
-        console.print(f"Note: {remark}", soft_wrap=True)
+        terminal.say(f"Note: {remark}")
     parts = [
         (part["what"], part["name"], part["set"], f"{part['count']:,} {part['of']}", part["note"])
         for part in record["parts"]
     ]
     if parts:
-        console.print(console_table(("part", "name", "set", "holds", "note"), parts, console.width))
+        terminal.print_table(("part", "name", "set", "holds", "note"), parts)
     modes_found = [(f"{number}", f"{value:.6g}") for number, value in enumerate(record["frequencies"], 1)]
     if modes_found:
-        console.print(console_table(("mode", "frequency [Hz]"), modes_found, console.width))
+        terminal.print_table(("mode", "frequency [Hz]"), modes_found)
     else:
-        console.print("No modes: nothing has mass. Give the materials a density.", soft_wrap=True)
+        terminal.say("No modes: nothing has mass. Give the materials a density.")
     for load in record["loads"]:
         of = f" at {load['control']} = {load['value']:g}" if load["control"] else ""
         largest = f"largest displacement {1e3 * load['largest_displacement']:.6g} mm"
-        console.print(f"Load {load['name']}{of}: {largest}", soft_wrap=True)
+        terminal.say(f"Load {load['name']}{of}: {largest}")
         outputs = [
             (what, name, f"{scale * value:.6g}", unit)
             for what, key, scale, unit in (
@@ -67,7 +65,7 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
             for name, value in load[key].items()
         ]
         if outputs:
-            console.print(console_table(("output", "name", "value", "unit"), outputs, console.width))
+            terminal.print_table(("output", "name", "value", "unit"), outputs)
 
 
 def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
@@ -192,14 +190,13 @@ def verify(
     from fe.runtime.errors import CalculixError
     from fe.verification.calculix_comparison import structure_agreement
     from fe.verification.calculix_job import calculix_program
-    from reporting.errors import FileNotWrittenError
+    from reporting.files import refuse_filled
 
     if calculix_program() is None:
         raise CalculixError(
             "CalculiX ('ccx') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
         )
-    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileNotWrittenError(f"{out} exists and is not an empty folder: choose another --out.")
+    refuse_filled(out)
     structure = assembled(file, memory_limit, mass_as_stiffness=True)
     with (
         tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch,
@@ -219,15 +216,14 @@ def verify(
             }
         )
     else:
-        console = terminal.console()
         table = [
             (of, what, f"{value:.2g}", f"{limit:g}", "kept" if value <= limit else "BROKEN")
             for of, what, value, limit in rows
         ]
         headings = ("of", "what", "difference", "limit", "verdict")
-        console.print(console_table(headings, table, console.width))
+        terminal.print_table(headings, table)
         if out is not None:
-            console.print(f"Wrote the decks and results of CalculiX to {out}", soft_wrap=True)
+            terminal.say(f"Wrote the decks and results of CalculiX to {out}")
     if broken:
         names = "; ".join(f"{of}, {what}" for of, what, _, _ in broken)
         typer.echo(f"{len(broken)} of {len(rows)} checks broke their limit: {names}.", err=True)

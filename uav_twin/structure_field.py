@@ -24,11 +24,9 @@ def field(
 ) -> None:
     """Solve the full structure under all its loads, and write its field as VTU for ParaView."""
     from fe.structure.field import write_structure_vtu
-    from reporting.errors import FileNotWrittenError
-    from reporting.files import write_error
+    from reporting.files import refuse_existing, write_error
 
-    if out.exists() and not replace:
-        raise FileNotWrittenError(f"{out} exists: choose another --out or give --replace.")
+    refuse_existing(out, replace=replace)
     structure = assembled(file, memory_limit)
     known = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
     values: dict[str, float] = {}

@@ -69,6 +69,7 @@ def fmu(
 def _check_targets(file: Path, target: Path, others: Mapping[str, Path | None], *, replace: bool) -> None:
     """Refuse files to write that are one another, or are there."""
     from reporting.errors import FileNotWrittenError
+    from reporting.files import refuse_existing
 
     taken = {file.resolve(): "the structure file", target.resolve(): "the FMU"}
     for name, path in others.items():
@@ -77,5 +78,4 @@ def _check_targets(file: Path, target: Path, others: Mapping[str, Path | None], 
         if path.resolve() in taken:
             raise FileNotWrittenError(f"{path} is {taken[path.resolve()]}: choose another --{name}.")
         taken[path.resolve()] = f"the file of --{name}"
-        if path.exists() and not replace:
-            raise FileNotWrittenError(f"{path} exists: choose another --{name} or give --replace.")
+        refuse_existing(path, replace=replace, option=f"--{name}")

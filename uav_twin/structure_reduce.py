@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reporting import terminal
-from uav_twin.console_table import console_table
 from uav_twin.structure_arguments import File, MemoryLimit, assembled_of_any, reduced
 
 if TYPE_CHECKING:
@@ -43,18 +42,16 @@ def reduce(
             }
         )
         return
-    console = terminal.console()
     headings = ("what", "name", "least", "nominal", "largest")
-    console.print(console_table(headings, list(_ranges(model)), console.width))
-    console.print(
+    terminal.print_table(headings, list(_ranges(model)))
+    terminal.say(
         f"{model.name}: {len(model.static_load.T)} static and {len(model.modal_load.T)} modal basis vectors; "
         f"gauges {len(model.gauges)}, displacements {len(model.displacements)}, "
-        f"accelerations {len(model.accelerations)}, modes {model.mode_count}.",
-        soft_wrap=True,
+        f"accelerations {len(model.accelerations)}, modes {model.mode_count}."
     )
     if errors is not None:
         heading = f"largest error at {errors.states} random states"
-        console.print(console_table(("of", heading), list(_errors(errors)), console.width))
+        terminal.print_table(("of", heading), list(_errors(errors)))
 
 
 def _ranges(model: "ReducedModel") -> Iterator[tuple[str, ...]]:

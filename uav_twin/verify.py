@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reporting import terminal
-from uav_twin.console_table import console_table
 
 if TYPE_CHECKING:
     from fe.full.operators import AffineOperators
@@ -70,34 +69,30 @@ def verify(
     """Check the finite element model: known answers, balances, convergence, and CalculiX where installed."""
     from fe.verification.calculix_job import calculix_program
     from fe.wing.design import load_design
-    from reporting.errors import FileNotWrittenError
+    from reporting.files import refuse_filled
 
     wing_design = load_design(design)
-    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileNotWrittenError(f"{out} exists and is not an empty folder: choose another --out.")
+    refuse_filled(out)
     with tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch:
         jobs = (out or Path(scratch)) / "calculix"
         checks = all_checks(wing_design, jobs, terminal.progress(), quick=quick)
     print_checks(checks)
     if calculix_program() is None:
-        terminal.console().print(
-            "CalculiX is not installed (apt-get install calculix-ccx): its checks are left out."
-        )
+        terminal.say("CalculiX is not installed (apt-get install calculix-ccx): its checks are left out.")
     if out is not None:
-        terminal.console().print(f"Wrote {write_record(out, wing_design, checks)}", soft_wrap=True)
+        terminal.say(f"Wrote {write_record(out, wing_design, checks)}")
     end_with(checks)
 
 
 def print_checks(checks: Sequence[Check]) -> None:
     """Print every check beside its limit."""
-    console = terminal.console()
     rows = []
     for check in checks:
         limit = "" if check.limit is None else f"{check.limit:.3g}"
         verdict = "" if check.limit is None else "kept" if check.passed else "BROKEN"
         found = f"{check.value:.3g}" + (f" {check.note}" if check.note else "")
         rows.append((check.group, check.name, found, limit, verdict))
-    console.print(console_table(("check", "figure", "found", "limit", "verdict"), rows, console.width))
+    terminal.print_table(("check", "figure", "found", "limit", "verdict"), rows)
 
 
 def end_with(checks: Sequence[Check]) -> None:

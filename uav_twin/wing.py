@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
-from uav_twin.console_table import console_table
 from uav_twin.verify import verify
 
 if TYPE_CHECKING:
@@ -56,11 +55,10 @@ def wing(
     for mode in record["modes"]:
         title = f"frequency {mode['number']}" + (f", {mode['shape']}" if mode["shape"] else "")
         rows.append((title, f"{mode['frequency']:.3f}", PUBLISHED.get(mode["shape"], ""), "Hz"))
-    console = terminal.console()
-    console.print(console_table(("figure", "this wing", "published model", "unit"), rows, console.width))
-    console.print("The published figures are of Kapteyn et al. 2021 and belong to the shipped wing.")
+    terminal.print_table(("figure", "this wing", "published model", "unit"), rows)
+    terminal.say("The published figures are of Kapteyn et al. 2021 and belong to the shipped wing.")
     for path in written:
-        console.print(f"Wrote {path}", soft_wrap=True)
+        terminal.say(f"Wrote {path}")
 
 
 def wing_record(design: "WingDesign", model: "ReducedModel") -> dict[str, Any]:

@@ -108,7 +108,7 @@ def test_the_catalogue(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
         (("run", "--from-run", "a_run", "--from-turn", "9", "--to-turn", "8"), "--to-turn 8 lies before"),
         (("check", "nowhere", *RIG), "nowhere"),
         (("example", "dance", "{new}", *RIG), "the kinds are"),
-        (("example", "static", "{campaign}", *RIG), "not empty"),
+        (("example", "static", "{campaign}", *RIG), "not an empty folder"),
         (("example", "static", "{new}", *RIG, "--effect", "gremlins=1"), "gremlins"),
         (("example", "static", "{new}", *RIG, "--effect", "load_cell=much"), "must end with numbers"),
         (("example", "static", "{new}", *RIG, "--effect", "load_cell=1,2,3"), "2 parameters"),

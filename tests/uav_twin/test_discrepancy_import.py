@@ -88,7 +88,7 @@ def test_a_folder_of_files_becomes_the_campaign_to_the_last_bit(
     assert checked.returncode == 0, checked.stderr
     # a second time nothing is touched
     again = call(*files, *options, *COLUMNS, "--out", "lab")
-    assert (again.returncode, "not empty" in again.stderr) == (1, True)
+    assert (again.returncode, "not an empty folder" in again.stderr) == (1, True)
 
 
 TWO = {
@@ -157,7 +157,7 @@ def test_everything_that_is_not_said_is_named_at_once(
             "--reference-temperature must be in degC, and 'warm' came",
         ),
         (("--decimal", "x"), "--decimal must be . or ,, and 'x' came"),
-        (("--out", "."), ". exists and is not empty"),
+        (("--out", "."), ". exists and is not an empty folder"),
     ],
 )  # fmt: skip
 def test_an_answer_that_does_not_fit_is_one_sentence(

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from discrepancy.catalogue.library import load_catalogue
-from uav_twin.console_table import broken, console_table
+from reporting.console_table import broken, console_table
 
 
 def printed(headings: tuple[str, ...], rows: list[tuple[str, ...]], width: int) -> list[str]:
