@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import command_page
 from reporting import terminal
 from tests.command_line import call
 from twin_master.errors import ScenarioError
@@ -177,3 +178,10 @@ def test_start_up_is_lazy() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_the_page_of_commands_is_that_of_the_commands() -> None:
+    """If this fails: python -m benchmarks.command_page."""
+    text = command_page.PAGE.read_text(encoding="utf-8")
+    assert command_page.page(text) == text
+    assert command_page.page(text.replace("uav-twin scenarios\n", "")) == text
