@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -39,11 +38,6 @@ def range_of(prior: Prior) -> str:
     return f"{name}, {prior.low:.3g} to {prior.high:.3g}"
 
 
-def rounded(value: Any) -> Any:
-    """Return a value with four digits, so that a page does not depend on the last bits of a computer."""
-    return float(f"{value:.4g}") if isinstance(value, float) else value
-
-
 def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     """Return the page of an effect."""
     tank = effect.identifier in FLOWS
@@ -51,7 +45,7 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     names = {other.identifier: other.name for other in library()}
     kinds = [name for kind, name in KIND_NAMES.items() if kind in effect.acts_on]
     places = effect.places(setting)
-    patch, place = picture_patch(effect, setting)
+    _, place = picture_patch(effect, setting)
     values = picture_of(effect).values
     rows = [
         f"| {cell(p.symbol)} | `{p.name}` | {cell(p.description)} | {p.unit} | {range_of(p.prior)} |"
@@ -89,9 +83,10 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
             ),
             "",
         ]
-    lines += ["## Where it acts", f"Trials: {', '.join(kinds)}."]
+    where = f"Acts in trials: {', '.join(kinds)}."
     if places != ("",):
-        lines.append(f"Places, {on} of the picture: {', '.join(f'`{name}`' for name in places)}.")
+        where += f" Places, {on} of the picture: {', '.join(f'`{name}`' for name in places)}."
+    lines.append(where)
     shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
     lines += [
         "",
@@ -106,13 +101,6 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         "",
         "## Easily confused with",
         *(f"- [{names[other]}]({other}.md): {text['tell'][other]}" for other in effect.confusable),
-        "",
-        "## Patch",
-        "That of the picture, rounded:",
-        "",
-        "```json",
-        *(json.dumps({k: rounded(v) for k, v in row.items()}) for row in patch.to_list()),
-        "```",
         "",
         "## References",
         *(f"- {reference}" for reference in text["references"]),
