@@ -33,3 +33,21 @@ def command(*words: object) -> subprocess.CompletedProcess[str]:
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(complained):
         code = call(patch, *words)
     return subprocess.CompletedProcess(words, code, said.getvalue(), complained.getvalue())
+
+
+def said(*words: object) -> str:
+    """Run `uav-twin`, which must end well; return what it said."""
+    done = command(*words)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def refused(*words: object, code: int | None = 1) -> str:
+    """Run `uav-twin`, which must end with an exit code (None: with any but 0) and without a traceback.
+
+    Returns what stands on the error stream, on one line.
+    """
+    done = command(*words)
+    assert done.returncode == code or (code is None and done.returncode != 0), done.stderr
+    assert "Traceback" not in done.stderr
+    return " ".join(done.stderr.replace("│", " ").split())

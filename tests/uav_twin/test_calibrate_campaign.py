@@ -1,7 +1,6 @@
 """`uav-twin calibrate campaign` as a user calls it."""
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,8 +9,7 @@ import pytest
 from calibration.result.file import load_calibration, save_calibration
 from calibration.result.record import Calibration
 from scenarios import structure_files
-from tests import command_line
-from uav_twin import cli
+from tests.command_line import refused, said
 
 MODEL = """format = 1
 name = "spring"
@@ -62,16 +60,9 @@ def lab(tmp_path: Path) -> Path:
     return folder
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    return command_line.call(monkeypatch, "calibrate", "campaign", *words)
-
-
-def test_a_campaign_gives_a_file_a_report_and_a_table(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_campaign_gives_a_file_a_report_and_a_table(lab: Path) -> None:
     model, out = lab.parent / "model.toml", lab.parent / "out"
-    assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 7") == 0
-    shown = capsys.readouterr().out
+    shown = said("calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", "spring 7")
     assert "factor" in shown
     assert "1.00 ± 0.19" in shown  # 0.20, cut off at 0.5 and 1.5
     found = load_calibration(out / "calibration.nc")
@@ -81,28 +72,25 @@ def test_a_campaign_gives_a_file_a_report_and_a_table(
     assert "Calibration of spring 7" in page
     assert page.count("<figure") == 2
     first = (out / "calibration.nc").read_bytes()
-    assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 7", "--no-report") == 0
+    said("calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", "spring 7", "--no-report")
     assert (out / "calibration.nc").read_bytes() == first
     assert [path.name for path in out.iterdir()] == ["calibration.nc"]  # no page of other figures beside it
-    capsys.readouterr()
-    assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 8") != 0
-    assert "is the calibration of spring 7, not of spring 8" in capsys.readouterr().err
+    assert "is the calibration of spring 7, not of spring 8" in refused(
+        "calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", "spring 8", code=None
+    )
 
 
-def test_a_report_of_something_else_stays(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_report_of_something_else_stays(lab: Path) -> None:
     out = lab.parent / "out"
     (out / "figures").mkdir(parents=True)
     for name in ("report.html", "figures/posterior.svg"):
         (out / name).write_text("mine")
-    assert call(monkeypatch, lab, "--model", lab.parent / "model.toml", "--out", out, "--no-report") == 0
+    said("calibrate", "campaign", lab, "--model", lab.parent / "model.toml", "--out", out, "--no-report")
     assert [(out / n).read_text() for n in ("report.html", "figures/posterior.svg")] == ["mine", "mine"]
 
 
 def test_a_calibration_of_the_other_kind_is_not_overwritten(
-    lab: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    make_calibration: Callable[..., Calibration],
+    lab: Path, make_calibration: Callable[..., Calibration]
 ) -> None:
     """A wing's by a campaign's and a campaign's by a wing's, of the same and of another asset."""
     model, out = lab.parent / "model.toml", lab.parent / "out"
@@ -113,11 +101,12 @@ def test_a_calibration_of_the_other_kind_is_not_overwritten(
                "from a campaign (`uav-twin calibrate campaign`) was asked for: choose another --out"),
         ("spring 7", f"is the calibration of {wing}, not of spring 7: choose another --out"),
     ):  # fmt: skip
-        assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", asset) == 1
-        assert words in " ".join(capsys.readouterr().err.split())
+        assert words in refused(
+            "calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", asset
+        )
         assert kept.read_bytes() == before
     kept.write_bytes(before[:200])  # what nobody can read is replaced
-    assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 7", "--no-report") == 0
+    said("calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", "spring 7", "--no-report")
     before = kept.read_bytes()
     assert load_calibration(kept).design is None
     for asset, words in (
@@ -127,21 +116,12 @@ def test_a_calibration_of_the_other_kind_is_not_overwritten(
         ),
         ("UAV 1", "is the calibration of spring 7, not of UAV 1: choose another --out"),
     ):
-        capsys.readouterr()
-        monkeypatch.setattr(
-            sys, "argv", ["uav-twin", "calibrate", "--out", str(out), "--asset", asset, "--no-report"]
-        )
-        with pytest.raises(SystemExit, match="1"):
-            cli.main()
-        assert words in " ".join(capsys.readouterr().err.split())
+        assert words in refused("calibrate", "--out", out, "--asset", asset, "--no-report")
         assert kept.read_bytes() == before
 
 
-def test_json_has_the_same_figures(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert call(monkeypatch, lab, "--model", lab.parent / "model.toml", "--json") == 0
-    record = json.loads(capsys.readouterr().out)
+def test_json_has_the_same_figures(lab: Path) -> None:
+    record = json.loads(said("calibrate", "campaign", lab, "--model", lab.parent / "model.toml", "--json"))
     (parameter,) = record["parameters"]
     assert parameter["name"] == "factor"
     assert parameter["interval_90"][0] < 0.88 < parameter["interval_90"][1]
@@ -161,38 +141,31 @@ def test_json_has_the_same_figures(
     ],
 )
 def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
-    lab: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    change: tuple[str, str],
-    words: str,
+    lab: Path, change: tuple[str, str], words: str
 ) -> None:
     changed = (lab / "up.csv",) if change[0] == "." else (lab / "campaign.toml", lab.parent / "model.toml")
     for file in changed:
         file.write_text(file.read_text().replace(*change))
     out = lab.parent / "out"
-    assert call(monkeypatch, lab, "--model", lab.parent / "model.toml", "--out", out) != 0
-    said = capsys.readouterr().err.strip()
+    said = refused(
+        "calibrate", "campaign", lab, "--model", lab.parent / "model.toml", "--out", out, code=None
+    ).strip()
     assert words in " ".join(said.split())
     assert "Traceback" not in said
     assert not out.exists()
 
 
-def test_a_structure_without_its_mesh_is_refused(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_structure_without_its_mesh_is_refused(lab: Path) -> None:
     own = lab.parent / "my_part.toml"
     own.write_text(structure_files()["bracket"].read_text(encoding="utf-8"))
-    assert call(monkeypatch, lab, "--model", own) != 0
-    said = capsys.readouterr().err.strip()
+    said = refused("calibrate", "campaign", lab, "--model", own, code=None).strip()
     assert "bracket.inp" in said
     assert len(said.splitlines()) == 1
 
 
-def test_a_model_without_parameters_is_refused(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_without_parameters_is_refused(lab: Path) -> None:
     model = lab.parent / "model.toml"
     model.write_text(MODEL.split("[[parameter]]")[0])
-    assert call(monkeypatch, lab, "--model", model) != 0
-    assert "has no parameter to calibrate: it lists none" in capsys.readouterr().err
+    assert "has no parameter to calibrate: it lists none" in refused(
+        "calibrate", "campaign", lab, "--model", model, code=None
+    )

@@ -9,11 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests import command_line
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    return command_line.call(monkeypatch, "calibrate", *words)
+from tests.command_line import refused, said
 
 
 def figures(file: Path) -> dict[str, float]:
@@ -47,11 +43,9 @@ def plots(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("options", [(), ("--extremes",), ("--fitted",)])
-def test_ringdown(
-    monkeypatch: pytest.MonkeyPatch, plots: Path, tmp_path: Path, options: tuple[str, ...]
-) -> None:
+def test_ringdown(plots: Path, tmp_path: Path, options: tuple[str, ...]) -> None:
     out = tmp_path / "out"
-    assert call(monkeypatch, "ringdown", "--data", str(plots), "--out", str(out), *options) == 0
+    said("calibrate", "ringdown", "--data", str(plots), "--out", str(out), *options)
     found = figures(out / "ringdown.csv")
     assert all(len(str(value)) > 8 for value in found.values())  # the console has five digits
     assert found["mode 1, natural frequency"] == pytest.approx(5.65, rel=5e-3)
@@ -60,8 +54,5 @@ def test_ringdown(
     assert (out / "figures" / "ringdown.png").is_file()
 
 
-def test_what_is_wrong_is_said_in_one_sentence(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert call(monkeypatch, "ringdown", "--data", str(tmp_path / "nothing")) == 1
-    assert "does not exist" in capsys.readouterr().err
+def test_what_is_wrong_is_said_in_one_sentence(tmp_path: Path) -> None:
+    assert "does not exist" in refused("calibrate", "ringdown", "--data", str(tmp_path / "nothing"))

@@ -14,7 +14,7 @@ from calibration.geometry import read_lengths
 from calibration.static.experiments import read_measurements
 from calibration.wing.laboratory import read_weighed_mass
 from fe.wing.design import SHIPPED_DESIGN
-from tests.command_line import call
+from tests.command_line import call, said
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 
@@ -25,9 +25,7 @@ def simulate(monkeypatch: pytest.MonkeyPatch, out: Path, *arguments: object) -> 
     )
 
 
-def test_a_folder_with_its_truth(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     out = tmp_path / "lab"
     given = ("--e", 0.99, "--servo-mass", 0.18, "--pitot-mass", 0.11, "--alpha", 0.9, "--beta", 5e-4)
     assert simulate(monkeypatch, out, *given) == 0
@@ -54,19 +52,17 @@ def test_a_folder_with_its_truth(
     for file in sorted(path for path in out.rglob("*") if path.is_file()):
         assert file.read_bytes() == (tmp_path / "again" / file.relative_to(out)).read_bytes()
     # the command line takes it
-    capsys.readouterr()
-    assert call(monkeypatch, "calibrate", "--data", out, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(said("calibrate", "--data", out, "--json"))
     assert told["laboratory"].startswith("step1/geometry_data.csv read")
     assert [item["name"] for item in told["quantities"]][:2] == ["tip_stiffness", "frequency_1"]
     assert {"weighed_mass", "frequency_1"} <= {reading["name"] for reading in told["readings"]}
-    assert call(monkeypatch, "calibrate", "ringdown", "--data", out, "--fitted") == 0
+    said("calibrate", "ringdown", "--data", out, "--fitted")
 
 
 @pytest.mark.long
 def test_the_fmu_gives_the_same_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     fmu = tmp_path / "wing.fmu"
-    assert call(monkeypatch, "fmu", "build", "--out", fmu) == 0
+    said("fmu", "build", "--out", fmu)
     assert simulate(monkeypatch, tmp_path / "model") == 0
     assert simulate(monkeypatch, tmp_path / "flown", "--fmu", fmu) == 0
     ours, theirs = read_measurements(tmp_path / "model"), read_measurements(tmp_path / "flown")

@@ -34,7 +34,7 @@ from fe.runtime.state import DigitalState
 from fe.wing.design import SHIPPED_DESIGN, load_design
 from fmu_asset.door.session import FmiAsset
 from scenarios import scenario_files
-from tests.command_line import call
+from tests.command_line import call, command, refused, said
 from twin_master.errors import NotResumableError
 from twin_master.workflow import resume_run
 
@@ -123,12 +123,9 @@ def test_wings_are_told_apart(wings: dict[str, Tailored]) -> None:
     assert stiff.mean("damping_ratio_2") > soft.mean("damping_ratio_2")
 
 
-def test_the_published_figures_give_table_1(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_published_figures_give_table_1(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    assert call(monkeypatch, "calibrate") == 0
-    rows = {line.split("  ")[0].strip(): line for line in capsys.readouterr().out.splitlines() if "±" in line}
+    rows = {line.split("  ")[0].strip(): line for line in said("calibrate").splitlines() if "±" in line}
     table = {name: re.findall(r"[−+]?[\d.]+", line.replace(name, "", 1)) for name, line in rows.items()}
     assert table["modulus factor e"][4:8] == ["1.0073", "0.0103", "1.0073", "0.0103"]  # procedure and paper
     for name, near in (
@@ -184,20 +181,18 @@ def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
 
 @pytest.mark.long
 def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(
-    wings: dict[str, Tailored],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    wings: dict[str, Tailored], tmp_path: Path
 ) -> None:
     made, out = wings["soft"], tmp_path / "out"
     shutil.copytree(made.out, out)
     before = (out / "calibration.nc").read_bytes()
-    assert call(monkeypatch, "calibrate", "--out", out, "--asset", "other") == 1
-    assert "is the calibration of soft, not of other: choose another --out" in capsys.readouterr().err
+    assert "is the calibration of soft, not of other: choose another --out" in refused(
+        "calibrate", "--out", out, "--asset", "other"
+    )
     assert (out / "calibration.nc").read_bytes() == before
     old = (out / "calibration.nc").stat().st_ino
     arguments = ["calibrate", "--data", made.lab, "--asset", "soft", "--fitted", "--no-report"]
-    assert call(monkeypatch, *arguments, "--out", out) == 0
+    said(*arguments, "--out", out)
     assert {path.name for path in out.iterdir()} == {"calibration.nc", "table_1.csv"}
     assert (out / "calibration.nc").stat().st_ino != old  # it was written anew
     assert (out / "calibration.nc").read_bytes() == before
@@ -205,30 +200,26 @@ def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(
 
 
 @pytest.mark.long
-def test_a_report_of_a_calibration_repeats_to_the_byte(
-    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_of_a_calibration_repeats_to_the_byte(wings: dict[str, Tailored], tmp_path: Path) -> None:
     made = wings["soft"]
     arguments = ["calibrate", "--data", made.lab, "--asset", "soft", "--fitted"]
-    assert call(monkeypatch, *arguments, "--out", tmp_path) == 0
+    said(*arguments, "--out", tmp_path)
     for name in ("calibration.nc", "report.html", "table_1.csv", "figures/posterior.svg"):
         assert (tmp_path / name).read_bytes() == (made.out / name).read_bytes(), name
 
 
 @pytest.mark.long
-def test_two_wings_are_two_fmus(
-    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_wings_are_two_fmus(wings: dict[str, Tailored], tmp_path: Path) -> None:
     strain, tip, guid = {}, {}, {}
     for name, made in wings.items():
         fmus = [tmp_path / f"{name}{copy}.fmu" for copy in (1, 2)]
         for fmu in fmus:
             arguments = ["fmu", "build", "--calibration", made.out / "calibration.nc", "--out", fmu]
-            assert call(monkeypatch, *arguments) == 0
+            said(*arguments)
         assert fmus[0].read_bytes() == fmus[1].read_bytes()
         assert validate_fmu(str(fmus[0])) == []
         if name == "soft":
-            assert call(monkeypatch, "fmu", "check", fmus[0], "--cycles", "5") == 0
+            said("fmu", "check", fmus[0], "--cycles", "5")
         described = read_model_description(str(fmus[0]))
         guid[name] = described.guid
         assert f"Calibrated for the wing '{name}'" in described.description
@@ -274,16 +265,14 @@ def short_scenario(file: Path, *, parameters: bool = True) -> Path:
 
 @pytest.mark.long
 @pytest.mark.usefixtures("no_report")
-def test_two_wings_are_two_flights(
-    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_wings_are_two_flights(wings: dict[str, Tailored], tmp_path: Path) -> None:
     """Without a truth of its own in the scenario, each wing is flown as it was calibrated."""
     scenario = short_scenario(tmp_path / "mine.toml", parameters=False)
     predicted, true = {}, {}
     for name, made in wings.items():
         out = tmp_path / name
         file = made.out / "calibration.nc"
-        assert call(monkeypatch, "run", scenario, "--calibration", file, "--out", out, "-q") == 0
+        said("run", scenario, "--calibration", file, "--out", out, "-q")
         assert (out / "asset" / "calibration.nc").read_bytes() == file.read_bytes()
         config = json.loads((out / "config.json").read_text(encoding="utf-8"))
         assert config["inputs"]["design"] == made.result.design_hash
@@ -339,14 +328,14 @@ def test_a_run_with_a_calibration_needs_nothing_but_its_folder(
     file.parent.mkdir()
     shutil.copy(wings["soft"].out / "calibration.nc", file)
     scenario = short_scenario(tmp_path / "mine.toml")
-    assert call(monkeypatch, "run", scenario, "--calibration", file, "--out", tmp_path / "whole", "-q") == 0
+    said("run", scenario, "--calibration", file, "--out", tmp_path / "whole", "-q")
     with monkeypatch.context() as patch:
         die_after_turn(patch, 2)
         arguments = ["run", scenario, "--calibration", file, "--out", tmp_path / "part", "-q"]
         assert call(patch, *arguments) == 130
     shutil.rmtree(file.parent)
     moved = (tmp_path / "part").rename(tmp_path / "moved")
-    assert call(monkeypatch, "run", "--resume", moved, "-q") == 0
+    said("run", "--resume", moved, "-q")
     for name in ("run.nc", "config.json", "summary.json", "calibration.json", "asset/asset.fmu", "wing.vtu"):
         assert (moved / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
     (moved / "run.nc").unlink()  # of a finished run nothing is computed again
@@ -360,10 +349,7 @@ def test_a_run_with_a_calibration_needs_nothing_but_its_folder(
 
 
 def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(
-    wings: dict[str, Tailored],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The published frequencies ask the softer wing for masses beyond the model.
     lab = tmp_path / "lab"
@@ -379,26 +365,20 @@ def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(
 
     monkeypatch.setattr(Path, "replace", full)
     arguments = ["--data", lab, "--procedure", "paper", "--out", tmp_path / "out", "--no-report"]
-    assert call(monkeypatch, "calibrate", *arguments) == 1
-    captured = capsys.readouterr()
-    lines = captured.out.splitlines()
+    done = command("calibrate", *arguments)
+    lines = done.stdout.splitlines()
     assert lines[0] == "Step 1: not measured; published lengths (Kapteyn et al. 2021, Table 1)."
     assert lines[1] == "Step 2: step2/load_displacement_measurements.csv read, 8 pairs."
     assert lines[2].startswith("Step 3: published frequencies and damping ratios")
-    assert "modulus factor e" in captured.out
-    assert "No space is left on the disk" in captured.err
+    assert "modulus factor e" in done.stdout
+    assert done.returncode == 1
+    assert "No space is left on the disk" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["lab"]
 
 
 @pytest.mark.long
-def test_records_may_be_left_aside(
-    wings: dict[str, Tailored], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert (
-        call(monkeypatch, "calibrate", "--data", wings["stiff"].lab, "--published", "--procedure", "paper")
-        == 0
-    )
-    out = capsys.readouterr().out
+def test_records_may_be_left_aside(wings: dict[str, Tailored]) -> None:
+    out = said("calibrate", "--data", wings["stiff"].lab, "--published", "--procedure", "paper")
     assert "Nothing was written" in out.splitlines()[-1]
     assert "Step 3: records left aside as asked; published" in out
     assert re.search(r"frequency_1 +Hz +5\.649 ±", out)
@@ -414,9 +394,7 @@ def measured_planform(folder: Path, semi_span: float) -> Path:
 
 
 @pytest.mark.long
-def test_the_model_follows_the_measured_planform(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_model_follows_the_measured_planform(tmp_path: Path) -> None:
     """The tailored wing is shorter and stiffer than the one on the drawing (a coarse mesh, for speed)."""
     text = SHIPPED_DESIGN.read_text(encoding="utf-8")
     coarse = tmp_path / "coarse.toml"
@@ -424,8 +402,7 @@ def test_the_model_follows_the_measured_planform(
     out = tmp_path / "out"
     lab = measured_planform(tmp_path, 1818.0)
     arguments = ["--data", lab, "--design", coarse, "--out", out, "--asset", "short wing", "--no-report"]
-    assert call(monkeypatch, "calibrate", *arguments) == 0
-    capsys.readouterr()
+    said("calibrate", *arguments)
     result = load_calibration(out / "calibration.nc")
     assert result.design.planform.semi_span == 1.8181  # prior and measurement together, to 0.1 mm
     assert result.mean_state().geometry.semi_span == 1.8181
@@ -438,9 +415,7 @@ def test_the_model_follows_the_measured_planform(
     assert model.tip_stiffness(1.0) == pytest.approx(expected, rel=5e-3)
 
 
-def test_a_design_that_the_measured_planform_spoils_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_design_that_the_measured_planform_spoils_is_refused(tmp_path: Path) -> None:
     text = SHIPPED_DESIGN.read_text(encoding="utf-8")
     design = tmp_path / "design.toml"
     last = text.rindex("span_end = ")
@@ -448,8 +423,7 @@ def test_a_design_that_the_measured_planform_spoils_is_refused(
     design.write_text(changed, encoding="utf-8")
     lab = measured_planform(tmp_path, 1815.0)
     arguments = ["--data", lab, "--design", design, "--out", tmp_path / "out"]
-    assert call(monkeypatch, "calibrate", *arguments) == 1
-    error = capsys.readouterr().err
+    error = refused("calibrate", *arguments)
     assert "defects[1] ends 1.825 m from the root, off the wing of 1.8151 m" in error
     assert not (tmp_path / "out").exists()
 
@@ -537,17 +511,12 @@ SENTENCES = {
     ],
 )
 def test_a_wrong_folder_is_one_sentence_and_leaves_nothing(
-    kind: str,
-    wings: dict[str, Tailored],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    kind: str, wings: dict[str, Tailored], tmp_path: Path
 ) -> None:
     lab, out = tmp_path / "lab", tmp_path / "out"
     shutil.copytree(wings["soft"].lab, lab)
     spoil(kind, lab)
-    assert call(monkeypatch, "calibrate", "--data", lab, "--out", out) == 1
-    error = capsys.readouterr().err
+    error = refused("calibrate", "--data", lab, "--out", out)
     last = [line for line in error.splitlines() if line.strip()][-1]
     assert SENTENCES[kind] in last
     assert "Traceback" not in error
@@ -579,10 +548,8 @@ def test_other_refusals(
         call(monkeypatch, "fmu", "build", "--calibration", tmp_path / "x.nc", "--out", tmp_path / "x.fmu")
         == 1
     )
-    assert (
-        call(monkeypatch, "run", "level_turns", "--calibration", tmp_path / "a file", "--out", tmp_path / "r")
-        == 1
+    assert "cannot be read as NetCDF" in refused(
+        "run", "level_turns", "--calibration", tmp_path / "a file", "--out", tmp_path / "r"
     )
-    assert "cannot be read as NetCDF" in capsys.readouterr().err
     assert not (tmp_path / "x.fmu").exists()
     assert not (tmp_path / "r").exists()

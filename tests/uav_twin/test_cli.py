@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks import command_page
 from reporting import terminal
-from tests.command_line import call
+from tests.command_line import call, refused, said
 from twin_master.errors import ScenarioError
 from uav_twin import cli
 
@@ -22,13 +22,11 @@ def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
 
 
-def test_commands_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(monkeypatch, "--help") == 0
-    text = capsys.readouterr().out
+def test_commands_are_listed() -> None:
+    text = said("--help")
     for command in ("run", "wing", "calibrate", "scenarios", "fmu"):
         assert command in text
-    assert call(monkeypatch, "run", "--help") == 0
-    text = capsys.readouterr().out
+    text = said("run", "--help")
     for option in (
         "--out",
         "--seed",
@@ -42,36 +40,32 @@ def test_commands_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
         assert option in text
 
 
-def test_scenarios(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(monkeypatch, "scenarios") == 0
-    text = capsys.readouterr().out
+def test_scenarios() -> None:
+    text = said("scenarios")
     for name in ("level_turns", "growing_damage", "failing_gauges", "model_mismatch"):
         assert name in text
 
 
 @pytest.mark.usefixtures("no_report")
 def test_run_prints_figures_and_report(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, library_file: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, library_file: Path
 ) -> None:
     out = tmp_path / "run"
     arguments = ["run", "level_turns", "--out", str(out), "--strain-library", str(library_file)]
-    assert call(monkeypatch, *arguments, "--seed", "3") == 0
-    text = capsys.readouterr().out
+    text = said(*arguments, "--seed", "3")
     assert "filtered rms error of z1" in text
     assert "60 % (1)" in text
     assert "(1) Kapteyn et al. 2021\n" in text
     assert f"Report: {out / 'report.html'}" in text
-    assert call(monkeypatch, *arguments) == 1
-    error = capsys.readouterr().err
+    error = refused(*arguments)
     assert "holds a run already" in error
     assert len(error.strip().splitlines()) == 1
-    assert call(monkeypatch, *arguments, "--replace", "--quiet") == 0
+    said(*arguments, "--replace", "--quiet")
     captured = capsys.readouterr()
     assert captured.out == captured.err == ""
-    assert call(monkeypatch, "run", "--resume", str(out), "--quiet") == 0
+    said("run", "--resume", str(out), "--quiet")
     (out / "report.html").unlink(missing_ok=True)
-    assert call(monkeypatch, *arguments, "--replace", "--json", "--no-report") == 0
-    record = json.loads(capsys.readouterr().out)
+    record = json.loads(said(*arguments, "--replace", "--json", "--no-report"))
     assert record["folder"] == str(out)
     assert record["report"] is None
     assert record["scenario"] == "level_turns"
@@ -80,19 +74,14 @@ def test_run_prints_figures_and_report(
 
 
 @pytest.mark.usefixtures("no_report")
-def test_a_scenario_without_references_has_no_column_for_them(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, library_file: Path
-) -> None:
+def test_a_scenario_without_references_has_no_column_for_them(tmp_path: Path, library_file: Path) -> None:
     arguments = ["--out", str(tmp_path / "run"), "--strain-library", str(library_file)]
-    assert call(monkeypatch, "run", "growing_damage", *arguments) == 0
-    text = capsys.readouterr().out
+    text = said("run", "growing_damage", *arguments)
     assert "filtered rms error of z1" in text
     assert "reference" not in text
 
 
-def test_usage_errors_end_with_2(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_usage_errors_end_with_2(tmp_path: Path) -> None:
     for arguments in (
         ["run"],
         ["run", "level_turns", "--nonsense"],
@@ -101,13 +90,10 @@ def test_usage_errors_end_with_2(
         ["run", "--resume", str(tmp_path), "--out", str(tmp_path)],
         ["nonsense"],
     ):
-        assert call(monkeypatch, *arguments) == 2
-        assert "Traceback" not in capsys.readouterr().err
+        assert "Traceback" not in refused(*arguments, code=2)
 
 
-def test_errors_of_the_packages_are_one_sentence_and_1(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_errors_of_the_packages_are_one_sentence_and_1(tmp_path: Path) -> None:
     broken = tmp_path / "broken.toml"
     broken.write_text("format = 3", encoding="utf-8")
     for arguments, word in (
@@ -124,8 +110,7 @@ def test_errors_of_the_packages_are_one_sentence_and_1(
         (["wing", "--design", str(tmp_path / "no.toml")], "no.toml"),
         (["calibrate", "ringdown", "--data", str(tmp_path / "no.csv")], "no.csv"),
     ):
-        assert call(monkeypatch, *arguments) == 1
-        error = capsys.readouterr().err
+        error = refused(*arguments)
         assert word in error.replace("\n", " ")
         assert "Traceback" not in error
     assert not (tmp_path / "x").exists()

@@ -9,38 +9,29 @@ import pytest
 
 from discrepancy.files.patch import read_patch
 from discrepancy.files.verdict import read_verdict
-from tests import command_line
+from tests.command_line import command, refused, said
 
 RIG = ("--model", "single_mass_rig")
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    return command_line.call(monkeypatch, "discrepancy", *words)
-
-
 @pytest.fixture
-def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def campaign(tmp_path: Path) -> Path:
     """A static campaign of the single-mass rig with a seating offset."""
     folder = tmp_path / "rig test"
     given = ("static", str(folder), *RIG, "--seed", "3", "--effect", "seating_offset@A:offset_ratio=0.08")
-    assert call(monkeypatch, "example", *given) == 0
+    said("discrepancy", "example", *given)
     return folder
 
 
-def test_from_an_example_to_a_verdict(
-    campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_from_an_example_to_a_verdict(campaign: Path, tmp_path: Path) -> None:
     table = (campaign / "campaign.toml").read_text(encoding="utf-8")
     (campaign / "campaign.toml").write_text(table.replace("held_out = true", "held_out = false"), "utf-8")
-    capsys.readouterr()
-    assert call(monkeypatch, "check", str(campaign), *RIG) == 0
-    shown = capsys.readouterr().out
+    shown = said("discrepancy", "check", str(campaign), *RIG)
     assert "seating_offset" in shown
     assert "Not testable: washout and inertia_relief. The campaign has no flight trial to fit." in shown
     assert "Hold out a trial" in shown or "held out" in shown
     out = tmp_path / "verdict"
-    assert call(monkeypatch, "run", str(campaign), *RIG, "--out", str(out), "--calibrate", "1") == 0
-    shown = capsys.readouterr().out
+    shown = said("discrepancy", "run", str(campaign), *RIG, "--out", str(out), "--calibrate", "1")
     stored = read_verdict(out / "verdict.json")
     assert f"Verdict: {stored.verdict.kind.value}" in shown
     assert "seating_offset" in stored.verdict.inclusion
@@ -57,44 +48,35 @@ def test_from_an_example_to_a_verdict(
     assert "seating offset" in page
     assert str(tmp_path) not in page
     # a second time: only on demand (that it comes to the same conclusion is tested in test_workflow.py)
-    assert call(monkeypatch, "run", str(campaign), *RIG, "--out", str(out)) == 1
-    assert "--replace" in capsys.readouterr().err
-    assert call(monkeypatch, "run", str(campaign), *RIG, "--out", str(out), "--replace") == 0
+    assert "--replace" in refused("discrepancy", "run", str(campaign), *RIG, "--out", str(out))
+    said("discrepancy", "run", str(campaign), *RIG, "--out", str(out), "--replace")
     assert not (out / "self_calibration.json").exists()
 
 
-def test_faults_of_the_data_end_with_a_sentence_and_a_report(
-    campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign: Path, tmp_path: Path) -> None:
     text = (campaign / "campaign.toml").read_text(encoding="utf-8")
     assert 'unit = "mm"' in text
     (campaign / "campaign.toml").write_text(text.replace('unit = "mm"', 'unit = "m"', 1), encoding="utf-8")
     table = next(path for path in campaign.glob("*.csv") if path.name != "noise.csv")
     first, *rows = table.read_text(encoding="utf-8").splitlines()
     table.write_text("\n".join([f"{first},weather", *(f"{row},1" for row in rows)]), encoding="utf-8")
-    capsys.readouterr()
-    assert call(monkeypatch, "check", str(campaign), *RIG) == 1
-    shown = capsys.readouterr().out
-    assert "Fault:" in shown
-    assert "no channel has the column 'weather'" in shown
-    assert call(monkeypatch, "run", str(campaign), *RIG, "--out", str(tmp_path / "v")) == 1
-    caught = capsys.readouterr()
-    assert "1000" in caught.err or "10^" in caught.err or "unit" in caught.err
-    assert "Traceback" not in caught.err
+    shown = command("discrepancy", "check", str(campaign), *RIG)
+    assert shown.returncode == 1
+    assert "Fault:" in shown.stdout
+    assert "no channel has the column 'weather'" in shown.stdout
+    error = refused("discrepancy", "run", str(campaign), *RIG, "--out", str(tmp_path / "v"))
+    assert "1000" in error or "10^" in error or "unit" in error
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
 
 
-def test_the_catalogue(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(monkeypatch, "effects") == 0
-    shown = capsys.readouterr().out
+def test_the_catalogue() -> None:
+    shown = said("discrepancy", "effects")
     assert "coulomb_friction" in shown
     assert "ζ_eq(A)" in shown
-    assert call(monkeypatch, "effects", "--show", "coulomb_friction") == 0
-    shown = capsys.readouterr().out
+    shown = said("discrepancy", "effects", "--show", "coulomb_friction")
     assert "friction_ratio" in shown
     assert "Den Hartog" in shown
-    assert call(monkeypatch, "effects", "--show", "gremlins") == 1
-    assert "coulomb_friction" in capsys.readouterr().err
+    assert "coulomb_friction" in refused("discrepancy", "effects", "--show", "gremlins")
 
 
 @pytest.mark.parametrize(
@@ -118,19 +100,11 @@ def test_the_catalogue(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     ],
 )
 def test_bad_input_is_one_sentence(
-    arguments: tuple[str, ...],
-    message: str,
-    campaign: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...], message: str, campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    capsys.readouterr()
     before = sorted(path.name for path in tmp_path.iterdir())
     filled = [word.format(campaign=campaign, new=tmp_path / "new") for word in arguments]
-    assert call(monkeypatch, *filled) == 1
-    error = capsys.readouterr().err.strip()
+    error = refused("discrepancy", *filled).strip()
     assert message in error
-    assert "Traceback" not in error
     assert sorted(path.name for path in tmp_path.iterdir()) == before  # nothing half-written

@@ -21,7 +21,7 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from reporting.progress import SilentProgress
 from tests import command_line
-from tests.command_line import command
+from tests.command_line import command, refused, said
 
 ROOM = """
 [binding]
@@ -104,25 +104,23 @@ def flown(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
     return command_line.call(monkeypatch, "fmu", "simulate", *words)
 
 
-def test_an_fmu_alone(
-    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_fmu_alone(foreign_fmu: Any, tmp_path: Path) -> None:
     """A ball that is let go, against its closed form; its second bounce ends the simulation."""
     out, plot, fmu = tmp_path / "ball.csv", tmp_path / "ball.png", foreign_fmu("ball2", "ENDS")
     wanted = ("--stop-time", 3, "--step-size", 0.1, "--set", "e=0.8", "--set", "g=3.72", "--in-process")
-    assert flown(monkeypatch, fmu, *wanted, "--out", out, "--plot", plot) == 0
-    said = capsys.readouterr().out
+    told = said("fmu", "simulate", fmu, *wanted, "--out", out, "--plot", plot)
     end = math.sqrt(2.0 / 3.72) * (1.0 + 2.0 * 0.8)
-    assert f"20 steps to t = {end:g} s, every 0.1 s" in said
-    assert f"ended at t = {end:g} s" in said
+    assert f"20 steps to t = {end:g} s, every 0.1 s" in told
+    assert f"ended at t = {end:g} s" in told
     rows = np.genfromtxt(out, delimiter=",", names=True)
     falling = rows["time"] < math.sqrt(2.0 / 3.72)
     np.testing.assert_allclose(rows["h"][falling], 1.0 - 1.86 * rows["time"][falling] ** 2, atol=1e-4)
     assert rows[0].tolist()[:3] == (0.0, 1.0, 0.0)
     assert rows["bounces"].tolist() == [0] * 8 + [1] * 12 + [2]
     assert plot.read_bytes()[:4] == b"\x89PNG"
-    assert flown(monkeypatch, fmu, "--in-process", "--stop-time", 0.4) == 0
-    assert "500 steps to t = 0.4 s, every 0.0008 s" in capsys.readouterr().out
+    assert "500 steps to t = 0.4 s, every 0.0008 s" in said(
+        "fmu", "simulate", fmu, "--in-process", "--stop-time", 0.4
+    )
     for wrong, sentence in (
         (["--set", "mass=1"], "has no parameter or input 'mass' that takes numbers; it has e, g"),
         (["--set", "e"], "--set e is not understood; write NAME=NUMBER"),
@@ -130,26 +128,20 @@ def test_an_fmu_alone(
         (["--set", "e=2"], "lies outside the range of 'e', 0.5 to 1"),
         (["--binding", "b.toml"], "--binding and --inputs go together"),
     ):
-        assert flown(monkeypatch, fmu, *wrong) != 0
-        assert sentence in " ".join(capsys.readouterr().err.split())
+        assert sentence in refused("fmu", "simulate", fmu, *wrong, code=None)
 
 
 @pytest.mark.parametrize("where", [(), ("--in-process",)], ids=["worker", "in process"])
 def test_structural_parameters_size_the_arrays(
-    foreign_fmu: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    where: tuple[str, ...],
+    foreign_fmu: Any, tmp_path: Path, where: tuple[str, ...]
 ) -> None:
     """Each element sums its weight times its input: n of them, set in configuration mode."""
     fmu, out = foreign_fmu("resize3"), tmp_path / "x.csv"
     wanted = ("--stop-time", 3, "--step-size", 1, "--out", out, *where)
-    assert flown(monkeypatch, fmu, *wanted, "--set", "n=4", "--set", "u=1,2,0,-1") == 0
+    said("fmu", "simulate", fmu, *wanted, "--set", "n=4", "--set", "u=1,2,0,-1")
     rows = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
     assert rows.dtype.names == ("time", "y[1]", "y[2]", "y[3]", "y[4]", "total")
     assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
-    capsys.readouterr()
     for wrong, sentence in (
         (("n=2.5",), "structural_parameters.n must be a whole number, but is 2.5"),
         (("n=-1",), "n = -1.0 lies outside the range of 'n', 0 to 8"),
@@ -160,8 +152,9 @@ def test_structural_parameters_size_the_arrays(
         (("n=3",), "'u' of {} has 3 elements but 2 start values; give all of its values."),
         (("n=3", "u=1,2"), "control.u takes 3 values, but 2 came"),
     ):
-        assert flown(monkeypatch, fmu, *wanted[:4], *where, *(w for v in wrong for w in ("--set", v))) != 0
-        error = capsys.readouterr().err
+        error = refused(
+            "fmu", "simulate", fmu, *wanted[:4], *where, *(w for v in wrong for w in ("--set", v)), code=None
+        )
         assert sentence.format(fmu) in " ".join(error.split())
         assert "Traceback" not in error
 
@@ -173,29 +166,26 @@ observation.y = { variables = "y", unit = "1" }
 """
 
 
-def test_an_array_may_be_empty(
-    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_array_may_be_empty(foreign_fmu: Any, tmp_path: Path) -> None:
     out, fmu = tmp_path / "x.csv", foreign_fmu("resize3")
     wanted = ("--stop-time", 2, "--step-size", 1, "--set", "n=0", "--in-process", "--out", out)
-    assert flown(monkeypatch, fmu, *wanted) == 0
+    said("fmu", "simulate", fmu, *wanted)
     assert out.read_text(encoding="utf-8").splitlines() == ["time,total", "0.0,0.0", "1.0,0.0", "2.0,0.0"]
     bound, given = tmp_path / "empty.toml", tmp_path / "u.csv"
     bound.write_text(SIZED.replace("n = 3", "n = 0"), encoding="utf-8")
     given.write_text("time,u\n0,1\n1,1\n", encoding="utf-8")
-    assert flown(monkeypatch, fmu, "--binding", bound, "--inputs", given, "--in-process") == 1
-    assert "control.u must be 0 values" in capsys.readouterr().err
+    assert "control.u must be 0 values" in refused(
+        "fmu", "simulate", fmu, "--binding", bound, "--inputs", given, "--in-process"
+    )
 
 
-def test_histories_of_an_array_of_another_size(
-    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_histories_of_an_array_of_another_size(foreign_fmu: Any, tmp_path: Path) -> None:
     """Weights 1, 2, 3; the two start values of the FMU are no longer of use. A state holds them, too."""
     bound, given, out = tmp_path / "b.toml", tmp_path / "u.csv", tmp_path / "x.csv"
     bound.write_text(SIZED, encoding="utf-8")
     given.write_text("time,u[1],u[2],u[3]\n0,1,2,3\n1,0,0,1\n", encoding="utf-8")
     fmu = foreign_fmu("resize3")
-    assert flown(monkeypatch, fmu, "--binding", bound, "--inputs", given, "--out", out, "--in-process") == 0
+    said("fmu", "simulate", fmu, "--binding", bound, "--inputs", given, "--out", out, "--in-process")
     assert out.read_text(encoding="utf-8").splitlines()[1:] == ["1.0,1.0,4.0,9.0", "2.0,1.0,4.0,12.0"]
     with closing(FmiAsset(fmu, bound, isolated=False)) as asset:
         assert asset.step({"u": [1.0, 2.0, 3.0]}).values.tolist() == [1.0, 4.0, 9.0]
@@ -295,9 +285,7 @@ def test_columns_of_arrays_in_any_order_and_time_alone(room: Path, tmp_path: Pat
     assert read_histories(given, load_binding(room)) == (3, {})
 
 
-def test_rows_that_are_joined_by_lines(
-    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_that_are_joined_by_lines(foreign_fmu: Any, tmp_path: Path) -> None:
     """x' = u - x from rest under u = t: x = t - 1 + exp(-t); the first row is where the asset starts."""
     given, bound, out = tmp_path / "u.csv", tmp_path / "follow.toml", tmp_path / "x.csv"
     bound.write_text(
@@ -306,8 +294,7 @@ def test_rows_that_are_joined_by_lines(
     )
     given.write_text("time,u\n0,0\n0.5,0.5\n1,1\n")
     wanted = (foreign_fmu("follow2"), "--binding", bound, "--inputs", given, "--out", out, "--in-process")
-    assert flown(monkeypatch, *wanted, "--interpolation", "linear") == 0
-    assert "2 steps to t = 1 s" in capsys.readouterr().out
+    assert "2 steps to t = 1 s" in said("fmu", "simulate", *wanted, "--interpolation", "linear")
     rows = np.genfromtxt(out, delimiter=",", names=True)
     np.testing.assert_allclose(rows["x"], rows["time"] - 1.0 + np.exp(-rows["time"]), atol=1e-14)
     assert rows["time"].tolist() == [0.0, 0.5, 1.0]
@@ -316,5 +303,6 @@ def test_rows_that_are_joined_by_lines(
         (("--interpolation", "linear"), "leads from one row of the inputs to the next: give two or more"),
         (("--interpolation", "cubic"), "--interpolation must be zero-order or linear, and 'cubic' came"),
     ):
-        assert flown(monkeypatch, *wanted, *more, "--replace") != 0
-        assert sentence in " ".join(capsys.readouterr().err.split())
+        assert sentence in " ".join(
+            refused("fmu", "simulate", *wanted, *more, "--replace", code=None).split()
+        )

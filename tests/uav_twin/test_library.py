@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from scenarios import binding_files, scenario_files
-from tests.command_line import call
+from tests.command_line import refused, said
 
 GRID = [
     "--grid",
@@ -22,17 +22,14 @@ GRID = [
 ]
 
 
-def test_from_a_script_to_a_library(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_from_a_script_to_a_library(tmp_path: Path) -> None:
     fmu, out = tmp_path / "pump.fmu", tmp_path / "pump.nc"
-    assert call(monkeypatch, "fmu", "build", "--script", "gear_pump", "--out", str(fmu)) == 0
-    assert call(monkeypatch, "fmu", "check", str(fmu), "--cycles", "5") == 0
+    said("fmu", "build", "--script", "gear_pump", "--out", str(fmu))
+    said("fmu", "check", str(fmu), "--cycles", "5")
     sample = ["library", "sample", "--fmu", str(fmu), "--binding", str(binding_files()["gear_pump"]), *GRID]
-    capsys.readouterr()
-    assert call(monkeypatch, *sample, "--out", str(out), "--workers", "2") == 0
     assert re.search(
-        r"pump\.nc: 1 x 4 x 2 x 4 \(draws, states, controls, sensors\), 2 proc", capsys.readouterr().out
+        r"pump\.nc: 1 x 4 x 2 x 4 \(draws, states, controls, sensors\), 2 proc",
+        said(*sample, "--out", str(out), "--workers", "2"),
     )
     content = out.read_bytes()
     for extra, words in (
@@ -40,14 +37,11 @@ def test_from_a_script_to_a_library(
         (["--replace", "--grid", "wear=0,2"], "wear = 2.0 lies outside the range of 'wear'"),
         (["--replace", "--role", "flow"], "no observation 'flow'; it has operation"),
     ):
-        assert call(monkeypatch, *sample, "--out", str(out), *extra) == 1
-        assert words in capsys.readouterr().err
+        assert words in refused(*sample, "--out", str(out), *extra)
         assert out.read_bytes() == content
 
 
-def test_a_wrong_command_line_is_said_to_be_so(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_wrong_command_line_is_said_to_be_so(tmp_path: Path) -> None:
     out = ["--out", str(tmp_path / "x.nc")]
     for arguments, words in (
         (["library", "sample", *out], "give a scenario, or --fmu and --binding"),
@@ -55,27 +49,26 @@ def test_a_wrong_command_line_is_said_to_be_so(
         (["library", "sample", "pump_wear", *out, "--role", "flow"], "the scenario says what is observed"),
         (["fmu", "build", "--script", "gear_pump", "--kind", "source"], "are for the wing"),
     ):
-        assert call(monkeypatch, *arguments) == 2
-        assert words in capsys.readouterr().err
-    assert call(monkeypatch, "library", "sample", "pump_wear", *out, "--grid", "speed=1000") == 1
-    assert "the rest is said by the scenario" in capsys.readouterr().err
+        assert words in refused(*arguments, code=2)
+    assert "the rest is said by the scenario" in refused(
+        "library", "sample", "pump_wear", *out, "--grid", "speed=1000"
+    )
     missing = str(tmp_path / "missing.nc")
-    assert call(monkeypatch, "run", "pump_wear", "--library", missing, "--out", str(tmp_path / "run")) == 1
-    assert "there is no observation library" in capsys.readouterr().err
+    assert "there is no observation library" in refused(
+        "run", "pump_wear", "--library", missing, "--out", str(tmp_path / "run")
+    )
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.long
-def test_a_run_of_the_pump_speaks_of_pumps(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_run_of_the_pump_speaks_of_pumps(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     text = scenario_files()["pump_wear"].read_text(encoding="utf-8")
     scenario = tmp_path / "short.toml"
     scenario.write_text(
         re.sub(r"^steps = 60$", "steps = 12", text, flags=re.M).replace("draws = 40", "draws = 6")
     )
     folder = tmp_path / "run"
-    assert call(monkeypatch, "run", str(scenario), "--out", str(folder), "--in-process") == 0
+    said("run", str(scenario), "--out", str(folder), "--in-process")
     shown = capsys.readouterr()
     assert "twin, per shift" in shown.out
     page = (folder / "report.html").read_text(encoding="utf-8")

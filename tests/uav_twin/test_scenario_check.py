@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from scenarios import scenario_files
-from tests.command_line import call
+from tests.command_line import command, refused, said
 from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario_check import check_scenario
@@ -28,31 +28,26 @@ def test_every_command_takes_quiet_and_verbose() -> None:
 
     everything = leaves(terminal.with_common_options(cli.app))
     assert len(everything) > 25
-    for words, command in everything:
-        options = [option for parameter in command.params for option in parameter.opts]  # type: ignore[attr-defined]
+    for words, leaf in everything:
+        options = [option for parameter in leaf.params for option in parameter.opts]  # type: ignore[attr-defined]
         for option in ("--quiet", "-q", "--verbose", "-v"):
             assert options.count(option) == 1, (words, option)
-        assert command.help, words  # type: ignore[attr-defined]
+        assert leaf.help, words  # type: ignore[attr-defined]
 
 
-def test_a_scenario_is_described(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(monkeypatch, "scenario", "check", "level_turns") == 0
-    text = capsys.readouterr().out
+def test_a_scenario_is_described() -> None:
+    text = said("scenario", "check", "level_turns")
     assert "Flown: FMU of the reduced model of the design." in text
     assert "Believed: reduced model of the design." in text
     assert "25 states, z1 (5 levels), z2 (5 levels)" in text
     assert "50 turns, 10 ahead" in text
-    assert call(monkeypatch, "scenario", "check", "level_turns", "--json", "-q") == 0
-    record = json.loads(capsys.readouterr().out)
+    record = json.loads(said("scenario", "check", "level_turns", "--json", "-q"))
     assert (record["states"], record["turns"], record["sensors"]) == (25, 50, 24)
     # at least predictions (E, S, U, G), transitions (U, S, S) and beliefs of 60 steps
     assert record["memory"] > 8 * (100 * 25 * 2 * 24 + 2 * 25**2 + 25 * 60)
-    assert call(monkeypatch, "scenario", "check", "level_turns", "-q") == 0
-    assert capsys.readouterr().out == ""
-    assert call(monkeypatch, "scenario", "check", "level_turns", "--calibration", "no_such.nc") == 1
-    assert "no_such.nc" in capsys.readouterr().err
-    assert call(monkeypatch, "scenario", "check", "level_turns", "-q", "-v") == 2
-    assert "exclude each other" in capsys.readouterr().err
+    assert said("scenario", "check", "level_turns", "-q") == ""
+    assert "no_such.nc" in refused("scenario", "check", "level_turns", "--calibration", "no_such.nc")
+    assert "exclude each other" in refused("scenario", "check", "level_turns", "-q", "-v", code=2)
 
 
 @pytest.mark.parametrize("name", sorted(scenario_files()))
@@ -89,49 +84,32 @@ def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name: str) -> Non
         ),
     ],
 )
-def test_a_fault_is_one_sentence(
-    old: str,
-    new: str,
-    sentence: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_fault_is_one_sentence(old: str, new: str, sentence: str, tmp_path: Path) -> None:
     text = scenario_files()["level_turns"].read_text(encoding="utf-8")
     assert old in text
     (tmp_path / "mine.toml").write_text(text.replace(old, new), encoding="utf-8")
-    assert call(monkeypatch, "scenario", "check", str(tmp_path / "mine.toml")) == 1
-    caught = capsys.readouterr()
-    assert caught.out == ""
-    assert sentence in caught.err
-    assert len(caught.err.strip().splitlines()) == 1
+    done = command("scenario", "check", tmp_path / "mine.toml")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert sentence in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_version() -> None:
     from importlib.metadata import version
 
-    assert call(monkeypatch, "--version") == 0
-    assert capsys.readouterr().out == f"uav-twin {version('uav-twin')}\n"
+    assert said("--version") == f"uav-twin {version('uav-twin')}\n"
 
 
-def test_ctrl_c_ends_every_command_alike(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ctrl_c_ends_every_command_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("fe.wing.design.load_design", interrupted)
-    assert call(monkeypatch, "wing") == 130
-    assert capsys.readouterr().err == "Interrupted.\n"
+    assert refused("wing", code=130) == "Interrupted."
 
 
-def test_verbose_shows_the_traceback_and_the_sentence(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert call(monkeypatch, "scenario", "check", "nowhere") == 1
-    sentence = capsys.readouterr().err
-    assert "Traceback" not in sentence
-    assert call(monkeypatch, "scenario", "check", "nowhere", "-v") == 1
-    told = capsys.readouterr().err
+def test_verbose_shows_the_traceback_and_the_sentence() -> None:
+    sentence = refused("scenario", "check", "nowhere")
+    told = command("scenario", "check", "nowhere", "-v").stderr
     assert "Traceback" in told
-    assert told.endswith(sentence)
+    assert told.strip().endswith(sentence)

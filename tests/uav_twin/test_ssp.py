@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.command_line import call
+from tests.command_line import call, refused, said
 
 HERE = Path(__file__).parents[1] / "twin_master" / "assets" / "heat_exchanger"
 
@@ -31,27 +31,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_export_check_and_run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
-) -> None:
+def test_export_check_and_run(monkeypatch: pytest.MonkeyPatch, folder: Path, tmp_path: Path) -> None:
     monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
     scenario, ssp, out = str(folder / "fouling.toml"), str(tmp_path / "x.ssp"), str(tmp_path / "run")
-    assert call(monkeypatch, "ssp", "export", scenario, "--out", ssp) == 0
-    assert "x.ssp: " in capsys.readouterr().out
-    assert call(monkeypatch, "ssp", "check", ssp) == 0
-    text = capsys.readouterr().out
+    assert "x.ssp: " in said("ssp", "export", scenario, "--out", ssp)
+    text = said("ssp", "check", ssp)
     assert "no problem found; 8 connections, 2 parameters" in text
     assert "evaluated in the order heat_exchanger (HeatExchanger)" in text
-    assert call(monkeypatch, "ssp", "export", scenario, "--out", ssp) == 1
-    assert "exists: choose another --out or give --replace" in capsys.readouterr().err
-    assert call(monkeypatch, "run", ssp, "--scenario", scenario, "--out", out, "--in-process", "-q") == 0
+    assert "exists: choose another --out or give --replace" in refused(
+        "ssp", "export", scenario, "--out", ssp
+    )
+    said("run", ssp, "--scenario", scenario, "--out", out, "--in-process", "-q")
     assert (Path(out) / "asset" / "system.ssp").read_bytes() == Path(ssp).read_bytes()
     assert (Path(out) / "csv" / "observed.csv").is_file()
 
 
-def test_bad_calls_are_one_sentence(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
-) -> None:
+def test_bad_calls_are_one_sentence(folder: Path, tmp_path: Path) -> None:
     scenario = str(folder / "fouling.toml")
     bad = tmp_path / "bad.ssp"
     bad.write_bytes(b"nothing")
@@ -68,8 +63,7 @@ def test_bad_calls_are_one_sentence(
         (("run", str(bad)), 2, "name a scenario as well"),
         (("run", scenario, "--scenario", scenario), 2, "belongs to an SSP file"),
     ):
-        assert call(monkeypatch, *arguments) == code
-        error = capsys.readouterr().err
+        error = refused(*arguments, code=code)
         assert words in " ".join(error.split())
         if code == 1:
             assert len(error.strip().splitlines()) == 1
@@ -97,14 +91,11 @@ def changed(system: Path, target: Path, **pairs: str) -> Path:
     return target
 
 
-def test_a_system_is_simulated_as_it_lies_there(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], system: Path, tmp_path: Path
-) -> None:
+def test_a_system_is_simulated_as_it_lies_there(system: Path, tmp_path: Path) -> None:
     """Against the closed form of the heat exchanger: what the file says, and what is set instead."""
     table, picture = tmp_path / "x.csv", tmp_path / "x.svg"
     simulate = ["ssp", "simulate", str(system), "--stop-time", "3", "--step-size", "1", "--in-process"]
-    assert call(monkeypatch, *simulate, "--out", str(table), "--plot", str(picture)) == 0
-    assert "3 steps to t = 3 s, every 1 s." in capsys.readouterr().out
+    assert "3 steps to t = 3 s, every 1 s." in said(*simulate, "--out", str(table), "--plot", str(picture))
     assert picture.read_text(encoding="utf-8").startswith("<?xml")
     rows = np.genfromtxt(table, delimiter=",", names=True)
     np.testing.assert_allclose(rows["time"], [0.0, 1.0, 2.0, 3.0])
@@ -112,38 +103,28 @@ def test_a_system_is_simulated_as_it_lies_there(
     for number, name in enumerate(("conductance", "heat_exchanger.conductance")):
         again = tmp_path / f"{number}.nc"
         values = ["--set", "mass_flow=0.5", "--set", f"{name}=5000"]
-        assert call(monkeypatch, *simulate, *values, "--out", str(again)) == 0
+        said(*simulate, *values, "--out", str(again))
         with xr.open_dataset(again, engine="h5netcdf") as data:
             outlet = float(data["observation"].sel(observation_name="outlet")[-1])
             assert data.attrs["fmu"] == "x.ssp"
         assert outlet == pytest.approx(20.0 + 60.0 * -np.expm1(-5000.0 / (4186.0 * 0.5)), rel=1e-14)
-    assert call(monkeypatch, *simulate, "--set", "heat_exchanger.outlet=1") == 1
-    assert "declared as output" in capsys.readouterr().err
-    assert call(monkeypatch, *simulate, "--interpolation", "linear") == 1
-    assert "asks for linear interpolation of inputs, but no component" in capsys.readouterr().err
+    assert "declared as output" in refused(*simulate, "--set", "heat_exchanger.outlet=1")
+    assert "asks for linear interpolation of inputs, but no component" in refused(
+        *simulate, "--interpolation", "linear"
+    )
 
 
-def test_what_nothing_takes_is_a_warning(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], system: Path, tmp_path: Path
-) -> None:
+def test_what_nothing_takes_is_a_warning(system: Path, tmp_path: Path) -> None:
     end = "</ssm:ParameterMapping>"
     more = f'<ssm:MappingEntry source="conductance" target="heat_exchanger.baffle" />{end}'
     file = str(changed(system, tmp_path / "more.ssp", **{end: more}))
     for command in (("check", file), ("simulate", file, "--stop-time", "1", "--in-process")):
-        assert call(monkeypatch, "ssp", *command) == 0
-        said = " ".join(capsys.readouterr().out.split())
-        assert f"warning: {file} sets parameters that nothing takes: heat_exchanger.baffle; correct" in said
-    assert call(monkeypatch, "ssp", "check", file, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["unused"] == ["heat_exchanger.baffle"]
+        told = " ".join(said("ssp", *command).split())
+        assert f"warning: {file} sets parameters that nothing takes: heat_exchanger.baffle; correct" in told
+    assert json.loads(said("ssp", "check", file, "--json"))["unused"] == ["heat_exchanger.baffle"]
 
 
-def test_a_misspelt_parameter_is_not_flown(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    folder: Path,
-    system: Path,
-    tmp_path: Path,
-) -> None:
+def test_a_misspelt_parameter_is_not_flown(folder: Path, system: Path, tmp_path: Path) -> None:
     """The nearest name is said; what another entry gives is not missed."""
     end = "</ssm:ParameterMapping>"
     more = "".join(
@@ -155,20 +136,16 @@ def test_a_misspelt_parameter_is_not_flown(
         f"{file} sets parameters that nothing takes: "
         "heat_exchanger.conductanse (did you mean 'heat_exchanger.conductance'?)"
     )
-    assert call(monkeypatch, "ssp", "check", str(file)) == 0
-    assert f"warning: {named}" in " ".join(capsys.readouterr().out.split())
+    assert f"warning: {named}" in " ".join(said("ssp", "check", str(file)).split())
     out = tmp_path / "run"
     scenario = str(folder / "fouling.toml")
-    assert call(monkeypatch, "run", str(file), "--scenario", scenario, "--out", str(out), "-q") == 1
-    error = capsys.readouterr().err
+    error = refused("run", str(file), "--scenario", scenario, "--out", str(out), "-q")
     assert named in " ".join(error.split())
     assert len(error.strip().splitlines()) == 1
     assert not out.exists()
 
 
-def test_the_words_of_ssp_2_are_read(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], system: Path, tmp_path: Path
-) -> None:
+def test_the_words_of_ssp_2_are_read(system: Path, tmp_path: Path) -> None:
     """The numbers of FMI 3, metadata and the version; what 1.0 has no word for is refused."""
     meta = '<ssc:MetaData kind="general" type="text/plain" source="note.txt" />'
     words = {
@@ -182,9 +159,8 @@ def test_the_words_of_ssp_2_are_read(
     for number, file in enumerate((system, newer)):
         tables.append(tmp_path / f"{number}.csv")
         arguments = ["--out", str(tables[-1]), "--step-size", "0.25", "--in-process"]
-        assert call(monkeypatch, "ssp", "simulate", str(file), *arguments) == 0
+        said("ssp", "simulate", str(file), *arguments)
     assert tables[0].read_bytes() == tables[1].read_bytes()
-    capsys.readouterr()
     for what, by, sentence in (
         ("<ssc:Float64 />", '<ssc:Float64 /><ssd:Dimension size="2" />', "has an array"),
         ("<ssc:Float64 />", "<ssc:Clock />", "has a clock"),
@@ -192,19 +168,12 @@ def test_the_words_of_ssp_2_are_read(
         (' source="resources/heat_exchanger.fmu"', "", "'heat_exchanger' without a source"),
     ):
         bad = changed(newer, tmp_path / "bad.ssp", **{what: by})
-        assert call(monkeypatch, "ssp", "simulate", str(bad)) == 1
-        error = capsys.readouterr().err
+        error = refused("ssp", "simulate", str(bad))
         assert sentence in error
         assert len(error.strip().splitlines()) == 1
 
 
-def test_a_strain_library_cannot_be_exported(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    folder: Path,
-    library_file: Path,
-    tmp_path: Path,
-) -> None:
+def test_a_strain_library_cannot_be_exported(folder: Path, library_file: Path, tmp_path: Path) -> None:
     from scenarios import scenario_files
 
     text = scenario_files()["level_turns"].read_text(encoding="utf-8")
@@ -213,16 +182,14 @@ def test_a_strain_library_cannot_be_exported(
     text = text[:flown] + library + text[after:]
     path = tmp_path / "library.toml"
     path.write_text(text, encoding="utf-8")
-    assert call(monkeypatch, "ssp", "export", str(path), "--out", str(tmp_path / "x.ssp")) == 1
-    assert "only FMUs can be exported" in capsys.readouterr().err
+    assert "only FMUs can be exported" in refused(
+        "ssp", "export", str(path), "--out", str(tmp_path / "x.ssp")
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_the_wing_of_a_design(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_wing_of_a_design(tmp_path: Path) -> None:
     ssp = str(tmp_path / "wing.ssp")
-    assert call(monkeypatch, "ssp", "export", "uav_wing", "--out", ssp) == 0
-    assert call(monkeypatch, "ssp", "check", ssp) == 0
-    assert "evaluated in the order uav_wing (uav_wing)" in capsys.readouterr().out
+    said("ssp", "export", "uav_wing", "--out", ssp)
+    assert "evaluated in the order uav_wing (uav_wing)" in said("ssp", "check", ssp)

@@ -10,7 +10,7 @@ import meshio
 import pytest
 
 from fe.verification.calculix_job import calculix_program
-from tests import command_line
+from tests.command_line import command, refused, said
 
 DECK = """*NODE
 1, 0, 0, 0
@@ -68,15 +68,8 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "bar.toml"
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *words: object, group: str = "structure") -> int:
-    return command_line.call(monkeypatch, group, *words)
-
-
-def test_info_says_what_a_structure_is(
-    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert call(monkeypatch, "info", str(file), "--modes", "2", "--quiet", "--json") == 0
-    record = json.loads(capsys.readouterr().out)
+def test_info_says_what_a_structure_is(file: Path) -> None:
+    record = json.loads(said("structure", "info", file, "--modes", "2", "--quiet", "--json"))
     assert record["mass"] == pytest.approx(7800 * 0.1 * 0.01**2)
     assert record["centre_of_gravity"] == pytest.approx([50, 5, 5])
     assert (record["unknowns"], record["held"], record["loose_nodes"]) == (12, 12, [9])
@@ -85,8 +78,7 @@ def test_info_says_what_a_structure_is(
     assert load["strain"]["top"] == pytest.approx(1e-4, rel=1e-9)
     assert load["output"]["end"] == pytest.approx(1e-5, rel=1e-9)
     assert len(record["frequencies"]) == 2
-    assert call(monkeypatch, "info", str(file), "--modes", "2") == 0
-    text = capsys.readouterr().out
+    text = said("structure", "info", file, "--modes", "2")
     for part in (
         "1 8-node hexahedra, 8 nodes",
         "linear: far too stiff in bending",
@@ -100,116 +92,91 @@ def test_info_says_what_a_structure_is(
 
 
 @pytest.mark.skipif(calculix_program() is None, reason="CalculiX (ccx) is not installed")
-def test_verify_compares_with_calculix(
-    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_verify_compares_with_calculix(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "jobs"
-    assert call(monkeypatch, "verify", str(file), "--modes", "2", "--out", str(out)) == 0
-    text = capsys.readouterr().out
+    text = said("structure", "verify", file, "--modes", "2", "--out", out)
     assert text.count("kept") == 4
     assert "BROKEN" not in text
     assert (out / "static.inp").is_file()
-    assert call(monkeypatch, "verify", str(file), "--out", str(out)) == 1
-    assert "is not an empty folder" in capsys.readouterr().err
-    assert call(monkeypatch, "verify", str(file), "--modes", "2", "--json", "--quiet") == 0
-    assert json.loads(capsys.readouterr().out)["passed"] is True
+    assert "is not an empty folder" in refused("structure", "verify", file, "--out", out)
+    assert (
+        json.loads(said("structure", "verify", file, "--modes", "2", "--json", "--quiet"))["passed"] is True
+    )
     monkeypatch.setattr("uav_twin.structure.FREQUENCY_LIMIT", 0.0)
-    assert call(monkeypatch, "verify", str(file), "--modes", "2") == 1
-    found = capsys.readouterr()
-    assert "BROKEN" in found.out
-    assert "1 of 4 checks broke their limit: 2 modes, frequencies." in found.err
+    found = command("structure", "verify", file, "--modes", "2")
+    assert "BROKEN" in found.stdout
+    assert (found.returncode, found.stderr.strip().splitlines()[-1]) == (
+        1,
+        "1 of 4 checks broke their limit: 2 modes, frequencies.",
+    )
 
 
-def test_a_fault_ends_in_one_sentence(
-    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert call(monkeypatch, "info", str(file), "--memory-limit", "0.1") == 1
-    assert "24 unknowns would take about" in capsys.readouterr().err
-    assert call(monkeypatch, "info", str(file), "--modes", "12") == 1
-    assert "12 free unknowns gives at most 11" in capsys.readouterr().err
+def test_a_fault_ends_in_one_sentence(file: Path) -> None:
+    assert "24 unknowns would take about" in refused("structure", "info", file, "--memory-limit", "0.1")
+    assert "12 free unknowns gives at most 11" in refused("structure", "info", file, "--modes", "12")
     file.write_text(STRUCTURE.replace('"ROOT"', '"WALL"'))
-    assert call(monkeypatch, "info", str(file)) == 1
-    assert "no set of nodes or faces named 'WALL'; there are ROOT, END." in capsys.readouterr().err
-    assert call(monkeypatch, "info", str(file.parent / "none.toml")) == 1
-    assert "none.toml" in capsys.readouterr().err
+    assert "no set of nodes or faces named 'WALL'; there are ROOT, END." in refused("structure", "info", file)
+    assert "none.toml" in refused("structure", "info", str(file.parent / "none.toml"))
 
 
 def test_a_shipped_structure_goes_by_its_name_and_nothing_moves_without_mass(
-    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, "info", "bracket", "--modes", "1") == 0
-    assert "HEEL" in capsys.readouterr().out
+    assert "HEEL" in said("structure", "info", "bracket", "--modes", "1")
     file.write_text(STRUCTURE.replace("density = 7800", "density = 0"))
-    assert call(monkeypatch, "info", str(file), "--modes", "3") == 0
-    assert "No modes: nothing has mass." in capsys.readouterr().out
+    assert "No modes: nothing has mass." in said("structure", "info", file, "--modes", "3")
 
 
 def test_a_structure_is_reduced_and_compared(
-    write_beam: Callable[..., Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    write_beam: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`structure reduce` says ranges and measured errors; a second call finds the model in the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     file = str(write_beam(tmp_path))
-    assert call(monkeypatch, "reduce", file, "--json", "--states", "2", "--quiet") == 0
-    record = json.loads(capsys.readouterr().out)
+    record = json.loads(said("structure", "reduce", file, "--json", "--states", "2", "--quiet"))
     assert record["ranges"]["z1"] == [0.0, 0.8]
     assert record["errors"]["strain"] < record["errors"]["bound"] < 1e-3
     kept = list((tmp_path / "cache" / "uav-twin").glob("structure-*.npz"))
     before = kept[0].stat().st_mtime_ns
-    assert call(monkeypatch, "reduce", file, "--states", "0") == 0
-    assert "load_factor" in capsys.readouterr().out
+    assert "load_factor" in said("structure", "reduce", file, "--states", "0")
     assert kept[0].stat().st_mtime_ns == before
     write_beam(tmp_path, {'name = "z1",': 'name = "z1", largest_loss = 2,'})
-    assert call(monkeypatch, "reduce", file) != 0
-    assert "largest_loss" in capsys.readouterr().err
+    assert "largest_loss" in refused("structure", "reduce", file, code=None)
 
 
-def test_the_field_is_written_for_paraview(
-    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_field_is_written_for_paraview(file: Path, tmp_path: Path) -> None:
     """A bar under 20 MPa: 100 microstrain along, none across, and by 1 / e more of all."""
     out = tmp_path / "bar.vtu"
-    assert call(monkeypatch, "field", str(file), "--out", str(out), "--at", "e=0.9") == 0
+    said("structure", "field", file, "--out", out, "--at", "e=0.9")
     field = meshio.read(out)
     assert field.cell_data["strain"][0][0] == pytest.approx([1e-4 / 0.9, 0, 0, 0, 0, 0], abs=1e-12)
     assert field.point_data["displacement"][:, 0].max() == pytest.approx(1e-5 / 0.9, rel=1e-9)
-    assert call(monkeypatch, "field", str(file), "--out", str(out)) != 0
-    assert "exists" in capsys.readouterr().err
+    assert "exists" in refused("structure", "field", file, "--out", out, code=None)
     before = out.read_bytes()
     for words in ("e=stiff", "e", "z9=0.1", "e=nan", "e=-1"):
-        assert call(monkeypatch, "field", str(file), "--out", str(out), "--replace", "--at", words) == 2
-    said = " ".join(capsys.readouterr().err.replace("│", " ").split())
-    assert "e must lie between 0.9 and 1.1, but is -1; give a value inside" in said
+        error = refused("structure", "field", file, "--out", out, "--replace", "--at", words, code=2)
+    assert "e must lie between 0.9 and 1.1, but is -1; give a value inside" in error
     twice = ("--replace", "--at", "e=1", "--at", "e=1.05")
-    assert call(monkeypatch, "field", str(file), "--out", str(out), *twice) == 2
-    assert "e is given twice" in capsys.readouterr().err
+    assert "e is given twice" in refused("structure", "field", file, "--out", out, *twice, code=2)
     assert out.read_bytes() == before
 
 
-def test_fmu_build_packs_a_structure_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fmu_build_packs_a_structure_too(tmp_path: Path) -> None:
     """`fmu build --design` gives the bytes of `structure fmu`; what is for wings alone is refused."""
     target, other = tmp_path / "one.fmu", tmp_path / "two.fmu"
-    assert call(monkeypatch, "fmu", "bracket", "--out", str(target)) == 0
-    assert call(monkeypatch, "build", "--design", "bracket", "--out", str(other), group="fmu") == 0
+    said("structure", "fmu", "bracket", "--out", str(target))
+    said("fmu", "build", "--design", "bracket", "--out", other)
     assert target.read_bytes() == other.read_bytes()
-    capsys.readouterr()
-    assert call(monkeypatch, "build", "--design", "bracket", "--activate", group="fmu") == 2
-    assert "are for wings" in capsys.readouterr().err
+    assert "are for wings" in refused("fmu", "build", "--design", "bracket", "--activate", code=2)
 
 
-def test_a_file_beside_an_fmu_is_neither_the_fmu_nor_the_structure(
-    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_beside_an_fmu_is_neither_the_fmu_nor_the_structure(file: Path) -> None:
     """Refused before anything is built, with --replace, too."""
     out = file.with_suffix(".fmu")
     for path, words in ((out, "is the FMU: choose another --binding"), (file, "is the structure file")):
-        assert call(monkeypatch, "fmu", str(file), "--binding", str(path), "--replace") == 1
-        assert words in " ".join(capsys.readouterr().err.split())
+        assert words in " ".join(
+            refused("structure", "fmu", file, "--binding", str(path), "--replace").split()
+        )
     assert not out.exists()
     assert file.read_text() == STRUCTURE
