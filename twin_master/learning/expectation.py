@@ -182,10 +182,7 @@ class LearntExpectation:
             share = by_state[b, kept]
             own = means[b, kept] / share[:, None]
             wide = np.sqrt(np.maximum(squares[b, kept] / share[:, None] - own**2, 0.0))
-            quantiles_of(
-                share / share.sum(), np.ascontiguousarray(own.T), np.ascontiguousarray(wide.T), mean[b],
-                deviation[b], _LEVELS, quantiles[b],
-            )  # fmt: skip
+            quantiles[b] = quantiles_of(share / share.sum(), own, wide, _LEVELS)
         rewards = self._rewards.expectation_of(
             weight, hypotheses.draw, controls, shown.mean, shown.variance, seen
         )

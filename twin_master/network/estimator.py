@@ -265,7 +265,7 @@ class ExactFilter:
             ObservationContext(self._name, turn, worst),
         )
         carried = Carried(control_index, {"log_filtered": step.log_filtered})
-        return Estimate(step.forecast, step.filtered, step.log_evidence, carried)
+        return Estimate(step.forecast, step.filtered, float(step.log_evidence), carried)
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""

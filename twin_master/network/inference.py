@@ -11,26 +11,29 @@ import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.kernels import backward_pass, forward_pass, smooth_many
-from twin_master.network.product_kernels import product_backward_pass, product_forward_pass
+from twin_master.network.kernels import backward_pass, forward_pass, move
+from twin_master.network.transition import TransitionModel
 
 __all__ = [
-    "FilterStep",
     "Filtered",
     "ObservationContext",
     "Predicted",
     "Smoothed",
+    "filter_many",
     "filter_sequence",
     "filter_step",
     "known_control",
+    "log_forecast",
     "predict",
     "smooth",
+    "smooth_many",
     "smooth_many_twins",
 ]
 
@@ -65,40 +68,18 @@ class ObservationContext:
 
 
 @dataclass(frozen=True)
-class FilterStep:
-    """One filtered step.
-
-    Attributes
-    ----------
-    forecast : (S,)
-        p(D_t | o_0..o_{t-1}): the belief before the observation.
-    filtered : (S,)
-        p(D_t | o_0..o_t).
-    log_filtered : (S,)
-        Its logarithm; carry this to the next step.
-    log_evidence : float
-        log p(o_t | o_0..o_{t-1}).
-    """
-
-    forecast: Float
-    filtered: Float
-    log_filtered: Float
-    log_evidence: float
-
-
-@dataclass(frozen=True)
 class Filtered:
-    """Filtered beliefs of T steps.
+    """Filtered beliefs; the leading axes are twins and steps, as far as there are several.
 
     Attributes
     ----------
-    forecast : (T, S)
-        p(D_t | o_0..o_{t-1}).
-    filtered : (T, S)
+    forecast : (..., S)
+        p(D_t | o_0..o_{t-1}): the belief before the observation.
+    filtered : (..., S)
         p(D_t | o_0..o_t).
-    log_filtered : (T, S)
-        Its logarithm.
-    log_evidence : (T,)
+    log_filtered : (..., S)
+        Its logarithm; carry this to the next step.
+    log_evidence : (...)
         log p(o_t | o_0..o_{t-1}); the sum is the log evidence of all observations.
     """
 
@@ -106,6 +87,10 @@ class Filtered:
     filtered: Float
     log_filtered: Float
     log_evidence: Float
+
+    def __getitem__(self, place: Any) -> "Filtered":
+        """Return the beliefs at a place of the leading axes."""
+        return Filtered(*(np.asarray(values)[place] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -167,44 +152,47 @@ def _checked_rows(model: GraphicalModel, control: Index, rows: ArrayLike, *, wha
     return rows
 
 
-def _forward(
-    model: GraphicalModel,
-    control: Index,
-    log_likelihood: Float,
-    first: int,
-    forecast: Float,
-    filtered: Float,
-    log_filtered: Float,
-    log_evidence: Float,
-) -> int:
-    """Fill the rows from `first` on; return -1, or the row whose observation is impossible."""
-    if model.transition.is_product:
-        levels, row, begin, source, probability, power = model.transition.forward_lists.arrays
-        return product_forward_pass(
-            model.log_prior, levels, row, begin, source, probability, power,
-            control, log_likelihood, first, forecast, filtered, log_filtered, log_evidence,
-        )  # fmt: skip
-    sparse = model.transition.sparse
-    return forward_pass(
-        model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-        control, log_likelihood, first, forecast, filtered, log_filtered, log_evidence,
-    )  # fmt: skip
+def log_forecast(transition: TransitionModel, control: ArrayLike, log_filtered: ArrayLike) -> Float:
+    """Return the logarithms of beliefs (B, S) one transition later, each under its control (B,)."""
+    before = np.array(log_filtered, dtype=np.float64, order="C")
+    after = np.empty_like(before)
+    move(transition.forward_lists.arrays, np.array(control, dtype=np.int64), before, after)
+    return after
 
 
-def _backward(
-    model: GraphicalModel, control: Index, filtered: Float, log_filtered: Float, smoothed: Float
-) -> None:
-    """Fill the smoothed rows."""
-    transition = model.transition
-    if transition.is_product:
-        lists = (*transition.forward_lists.arrays, *transition.backward_lists.arrays[1:])
-        product_backward_pass(*lists, control, filtered, log_filtered, smoothed)
-        return
-    sparse = transition.sparse
-    backward_pass(
-        sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-        control, filtered, log_filtered, smoothed,
-    )  # fmt: skip
+def filter_many(
+    model: GraphicalModel, control: Index, rows: Float, log_first: Float
+) -> tuple[Filtered, Index]:
+    """Filter B twins without any check.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+    control : (B, T)
+    rows : (B, T, S)
+        log p(o_t | D_t, u_t).
+    log_first : (B, S) or (S,)
+        Logarithm of the belief before the first of the observations.
+
+    Returns
+    -------
+    tuple of Filtered, (B,)
+        The latter is -1, or the row whose observation is impossible; the rest of such a twin means nothing.
+    """
+    forecast, filtered, log_filtered = (np.zeros_like(rows) for _ in range(3))
+    log_evidence, failed = np.zeros(rows.shape[:2]), np.empty(len(rows), dtype=np.int64)
+    log_filtered[:, :1] = np.broadcast_to(log_first, (len(rows), rows.shape[2]))[:, None]
+    lists = model.transition.forward_lists.arrays
+    forward_pass(lists, control, rows, forecast, filtered, log_filtered, log_evidence, failed)
+    return Filtered(forecast, filtered, log_filtered, log_evidence), failed
+
+
+def smooth_many(transition: TransitionModel, control: Index, log_filtered: Float) -> Float:
+    """Smooth the filtered beliefs (B, T, S) of B twins under controls (B, T), without any check."""
+    smoothed = np.empty_like(log_filtered)
+    lists = transition.forward_lists.arrays, transition.backward_lists.arrays
+    backward_pass(*lists, control, np.ascontiguousarray(log_filtered), smoothed)
+    return smoothed
 
 
 def filter_step(
@@ -213,7 +201,7 @@ def filter_step(
     previous_control_index: int | None,
     log_likelihood: ArrayLike,
     context: ObservationContext | None = None,
-) -> FilterStep:
+) -> Filtered:
     """Assimilate one observation: Kapteyn et al. 2021, eqs. (2), (28)-(31).
 
     Parameters
@@ -239,19 +227,16 @@ def filter_step(
         raise InvalidModelError(
             "the previous belief and the previous control go together: give both or neither"
         )
-    first = 0 if previous_control_index is None else 1
-    control = _checked_controls(model, [previous_control_index or 0] * (first + 1))
-    rows = np.zeros((first + 1, model.states.size))
-    rows[first] = _checked_rows(model, control[0], log_likelihood, what="log-likelihood")
-    log_filtered, filtered, forecast = np.empty_like(rows), np.empty_like(rows), np.empty_like(rows)
-    log_evidence = np.empty(first + 1)
+    control = _checked_controls(model, previous_control_index or 0)
+    rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
+    first = model.log_prior
     if previous_log_filtered is not None:
-        log_filtered[0] = _checked_rows(model, control[0], previous_log_filtered, what="previous log belief")
-        np.exp(log_filtered[0], out=filtered[0])
-    failed = _forward(model, control, rows, first, forecast, filtered, log_filtered, log_evidence)
-    if failed >= 0:
+        before = _checked_rows(model, control, previous_log_filtered, what="previous log belief")
+        first = log_forecast(model.transition, control[None], before[None])
+    found, failed = filter_many(model, control[None, None], rows[None, None], first)
+    if failed[0] >= 0:
         raise (context or ObservationContext()).impossible(0)
-    return FilterStep(forecast[first], filtered[first], log_filtered[first], float(log_evidence[first]))
+    return found[0, 0]
 
 
 def filter_sequence(
@@ -281,12 +266,10 @@ def filter_sequence(
     if control.ndim != 1:
         raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
     rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
-    log_filtered, filtered, forecast = np.empty_like(rows), np.empty_like(rows), np.empty_like(rows)
-    log_evidence = np.empty(len(rows))
-    failed = _forward(model, control, rows, 0, forecast, filtered, log_filtered, log_evidence)
-    if failed >= 0:
-        raise (context or ObservationContext()).impossible(failed)
-    return Filtered(forecast, filtered, log_filtered, log_evidence)
+    found, failed = filter_many(model, control[None], rows[None], model.log_prior)
+    if failed[0] >= 0:
+        raise (context or ObservationContext()).impossible(int(failed[0]))
+    return found[0]
 
 
 def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayLike) -> Smoothed:
@@ -309,9 +292,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
     if control.ndim != 1:
         raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
     rows = _checked_rows(model, control, log_filtered, what="log belief")
-    smoothed = np.empty_like(rows)
-    _backward(model, control, np.exp(rows), rows, smoothed)
-    return Smoothed(smoothed)
+    return Smoothed(smooth_many(model.transition, control[None], rows[None])[0])
 
 
 def smooth_many_twins(
@@ -347,36 +328,23 @@ def smooth_many_twins(
     if control.ndim != 2:
         raise InvalidModelError(f"expected controls of shape (twins, steps), got {control.shape}")
     rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
-    forecast, filtered, log_filtered, smoothed = (np.empty_like(rows) for _ in range(4))
-    log_evidence = np.empty(rows.shape[:2])
-    failed = np.empty(len(rows), dtype=np.int64)
-
-    def run(part: slice) -> None:
-        if not model.transition.is_product:
-            sparse = model.transition.sparse
-            smooth_many(
-                model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-                control[part], rows[part], forecast[part], filtered[part], log_filtered[part],
-                log_evidence[part], smoothed[part], failed[part],
-            )  # fmt: skip
-            return
-        for twin in range(len(rows))[part]:
-            failed[twin] = _forward(
-                model, control[twin], rows[twin], 0,
-                forecast[twin], filtered[twin], log_filtered[twin], log_evidence[twin],
-            )  # fmt: skip
-            if failed[twin] < 0:
-                _backward(model, control[twin], filtered[twin], log_filtered[twin], smoothed[twin])
-
     count = max(1, min(workers or os.cpu_count() or 1, len(rows)))
     edges = [len(rows) * i // count for i in range(count + 1)]
+
+    def run(part: slice) -> tuple[Filtered, Index, Float]:
+        found, failed = filter_many(model, control[part], rows[part], model.log_prior)
+        return found, failed, smooth_many(model.transition, control[part], found.log_filtered)
+
     with ThreadPoolExecutor(count) as pool:
-        list(pool.map(run, map(slice, edges[:-1], edges[1:])))
+        parts = list(pool.map(run, map(slice, edges[:-1], edges[1:])))
+    failed = np.concatenate([part[1] for part in parts])
     if np.any(failed >= 0):
         twin = int(np.argmax(failed >= 0))
-        found = context(twin) if context else ObservationContext(twin=f"twin {twin}")
-        raise found.impossible(int(failed[twin]))
-    return Filtered(forecast, filtered, log_filtered, log_evidence), Smoothed(smoothed)
+        told = context(twin) if context else ObservationContext(twin=f"twin {twin}")
+        raise told.impossible(int(failed[twin]))
+    columns = zip(*(vars(part[0]).values() for part in parts), strict=True)
+    smoothed = np.concatenate([part[2] for part in parts])
+    return Filtered(*(np.concatenate(column) for column in columns)), Smoothed(smoothed)
 
 
 def predict(
@@ -418,24 +386,11 @@ def predict(
             f"expected a control index between 0 and {controls - 1} and a horizon of 0 or more steps, "
             f"got {control_index} and {horizon}"
         )
-    transition = model.transition
     predicted = np.empty((horizon, size))
-    if transition.is_product:
-        for h in range(horizon):
-            if h == 0:
-                predicted[h] = transition.forward(control_index, belief)
-                continue
-            flows = (transition.forward(u, predicted[h - 1] * policy[:, u]) for u in range(controls))
-            predicted[h] = sum(flows, np.zeros(size))
-    else:
-        matrix = transition.matrix
-        closed_loop = policy[:, 0, None] * matrix[0]
-        for control in range(1, controls):
-            closed_loop += policy[:, control, None] * matrix[control]
-        step = matrix[control_index]
-        for h in range(horizon):
-            np.dot(belief, step, out=predicted[h])
-            belief, step = predicted[h], closed_loop
+    now: Float = belief
+    for h in range(horizon):
+        flows = [(control_index, now)] if h == 0 else list(enumerate((now[:, None] * policy).T))
+        now = predicted[h] = np.sum([model.transition.forward(u, flow) for u, flow in flows], axis=0)
     joint = predicted[:, :, None] * policy
     return Predicted(predicted=predicted, control_probability=joint.sum(axis=1), joint=joint)
 
