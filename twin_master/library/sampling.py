@@ -4,12 +4,13 @@ import itertools
 import json
 import os
 import shutil
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +21,19 @@ from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuError
 from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftovers, write_error
 from reporting.json_file import parse_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file
 from twin_master.assets.observation_library import ObservationLibrary, write_observation_library
-from twin_master.errors import InvalidObservationLibraryError
-from twin_master.library.grid import Float, SamplingGrid
-from twin_master.library.worker import SamplingProcess
+from twin_master.errors import InvalidObservationLibraryError, TwinMasterError
+from twin_master.library.grid import Float, GridSampler, SamplingGrid
 from twin_master.network.graphical_model import Factor, StateSpace
 from twin_master.network.memory import NUMBER, check_fits
 
 PLAN_NAME = "grid.json"
 _COPIES = 3  # of what was sampled: the blocks, all of them, and the library
-_AHEAD = 2  # blocks that a process has been asked for, so that it need not wait for its parent
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def sample_library(
     out : Path
         The NetCDF file. Finished blocks are kept in the folder `blocks_folder(out)` until it is written.
     workers : int, optional
-        Number of processes; by default one for each processor.
+        Number of FMUs, each in a process; by default one for each processor.
     resume : bool
         Go on with the finished blocks of an interrupted sampling of the same grid.
     replace_existing : bool
@@ -140,31 +140,37 @@ def sample_library(
 
 
 def _sampled(grid: SamplingGrid, todo: list[int], count: int) -> Iterator[tuple[int, Float]]:
-    """Yield number and observations of each block as they come."""
-    waiting = list(reversed(todo))
-    workers: list[SamplingProcess] = []
+    """Yield number and observations of each block as they come; each thread waits for an FMU of its own."""
+    own = threading.local()
+    samplers: list[GridSampler] = []
+    failures: list[BaseException] = []
+
+    def sample(number: int) -> tuple[int, Float | None]:
+        try:
+            if not failures:
+                if not hasattr(own, "sampler"):
+                    own.sampler = GridSampler(grid)
+                    samplers.append(own.sampler)
+                return number, own.sampler.block(*grid.blocks[number])
+        except (FmuError, TwinMasterError, OSError) as error:  # what came before is kept
+            failures.append(error)
+        return number, None
+
+    pool = ThreadPoolExecutor(count)
     try:
-        if todo:
-            workers.extend(SamplingProcess(grid) for _ in range(count))
-        while True:
-            for _ in range(_AHEAD):  # one each before anyone has two
-                for worker in workers:
-                    if waiting and worker.load < _AHEAD:
-                        number = waiting.pop()
-                        worker.ask(number, *grid.blocks[number])
-            busy = {worker.connection: worker for worker in workers if worker.load}
-            if not busy:
-                return
-            for connection in wait(list(busy)):
-                worker = busy[connection]  # type: ignore[index]
-                result = worker.take()
-                if waiting and worker.load < _AHEAD:  # before the block is written
-                    number = waiting.pop()
-                    worker.ask(number, *grid.blocks[number])
-                yield result
+        for done in as_completed([pool.submit(sample, number) for number in todo]):
+            number, values = done.result()
+            if values is not None:
+                yield number, values
+        if failures:
+            raise failures[0]
+    except BaseException as error:
+        failures.append(error)
+        raise
     finally:
-        for worker in workers:
-            worker.close()
+        for sampler in samplers:
+            sampler.close()
+        pool.shutdown(cancel_futures=True)
 
 
 def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
@@ -202,7 +208,7 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
 
 def _record(grid: SamplingGrid) -> dict[str, Any]:
     """Return what a library is a function of: the grid with hashes in the place of files."""
-    record: dict[str, Any] = json.loads(grid.to_json())
+    record: dict[str, Any] = json.loads(json.dumps(asdict(grid)))
     del record["step_timeout"]
     hashes = {"fmu": hash_file(Path(grid.fmu)), "binding": hash_file(Path(grid.binding))}
     return record | hashes | {"version": version("uav-twin")}
