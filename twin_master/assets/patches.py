@@ -19,7 +19,6 @@ from fmu_asset.packing.wing_packing import arrays_for
 from fmu_asset.slaves.base import UnacceptableValuesError
 from fmu_asset.slaves.table import structure_table
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.assets.wing_model import check_wing_scenario, wing_observation_table
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
@@ -48,27 +47,22 @@ def check_model_patch(patch: PatchFile, gauge_count: int, where: str = "The patc
                 )
 
 
-def model_observation_table(
+def patched_observation_table(
     wing: ReducedModel,
     scenario: Scenario,
     draws: ParameterDraws,
     model: GraphicalModel,
-    patch: PatchFile | None,
+    patch: PatchFile,
     design: WingDesign,
-    where: str = "The patch",
+    where: str,
 ) -> Float:
-    """Return the strains (E, S, U, G) that the twin predicts, with the effects of its patch if it has one.
+    """Return the strains (E, S, U, G) that the twin predicts with the effects of its patch.
 
     Raises
     ------
-    MissingObservationModelError, OutsideModelError
-        As `wing_observation_table`.
     PatchFileError, MissionInputError
         The model cannot carry the patch.
     """
-    if patch is None or not patch.effects:
-        return wing_observation_table(wing, scenario, draws, model)
-    check_wing_scenario(scenario, wing.regions, wing.gauge_count)
     check_model_patch(patch, wing.gauge_count, where)
     effects = plain_effects(patch.for_outputs(output_channels(wing.gauge_count)))
     behaviour = patched_behaviour(wing, effects, arrays_for(design, patch))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-__all__ = ["Hypotheses", "Shown", "quantiles_of", "shown_by"]
+__all__ = ["Hypotheses", "quantiles_of", "shown_by"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -53,25 +53,10 @@ class Hypotheses:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Shown:
-    """What the G sensors show without noise, and the noise, for each hypothesis, state and control.
+def shown_by(hypotheses: Hypotheses, value: Float, total_deviation: Float) -> tuple[Float, Float, Float]:
+    """Return mean and variance of what the sensors show, normally distributed, and the variance of noise.
 
-    Attributes
-    ----------
-    mean, variance : (K, S, U, G)
-        Of what is shown, normally distributed.
-    noise2 : (K, S, U, G)
-        Variance of noise and model error.
-    """
-
-    mean: Float
-    variance: Float
-    noise2: Float
-
-
-def shown_by(hypotheses: Hypotheses, value: Float, total_deviation: Float) -> Shown:
-    """Return what the sensors show.
+    Each is (K, S, U, G): of each hypothesis, state and control; the noise has the model error in it.
 
     Parameters
     ----------
@@ -86,11 +71,9 @@ def shown_by(hypotheses: Hypotheses, value: Float, total_deviation: Float) -> Sh
         part[:, None, None]
         for part in (hypotheses.gain, hypotheses.offset, hypotheses.covariance, hypotheses.scale2)
     )
-    return Shown(
-        mean=own * (1.0 + gain) + offset,
-        variance=spread[..., 0] + own * (2.0 * spread[..., 1] + own * spread[..., 2]),
-        noise2=scale2 * total_deviation**2,
-    )
+    mean = own * (1.0 + gain) + offset
+    variance = spread[..., 0] + own * (2.0 * spread[..., 1] + own * spread[..., 2])
+    return mean, variance, np.broadcast_to(scale2 * total_deviation**2, mean.shape)
 
 
 def quantiles_of(weight: Float, mean: Float, deviation: Float, levels: Float) -> Float:

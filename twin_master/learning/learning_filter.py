@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv, gammaln, logsumexp
 
-from twin_master.errors import InvalidModelError
+from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.learning.hypotheses import Hypotheses, shown_by
 from twin_master.learning.posterior import INTERVAL, DrawsPosterior
 from twin_master.learning.regression import GaugeRegression
 from twin_master.network.estimator import Carried, Estimate, Learnt
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import ObservationContext, log_forecast, smooth_many
+from twin_master.network.inference import log_forecast, smooth_many
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import TransitionModel
 
@@ -127,7 +127,7 @@ class LearningFilter:
                 f"expected one transition table for each of {len(priors.transition_factors)} factors, "
                 f"got {len(matrices)}"
             )
-        self._model, self._sensor_model, self._name = model, sensor_model, name
+        self.model, self.sensor_model, self._name = model, sensor_model, name
         self.priors = priors
         draws, factors, sensors = sensor_model.draw_count, len(matrices), sensor_model.sensor_count
         self._transition = TransitionModel((np.concatenate(matrices),))  # one after the other, by factor
@@ -147,19 +147,9 @@ class LearningFilter:
         self._of_factors = DrawsPosterior(priors.transition_factors, np.full(factors, 1.0 / factors))
 
     @property
-    def model(self) -> GraphicalModel:
-        """States, controls, prior and transitions."""
-        return self._model
-
-    @property
-    def sensor_model(self) -> GaussianSensorModel:
-        """Predictions and assumed noise."""
-        return self._sensor_model
-
-    @property
     def prior(self) -> Mapping[str, Learnt]:
         """What is believed of all that is learnt before the first observation, by name."""
-        sensors = self._sensor_model.sensor_count
+        sensors = self.sensor_model.sensor_count
         weight = np.exp(self._log_weight)[:, None]
         return self._learnt(weight, np.zeros((len(weight), sensors, 6)), np.zeros(sensors))
 
@@ -169,20 +159,19 @@ class LearningFilter:
         See `Estimator.turn`; `learnt` of the estimate holds by name the parameter, `transition_factor`,
         and `noise_scale[g]`, `gauge_gain[g]`, `gauge_offset[g]` for the sensors g from 1.
         """
-        seen, told = self._sensor_model.apart(observation)
+        seen, told = self.sensor_model.apart(observation)
         forecast, statistics, count = self._forecast(before)
         value, inverse = (
-            self._sensor_model.value_per_draw[:, :, control_index],
+            self.sensor_model.value_per_draw[:, :, control_index],
             self._inverse[:, control_index],
         )
-        near = self._sensor_model.nearest(seen, control_index, value)
+        near = self.sensor_model.nearest(seen, control_index, value)
         log_belief = forecast + told + near.log_density[self._draw]
         log_belief += self._gauges.log_density(seen, near.value[self._draw], inverse, statistics, count)
         evidence = float(logsumexp(log_belief))
         if evidence == -np.inf:
-            raise ObservationContext(
-                self._name, turn, lambda _turn: self._sensor_model.worst_residuals(seen, control_index)
-            ).impossible(0)
+            worst = self.sensor_model.worst_residuals(seen, control_index)
+            raise ImpossibleObservation(self._name, turn, worst)
         log_belief -= evidence
         filtered = np.exp(log_belief)
         if self._gauges.learns:
@@ -203,9 +192,9 @@ class LearningFilter:
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
         """Return log p(D_t, k | o_0..o_t-1) (K, S), and statistics (K, G, 6) and counts (G,) until then."""
-        hypotheses, sensors = len(self._draw), self._sensor_model.sensor_count
+        hypotheses, sensors = len(self._draw), self.sensor_model.sensor_count
         if before is None:
-            forecast = self._log_weight[:, None] + self._model.log_prior
+            forecast = self._log_weight[:, None] + self.model.log_prior
             return forecast, np.zeros((hypotheses, sensors, 6)), np.zeros(sensors)
         log_before = before.arrays["log_belief"]
         forecast = log_forecast(self._transition, self._first_control + before.control_index, log_before)
@@ -234,17 +223,13 @@ class LearningFilter:
     ) -> tuple[Float, Float]:
         """Return for each sensor what it shows in the mean, and the deviation of its noise: two of (G,)."""
         own = self._hypotheses(filtered, statistics, count).counting(filtered)
-        model = self._sensor_model
+        model = self.sensor_model
         in_force = slice(control, control + 1)
-        shown = shown_by(
+        mean, _, noise2 = shown_by(
             own, model.value_per_draw[:, :, in_force], model.total_standard_deviation[:, in_force]
         )
         weight = own.weight.ravel() / own.weight.sum()
-        mean, noise2 = (
-            weight @ np.broadcast_to(part, shown.mean.shape).reshape(weight.size, -1)
-            for part in (shown.mean, shown.noise2)
-        )
-        return mean, np.sqrt(noise2)
+        return weight @ mean.reshape(weight.size, -1), np.sqrt(weight @ noise2.reshape(weight.size, -1))
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
@@ -252,7 +237,7 @@ class LearningFilter:
 
     def smoothed_hypotheses(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_i, k | o_0..o_t) for the turns i of `carried`, which end at t: (n, K, S)."""
-        result = np.zeros((len(carried), len(self._draw), self._model.states.size))
+        result = np.zeros((len(carried), len(self._draw), self.model.states.size))
         if not len(carried):
             return result
         rows = np.array([turn.arrays["log_belief"] for turn in carried])  # (n, K, S)

@@ -20,16 +20,15 @@ from numpy.typing import NDArray
 
 from twin_master.errors import InvalidModelError
 from twin_master.learning import switching
-from twin_master.learning.monitor_settings import MonitorSettings, Words
 from twin_master.learning.rivals import Shown, mix_onset, weigh_gauges, weigh_model, weigh_none
 from twin_master.learning.switching import GAUGES, MENDED, NONE
+from twin_master.learning.words import Words
 from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
-from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.scenario.notice import MOST_DRAWS
+from twin_master.scenario.notice import MOST_DRAWS, Noticing
 
-__all__ = ["MonitorSettings", "WatchfulEstimator", "Words"]
+__all__ = ["WatchfulEstimator", "Words"]
 
 Float = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
@@ -67,7 +66,7 @@ class WatchfulEstimator:
         Predictions (E, S, U, G) and assumed noise.
     draws : (E,)
         Values of the parameter.
-    settings : MonitorSettings, optional
+    settings : Noticing, optional
     words : Words, optional
 
     Raises
@@ -81,7 +80,7 @@ class WatchfulEstimator:
         inner: Estimator,
         sensor_model: GaussianSensorModel,
         draws: Float,
-        settings: MonitorSettings | None = None,
+        settings: Noticing | None = None,
         words: Words | None = None,
     ) -> None:
         if sensor_model.averages_inside:
@@ -89,8 +88,8 @@ class WatchfulEstimator:
                 "noticing needs the average over the draws outside the product over the sensors: inside, "
                 "each sensor has a parameter of its own"
             )
-        self._inner, self._sensor_model = inner, sensor_model
-        self._settings = settings = settings or MonitorSettings()
+        self._inner, self._sensor_model, self.model = inner, sensor_model, inner.model
+        self._settings = settings = settings or Noticing()
         self._words = words or Words()
         places, self._draw_weight = _spread(np.asarray(draws, np.float64), sensor_model.draw_weight)
         table, deviation = sensor_model.value_per_draw[places], sensor_model.total_standard_deviation
@@ -120,11 +119,6 @@ class WatchfulEstimator:
         of_gauges = np.repeat(self._log_prior - np.log(len(_GAINS)), len(_GAINS))
         self._begins: Float = np.log(0.5) + np.concatenate([[-np.inf, -np.inf, 0.0], of_gauges])
         self._names = tuple(f"{self._words.sensors([g])} off" for g in range(sensors))
-
-    @property
-    def model(self) -> GraphicalModel:
-        """States, controls, prior and transitions."""
-        return self._inner.model
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S).

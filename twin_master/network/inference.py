@@ -7,9 +7,6 @@ The order of one turn t: control u_t is in force, the state is D_t, the observat
 Hence D_t follows D_{t-1} through u_{t-1}, and the first state follows the prior.
 """
 
-import os
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +20,6 @@ from twin_master.network.transition import TransitionModel
 
 __all__ = [
     "Filtered",
-    "ObservationContext",
     "Predicted",
     "Smoothed",
     "filter_many",
@@ -34,37 +30,10 @@ __all__ = [
     "predict",
     "smooth",
     "smooth_many",
-    "smooth_many_twins",
 ]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class ObservationContext:
-    """Who observes, for the message of `ImpossibleObservation`.
-
-    Attributes
-    ----------
-    twin : str
-        Name of the twin.
-    first_step : int
-        Step of the first row of the log-likelihoods.
-    worst_residuals : callable or None
-        Gives, for a step, the names of the worst sensors with their standardised residuals.
-    """
-
-    twin: str = "twin"
-    first_step: int = 0
-    worst_residuals: Callable[[int], Mapping[str, float]] | None = None
-
-    def impossible(self, row: int) -> ImpossibleObservation:
-        """Return the exception for the observation in row `row` of the log-likelihoods."""
-        step = self.first_step + row
-        return ImpossibleObservation(
-            self.twin, step, self.worst_residuals(step) if self.worst_residuals else None
-        )
 
 
 @dataclass(frozen=True)
@@ -200,7 +169,6 @@ def filter_step(
     previous_log_filtered: ArrayLike | None,
     previous_control_index: int | None,
     log_likelihood: ArrayLike,
-    context: ObservationContext | None = None,
 ) -> Filtered:
     """Assimilate one observation: Kapteyn et al. 2021, eqs. (2), (28)-(31).
 
@@ -213,8 +181,6 @@ def filter_step(
         Control u_{t-1} that was in force in the step before; None at the first step.
     log_likelihood : (S,)
         log p(o_t | D_t, u_t), zeros when nothing was observed.
-    context : ObservationContext, optional
-        Names the twin if the observation is impossible; its `first_step` is this step.
 
     Raises
     ------
@@ -235,7 +201,7 @@ def filter_step(
         first = log_forecast(model.transition, control[None], before[None])
     found, failed = filter_many(model, control[None, None], rows[None, None], first)
     if failed[0] >= 0:
-        raise (context or ObservationContext()).impossible(0)
+        raise ImpossibleObservation("twin", 0)
     return found[0, 0]
 
 
@@ -243,7 +209,6 @@ def filter_sequence(
     model: GraphicalModel,
     control_index: ArrayLike,
     log_likelihood: ArrayLike,
-    context: ObservationContext | None = None,
 ) -> Filtered:
     """Filter a whole sequence: Kapteyn et al. 2021, eqs. (2), (28)-(31).
 
@@ -254,8 +219,6 @@ def filter_sequence(
         Control u_t in force in each step.
     log_likelihood : (T, S)
         log p(o_t | D_t, u_t), a row of zeros where nothing was observed.
-    context : ObservationContext, optional
-        Names twin and steps if an observation is impossible.
 
     Raises
     ------
@@ -268,7 +231,7 @@ def filter_sequence(
     rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
     found, failed = filter_many(model, control[None], rows[None], model.log_prior)
     if failed[0] >= 0:
-        raise (context or ObservationContext()).impossible(int(failed[0]))
+        raise ImpossibleObservation("twin", int(failed[0]))
     return found[0]
 
 
@@ -293,58 +256,6 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
         raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
     rows = _checked_rows(model, control, log_filtered, what="log belief")
     return Smoothed(smooth_many(model.transition, control[None], rows[None])[0])
-
-
-def smooth_many_twins(
-    model: GraphicalModel,
-    control_index: ArrayLike,
-    log_likelihood: ArrayLike,
-    context: Callable[[int], ObservationContext] | None = None,
-    workers: int | None = None,
-) -> tuple[Filtered, Smoothed]:
-    """Filter and smooth many independent twins of the same model.
-
-    Parameters
-    ----------
-    model : GraphicalModel
-    control_index : (B, T)
-    log_likelihood : (B, T, S)
-    context : callable, optional
-        Gives the context of twin number b if one of its observations is impossible.
-    workers : int, optional
-        Number of threads; by default the processors of the machine.
-
-    Returns
-    -------
-    tuple of Filtered, Smoothed
-        With a leading axis B.
-
-    Raises
-    ------
-    ImpossibleObservation, InvalidModelError, InvalidObservationError
-        As `filter_step`; the first twin that fails is named.
-    """
-    control = _checked_controls(model, control_index)
-    if control.ndim != 2:
-        raise InvalidModelError(f"expected controls of shape (twins, steps), got {control.shape}")
-    rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
-    count = max(1, min(workers or os.cpu_count() or 1, len(rows)))
-    edges = [len(rows) * i // count for i in range(count + 1)]
-
-    def run(part: slice) -> tuple[Filtered, Index, Float]:
-        found, failed = filter_many(model, control[part], rows[part], model.log_prior)
-        return found, failed, smooth_many(model.transition, control[part], found.log_filtered)
-
-    with ThreadPoolExecutor(count) as pool:
-        parts = list(pool.map(run, map(slice, edges[:-1], edges[1:])))
-    failed = np.concatenate([part[1] for part in parts])
-    if np.any(failed >= 0):
-        twin = int(np.argmax(failed >= 0))
-        told = context(twin) if context else ObservationContext(twin=f"twin {twin}")
-        raise told.impossible(int(failed[twin]))
-    columns = zip(*(vars(part[0]).values() for part in parts), strict=True)
-    smoothed = np.concatenate([part[2] for part in parts])
-    return Filtered(*(np.concatenate(column) for column in columns)), Smoothed(smoothed)
 
 
 def predict(
