@@ -16,7 +16,7 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import BINDING_COPY, FLOWN_DESIGN_HASH, AssetBelief, Source, read_files
 from twin_master.assets.flown_fmu import FmuAsset, InnerRoles
-from twin_master.assets.interface import Asset
+from twin_master.assets.interface import Asset, asked_table
 from twin_master.assets.parameter import (
     ParameterDraws,
     calibrated_means,
@@ -224,20 +224,22 @@ class FmuSource(Source):
 
         That holds for assets without memory.
         """
-        scenario = self._scenario
-        states, controls = model.states.coordinates, scenario.control
-        table = np.empty((len(draws.values), len(states), len(controls), scenario.observation.count))
+        scenario, load, rows = self._scenario, self._section.load, []
+        controls = [control.values for control in scenario.control]
         with self._session() as session:
             chosen = self._observed(session.binding)
             for row, value in enumerate(draws.values):
                 others = {name: float(values[row]) for name, values in draws.others.items()}
                 session.reset({**self.parameters(), **others, draws.name: float(value)})
-                for state, levels in enumerate(states):
-                    health = dict(zip(scenario.state_names, levels.tolist(), strict=True))
-                    for index, control in enumerate(controls):
-                        reading = session.step(control.values, health, self._section.load)
-                        table[row, state, index] = reading.values[chosen]
-        return table
+                rows.append(
+                    asked_table(
+                        scenario.state_names,
+                        model.states.coordinates,
+                        controls,
+                        lambda control, health: session.step(control, health, load).values[chosen],
+                    )
+                )
+        return np.array(rows)
 
     def _observed(self, binding: "Binding", role: str = "") -> slice:
         """Return where a role stands among the observations of the binding, in the units of the scenario."""

@@ -97,7 +97,7 @@ class LearningFilter:
     sensor_model : GaussianSensorModel
         Predictions (E, S, U, G), weights of the draws, and the noise that is assumed.
     priors : LearntPriors
-    transitions : sequence of (U, S, S), optional
+    transitions : sequence of TransitionModel, optional
         Transitions for each of `transition_factors`; those of the model if there is one factor.
     name : str
         Name of the twin, for messages.
@@ -113,7 +113,7 @@ class LearningFilter:
         model: GraphicalModel,
         sensor_model: GaussianSensorModel,
         priors: LearntPriors,
-        transitions: Sequence[ArrayLike] | None = None,
+        transitions: Sequence[TransitionModel] | None = None,
         name: str = "twin",
     ) -> None:
         if sensor_model.averages_inside:
@@ -121,16 +121,17 @@ class LearningFilter:
                 "learning needs the average over the draws outside the product over the sensors: inside, "
                 "each sensor has a parameter of its own"
             )
-        matrices = [np.asarray(item) for item in (transitions or [model.transition.matrix])]
-        if len(matrices) != len(priors.transition_factors):
+        moves = transitions or [model.transition]
+        if len(moves) != len(priors.transition_factors):
             raise InvalidModelError(
                 f"expected one transition table for each of {len(priors.transition_factors)} factors, "
-                f"got {len(matrices)}"
+                f"got {len(moves)}"
             )
         self.model, self.sensor_model, self._name = model, sensor_model, name
         self.priors = priors
-        draws, factors, sensors = sensor_model.draw_count, len(matrices), sensor_model.sensor_count
-        self._transition = TransitionModel((np.concatenate(matrices),))  # one after the other, by factor
+        draws, factors, sensors = sensor_model.draw_count, len(moves), sensor_model.sensor_count
+        blocks = zip(*(move.blocks for move in moves), strict=True)
+        self._transition = TransitionModel(tuple(map(np.concatenate, blocks)))  # one factor after the other
         self._draw: Index = np.tile(np.arange(draws), factors)
         self._first_control: Index = np.repeat(np.arange(factors), draws) * len(model.controls)
         with np.errstate(divide="ignore"):

@@ -103,7 +103,7 @@ class GaugeRegression:
         """
         there = ~np.isnan(seen)
         x = np.where(there, seen - value, 0.0) * inverse
-        a, c = np.broadcast_to(self.offset * inverse, x.shape), self.gain * value * inverse
+        a, c, share = self.offset * inverse, self.gain * value * inverse, weight[:, :, None]
         pairs = ((a, a), (a, c), (c, c), (a, x), (c, x), (x, x))
-        sums = [np.einsum("ks,ksg,ksg->kg", weight, one, other, optimize=True) for one, other in pairs]
+        sums = [(share * (one * other)).sum(axis=1) for one, other in pairs]
         return np.where(there[:, None], np.stack(sums, axis=-1), 0.0)

@@ -112,8 +112,8 @@ def weigh_gauges(
     innovation, wide = x - c * fitted[g, k], 1.0 + c**2 * unknown[g, k]
     density = np.log(known[place, g] / (1.0 + innovation**2 / (left[g, k] * wide)))
     log_value = log_likelihood[place] + constant[g, k] + shown.power[g] * density - 0.5 * np.log(wide)
-    best = np.full(len(belief), -np.inf)
-    np.maximum.at(best, rival, log_value)
+    best, first = np.full(len(belief), -np.inf), np.flatnonzero(np.diff(rival, prepend=-1))
+    best[rival[first]] = np.maximum.reduceat(log_value, first) if first.size else -np.inf
     weight = belief[rival, place] * np.exp(log_value - best[rival])
 
     def total(values: Float) -> Float:

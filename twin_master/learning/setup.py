@@ -85,5 +85,5 @@ def learning_filter(
         transition_factors=factors,
         sensor_unit=units.pop() if len(units) == 1 else "",
     )
-    tables = [build_graphical_model(scenario, factor).transition.matrix for factor in factors]
+    tables = [build_graphical_model(scenario, factor).transition for factor in factors]
     return LearningFilter(model, sensor_model, priors, tables, scenario.mission.name)

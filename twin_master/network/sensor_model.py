@@ -132,24 +132,20 @@ class GaussianSensorModel(QuantityModel):
         interval: ArrayLike | None = None,
     ) -> None:
         super().__init__(strain_per_draw, draw_weight)
-        deviation = np.array(standard_deviation, dtype=np.float64)
-        if deviation.shape not in ((), (self.sensor_count,)) or not np.all(
-            np.isfinite(deviation) & (deviation > 0.0)
+        for what, given, positive in (
+            ("positive noise standard deviation", standard_deviation, True),
+            ("relative model error that is not negative", model_error, False),
         ):
-            raise InvalidModelError(
-                f"expected one positive noise standard deviation, or one for each of {self.sensor_count} "
-                f"sensors, got {deviation}"
-            )
-        error = np.array(model_error, dtype=np.float64)
-        if error.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(error) & (error >= 0.0)):
-            raise InvalidModelError(
-                f"expected one relative model error that is not negative, or one for each of "
-                f"{self.sensor_count} sensors, got {error}"
-            )
+            value = np.array(given, dtype=np.float64)
+            enough = value > 0.0 if positive else value >= 0.0
+            if value.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(value) & enough):
+                raise InvalidModelError(
+                    f"expected one {what}, or one for each of {self.sensor_count} sensors, got {value}"
+                )
         if average not in ("outside", "inside"):
             raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
-        self.standard_deviation: Float = np.broadcast_to(deviation, (self.sensor_count,))
-        self.model_error: Float = np.broadcast_to(error, (self.sensor_count,))
+        self.standard_deviation: Float = np.full(self.sensor_count, standard_deviation, np.float64)
+        self.model_error: Float = np.full(self.sensor_count, model_error, np.float64)
         independent = np.hypot(
             self.standard_deviation, self.model_error * self.mean
         )  # a root of a square rounds

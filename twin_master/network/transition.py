@@ -24,8 +24,8 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 Unsigned = NDArray[np.uint64]
 
-JOINT_NON_ZEROS = 8192
-"""Non-zero transitions of a control up to which one table is used: it is applied in some ten microseconds."""
+JOINT_NON_ZEROS = 512
+"""Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""
 JOINT_LEVELS = 1024
 """Joint levels of neighbours up to which they may share a table: it has 8 MB for each control."""
 

@@ -72,7 +72,7 @@ def enumerated(turns: int) -> Float:
 
 def learner_of_all() -> LearningFilter:
     priors = LearntPriors("e", [0.9, 1.0, 1.1], transition_factors=FACTORS)
-    return LearningFilter(model(), sensors(), priors, [model(f).transition.matrix for f in FACTORS])
+    return LearningFilter(model(), sensors(), priors, [model(f).transition for f in FACTORS])
 
 
 def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_trajectories() -> None:

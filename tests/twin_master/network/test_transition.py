@@ -133,7 +133,7 @@ def test_factors_share_a_table_where_that_is_small_and_blocks_where_it_costs_no_
         count: [block.shape[1] for block in TransitionModel.from_factors([[worse] * count] * 2).blocks]
         for count in (1, 2, 4, 6, 7)
     }
-    assert sizes == {1: [5], 2: [25], 4: [625], 6: [25, 25, 25], 7: [25, 25, 25, 5]}
+    assert sizes == {1: [5], 2: [25], 4: [25, 25], 6: [25, 25, 25], 7: [25, 25, 25, 5]}
     full = np.full((40, 40), 1.0 / 40)
     assert [b.shape[1] for b in TransitionModel.from_factors([[full, full]]).blocks] == [40, 40]
     still = np.eye(400)
