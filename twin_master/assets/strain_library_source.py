@@ -13,7 +13,7 @@ from twin_master.assets.asset_source import AssetBelief, AssetSource, Source
 from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.strain_library import FILE_NAME, StrainLibrary, load_strain_library
-from twin_master.errors import MissingObservationModelError, MissionInputError
+from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
@@ -115,12 +115,8 @@ class StrainLibrarySource(Source):
             )
 
     def _find_controls(self) -> list[int]:
-        missing = [name for name in self._scenario.control_names if name not in self._library.controls]
-        if missing:
-            raise MissingObservationModelError(
-                f"the strain library has the controls {', '.join(self._library.controls)}, and the scenario "
-                f"asks for {', '.join(missing)}."
-            )
+        rows = [("control", self._scenario.control_names, self._library.controls)]
+        check_names("the scenario has the", "the strain library", rows, MissingObservationModelError)
         return [self._library.controls.index(name) for name in self._scenario.control_names]
 
     def _make(self, progress: Progress) -> dict[str, str]:

@@ -106,12 +106,7 @@ def _checked(
 ) -> tuple[TransitionModel, Float, Float]:
     """Return the transitions, the reward (S, U) and the discount (U,)."""
     if not isinstance(transition, TransitionModel):
-        matrix = stochastic_matrix(transition, name="transition[control, state]")
-        if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2]:
-            raise PlanningError(
-                f"expected transitions of shape (controls, states, states), got {matrix.shape}"
-            )
-        transition = TransitionModel((matrix,))
+        transition = TransitionModel((np.asarray(transition, dtype=np.float64),))
     rewards = np.array(reward, dtype=np.float64, order="C")
     if rewards.shape != transition.shape[1::-1]:
         raise PlanningError(

@@ -161,16 +161,11 @@ class TransitionModel:
             ]
             for control, factor_tables in enumerate(tables)
         ]
-        for control, row in enumerate(checked):
-            if not row or any(t.ndim != 2 or t.shape[0] != t.shape[1] for t in row):
-                raise InvalidModelError(
-                    f"control {control}: expected a square table for each factor, "
-                    f"got shapes {[table.shape for table in row]}"
-                )
-        if len({tuple(table.shape for table in row) for row in checked}) != 1:
+        shapes = {tuple(table.shape for table in row) for row in checked}
+        if len(shapes) != 1 or not all(shapes) or any(s != s[:1] * 2 for row in shapes for s in row):
             raise InvalidModelError(
-                "every control needs the same states, got shapes "
-                f"{[[table.shape for table in row] for row in checked]}"
+                "expected for every control a square table for each factor, of the same states, got shapes "
+                f"{sorted(shapes)}"
             )
         return cls(tuple(_grouped([np.stack(factor) for factor in zip(*checked, strict=True)])))
 
