@@ -246,9 +246,6 @@ class PairedSource:
 
     def __init__(self, asset: AssetSource, model: AssetSource, *, differ: bool = True) -> None:
         self._asset, self._model, self._differ = asset, model, differ
-        self.open = asset.open
-        self.draws, self.observation_table = model.draws, model.observation_table
-        self.write_field = model.write_field
 
     @property
     def origin(self) -> FlownAndBelieved:
@@ -272,9 +269,25 @@ class PairedSource:
         self._differ = self._differ or (flown is not None and hashes.get("design", flown) != flown)
         return hashes
 
+    def draws(self, seed: int) -> ParameterDraws:
+        """Return draws of the parameter of the twin's model."""
+        return self._model.draws(seed)
+
+    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Return the predictions (E, S, U, G) of the twin's model."""
+        return self._model.observation_table(draws, model)
+
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
         """Return what is there at the sensors by the twin's model; None where they show it."""
         return structural_table(self._model, draws, model)
+
+    def open(self) -> Asset:
+        """Return the asset at its start."""
+        return self._asset.open()
+
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write the field of the twin's model."""
+        return self._model.write_field(path, state, control)
 
 
 FLOWN_DESIGN_HASH = "flown_design"
