@@ -10,7 +10,7 @@ from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,10 +139,8 @@ class Source:
         The table that names the files.
     """
 
-    words = "asset"
-    """What is flown or believed."""
-    differs = False
-    """Whether it is known to differ from what flies."""
+    label: ClassVar = "asset"
+    """What is flown or believed, where that is always the same."""
     model: "ReducedModel | None" = None
     """The reduced model of what is flown or believed, once prepared, where there is one."""
 
@@ -170,9 +168,14 @@ class Source:
         return self.places[copy] if self._folder is None else self._folder / copy
 
     @property
+    def words(self) -> str:
+        """What is flown or believed."""
+        return str(self.label)
+
+    @property
     def origin(self) -> FlownAndBelieved:
         """The same twice."""
-        return FlownAndBelieved(self.words, self.words, differ=self.differs)
+        return FlownAndBelieved(self.words, self.words)
 
     def check(self) -> None:
         """Accept what was read already."""

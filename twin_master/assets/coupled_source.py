@@ -166,7 +166,7 @@ class SeveralSource(FmuSource):
 class SspSource(SeveralSource):
     """The system of an SSP file."""
 
-    words = "system of an SSP file"
+    label = "system of an SSP file"
 
     def wiring(self) -> "Wiring":
         """Return the system as it is flown, once prepared."""
@@ -196,7 +196,7 @@ class CoupledSource(SeveralSource):
     _section: CoupledSection
 
     @property
-    def words(self) -> str:  # type: ignore[override]
+    def words(self) -> str:
         """How many there are."""
         return f"{len(self._section.component)} coupled FMUs"
 

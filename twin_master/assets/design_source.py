@@ -215,7 +215,7 @@ class WingFmuSource(FmuSource):
         self._mean = 1.0
 
     @property
-    def words(self) -> str:  # type: ignore[override]
+    def words(self) -> str:
         """The FMU; it has the name of its design once prepared."""
         return f"FMU of the {self._of.words}{'' if self._of.patch_path is None else ', with hidden effects'}"
 
@@ -287,7 +287,7 @@ class DesignSource(ReducedModelSource):
         self._of = _Wing(self, section)
 
     @property
-    def words(self) -> str:  # type: ignore[override]
+    def words(self) -> str:
         """The reduced model; it has the name of its design once prepared."""
         return f"{self._of.words}{'' if self._of.patch_path is None else ', with effects'}"
 
@@ -320,7 +320,7 @@ class DesignSource(ReducedModelSource):
         if patch is not None:
             check_model_patch(patch, gauges, str(self._of.patch_path))
 
-    def _make(self, progress: Progress) -> dict[str, str]:  # type: ignore[override]
+    def _make(self, progress: Progress) -> dict[str, str]:
         self.model = self._of.reduced(progress)
         return super()._make(progress)
 

@@ -123,7 +123,7 @@ class FmuSource(Source):
         Its table `asset`.
     """
 
-    words = "FMU"  # it may hold any model, also that of a design: whether they differ is not known
+    label = "FMU"  # it may hold any model, also that of a design: whether they differ is not known
 
     def __init__(self, scenario: Scenario, section: FmuSection) -> None:
         super().__init__(scenario, section)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import AssetSource, Source
+from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, Source
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
 from twin_master.assets.parameter import ParameterDraws
@@ -80,15 +80,15 @@ class LibrarySource(Source):
         self.open = model.open  # a library is flown by nobody
 
     @property
-    def words(self) -> str:  # type: ignore[override]
+    def words(self) -> str:
         """The library; it differs from the asset if it was sampled from another FMU."""
         other = {True: " of another FMU", False: " of it", None: ""}[self._other_fmu]
         return f"observation library{other}"
 
     @property
-    def differs(self) -> bool:  # type: ignore[override]
-        """Whether it was sampled from another FMU."""
-        return self._other_fmu is True
+    def origin(self) -> FlownAndBelieved:
+        """The library, twice."""
+        return FlownAndBelieved(self.words, self.words, differ=self._other_fmu is True)
 
     def check(self) -> None:
         """Check that the library has what the scenario asks for.

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.progress import Progress
 from twin_master.assets.asset_source import Source
 from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
 from twin_master.assets.parameter import ParameterDraws
@@ -34,7 +35,7 @@ class ReducedModelSource(Source):
         The table that names the files.
     """
 
-    words = "reduced model of the wing"
+    label = "reduced model of the wing"
 
     def __init__(
         self, scenario: Scenario, model: "ReducedModel | None" = None, section: FileSection | None = None
@@ -50,7 +51,7 @@ class ReducedModelSource(Source):
             raise MissionInputError("the model was not prepared: call `prepare` first.")
         return self.model
 
-    def _make(self, progress: object) -> dict[str, str]:
+    def _make(self, progress: Progress) -> dict[str, str]:
         return {"design": self.wing.design_hash}
 
     def draws(self, seed: int) -> ParameterDraws:

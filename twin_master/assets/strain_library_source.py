@@ -98,7 +98,7 @@ def _read(scenario: Scenario, path: Path) -> "StrainLibrarySource":
 class StrainLibrarySource(Source):
     """A strain library in the format of the authors of Kapteyn et al. 2021, as model and as asset."""
 
-    words = "strain library"
+    label = "strain library"
 
     def __init__(
         self, scenario: Scenario, library: StrainLibrary, content_hash: str, path: Path | None = None

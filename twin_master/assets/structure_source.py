@@ -115,7 +115,7 @@ class StructureFmuSource(FmuSource):
     _section: StructureSection
 
     @property
-    def words(self) -> str:  # type: ignore[override]
+    def words(self) -> str:
         """The FMU with its name."""
         return f"FMU of the structure {self._design().name}"
 
@@ -197,7 +197,7 @@ class StructureSource(ReducedModelSource):
         super().__init__(scenario, section=section)
 
     @property
-    def words(self) -> str:  # type: ignore[override]
+    def words(self) -> str:
         """The reduced model with its name."""
         return f"reduced model of the structure {self._design().name}"
 
@@ -231,7 +231,7 @@ class StructureSource(ReducedModelSource):
         check_ranges(scenario, design, {})
         check_structure(self.path(MODEL_COPY))
 
-    def _make(self, progress: Progress) -> dict[str, str]:  # type: ignore[override]
+    def _make(self, progress: Progress) -> dict[str, str]:
         from fe.reduction.model_cache import reduced_structure
 
         self.model = reduced_structure(self.path(MODEL_COPY), progress=progress)
