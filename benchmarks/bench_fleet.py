@@ -13,7 +13,7 @@ from benchmarks.measurement import Measurement
 from fe.reduction.model_cache import reduced_model
 from reporting.files import atomic_write_text
 from scenarios import scenario_files
-from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.evidence import Worsening, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble

@@ -21,12 +21,13 @@ from twin_master.network.graphical_model import (
     worsening_table,
 )
 from twin_master.network.inference import (
+    filter_many,
     filter_sequence,
     filter_step,
     known_control,
     predict,
     smooth,
-    smooth_many_twins,
+    smooth_many,
 )
 from twin_master.network.planner import value_iteration
 from twin_master.network.rewards import RewardModel, RewardSettings
@@ -206,7 +207,12 @@ def run() -> list[Measurement]:
     per_twin = "pgmpy variable elimination"
     online = median_seconds(online_step, repeats=25, inner=20)
     whole = median_seconds(whole_history, repeats=25, inner=20)
-    batch = median_seconds(lambda: smooth_many_twins(model, many_controls, many), repeats=9)
+
+    def side_by_side() -> None:
+        found, _ = filter_many(model, many_controls, many, model.log_prior)
+        smooth_many(model.transition, many_controls, found.log_filtered)
+
+    batch = median_seconds(side_by_side, repeats=9)
     single = median_seconds(one_by_one, repeats=3)
     planning = median_seconds(lambda: value_iteration(model.transition, reward, 0.6), inner=20)
     mixture = median_seconds(quantities, repeats=5)

@@ -19,7 +19,7 @@ from benchmarks.study_hidden_effects import LIMIT, beyond_the_limit
 from benchmarks.study_learning import SOFTENING, spoiled, third_region
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
-from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.scenario.reading import load_scenario

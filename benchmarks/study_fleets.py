@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fe.reduction.model_cache import reduced_model
-from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.evidence import Worsening, scaled_likelihood, transition_evidence
 from twin_master.fleet.outcome import outcomes_of
 from twin_master.fleet.plan import Member

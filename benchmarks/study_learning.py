@@ -24,7 +24,7 @@ from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import load_design
 from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
-from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.reading import Estimated, Outcomes
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge

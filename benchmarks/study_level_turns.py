@@ -30,10 +30,10 @@ from reporting.progress import RichProgress
 from twin_master.assets.asset_source import AssetSource, PairedSource
 from twin_master.assets.mismatch import Misfit, find_misfit
 from twin_master.assets.parameter import ParameterDraws
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
-from twin_master.assets.wing_model import ReducedModelSource
 from twin_master.fleet.reading import Estimated, Outcomes, fly_seeds
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.side_by_side import fly_side_by_side

@@ -96,7 +96,7 @@ def wing() -> DecisionProblem:
     """Return the decision problem of `inspected_wing`."""
     from fe.reduction.model_cache import reduced_model
     from fe.wing.design import load_design
-    from twin_master.assets.wing_model import ReducedModelSource
+    from twin_master.assets.reduced_model import ReducedModelSource
     from twin_master.mission.planning import decision_problem
     from twin_master.mission.preparation import prepare_knowledge
     from twin_master.scenario.reading import load_scenario

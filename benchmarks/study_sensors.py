@@ -16,7 +16,7 @@ from scipy.linalg import qr
 
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
-from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.outcome import outcomes_of
 from twin_master.fleet.plan import Member
 from twin_master.mission.preparation import Knowledge, prepare_knowledge

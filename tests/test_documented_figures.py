@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fe.reduction.model_cache import reduced_model
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.wing_model import ReducedModelSource
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.rewards import error_reward

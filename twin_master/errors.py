@@ -1,6 +1,6 @@
 """What can go wrong in the twin, by cause."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 __all__ = [
     "AssetOutputError",
@@ -22,6 +22,7 @@ __all__ = [
     "TwinMasterError",
     "UnknownScenarioError",
     "ViewError",
+    "check_names",
 ]
 
 
@@ -123,3 +124,34 @@ class FleetError(TwinMasterError, RuntimeError):
 
 class ViewError(TwinMasterError, RuntimeError):
     """A flight cannot be shown on this machine."""
+
+
+def check_names(
+    whose: str,
+    where: str,
+    rows: Iterable[tuple[str, Iterable[str], Collection[str]]],
+    error: type[TwinMasterError] = MissionInputError,
+    advice: str = "",
+) -> None:
+    """Check names of several sorts against those that are known.
+
+    Parameters
+    ----------
+    whose : str
+        What has the names: "the scenario has the".
+    where : str
+        What knows names: "the binding uav_wing".
+    rows : iterable of (str, names, known names)
+        What the names are of, in the singular.
+    error : type
+        What is raised.
+    advice : str
+        What to do, behind a colon.
+    """
+    for what, names, known in rows:
+        unknown = sorted({*names} - {*known})
+        if unknown:
+            raise error(
+                f"{whose} {what} {', '.join(unknown)}, which {where} does not know; it knows "
+                f"{', '.join(known) or 'none'}{f': {advice}' if advice else ''}."
+            )

@@ -17,8 +17,8 @@ from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
 from twin_master import workflow
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides
-from twin_master.assets.wing_model import ReducedModelSource
 from twin_master.fleet.reading import fly_seeds
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.reading import load_scenario, parse_scenario

@@ -6,22 +6,27 @@ names end in `_source`: each holds the tables of its kinds and what is made of t
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
+from reporting.provenance import hash_file
 from twin_master.assets.interface import Asset
-from twin_master.assets.parameter import ParameterDraws
+from twin_master.assets.parameter import ParameterDraws, draw_parameter
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import BeliefSection, FileSection
-from twin_master.scenario.schema import Scenario
+from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
+
+if TYPE_CHECKING:
+    from fe.runtime.reduced import ReducedModel
 
 Float = NDArray[np.float64]
 
@@ -87,6 +92,7 @@ class AssetSource(Protocol):
 
     It may have `structural_table(draws, model)`, which returns like `observation_table` what is there at the
     sensors where its model knows that they do not show it, else None: limits are of the structure.
+    What most sources have in common is `Source`.
     """
 
     @property
@@ -122,6 +128,102 @@ def structural_table(source: AssetSource, draws: ParameterDraws, model: Graphica
     return found
 
 
+class Source:
+    """What sources have in common: files that are kept in the run folder, and draws of a calibration.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What is flown.
+    section : FileSection, optional
+        The table that names the files.
+    """
+
+    label: ClassVar = "asset"
+    """What is flown or believed, where that is always the same."""
+    model: "ReducedModel | None" = None
+    """The reduced model of what is flown or believed, once prepared, where there is one."""
+
+    def __init__(self, scenario: Scenario, section: FileSection | None = None) -> None:
+        self._scenario = scenario
+        self._files = section
+        self._folder: Path | None = None
+
+    @cached_property
+    def places(self) -> dict[str, Path]:
+        """What the table names, and the calibration file, by the places of their copies in a run folder."""
+        own = {} if self._files is None else self._files.all_files()
+        return {**own, **self._scenario.calibration.all_files()}
+
+    def path(self, copy: str) -> Path:
+        """Return a file: its copy in the run folder, or where it is given before that.
+
+        Raises
+        ------
+        MissionInputError
+            It is made in the run folder, and there is none yet.
+        """
+        if self._folder is None and copy not in self.places:
+            raise MissionInputError("the asset was not prepared: call `prepare` first.")
+        return self.places[copy] if self._folder is None else self._folder / copy
+
+    @property
+    def words(self) -> str:
+        """What is flown or believed."""
+        return str(self.label)
+
+    @property
+    def origin(self) -> FlownAndBelieved:
+        """The same twice."""
+        return FlownAndBelieved(self.words, self.words)
+
+    def check(self) -> None:
+        """Accept what was read already."""
+
+    def files(self) -> dict[str, bytes]:
+        """Return what the files hold, by the places of their copies.
+
+        Raises
+        ------
+        MissionInputError
+            One cannot be read.
+        """
+        return read_files(self.places)
+
+    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
+        """Copy what is given into the run folder and make what follows from it; return the hashes.
+
+        Raises
+        ------
+        MissionInputError
+            A file cannot be read.
+        """
+        keep_files(folder, self.files())
+        self._folder = folder
+        hashes = {name: hash_file(folder / copy) for name, copy in HASHED.items() if copy in self.places}
+        return hashes | self._make(progress)
+
+    def use(self, folder: Path) -> None:
+        """Take what an earlier `prepare` left in a folder, without making it again."""
+        self._folder = folder
+
+    def _make(self, progress: Progress) -> dict[str, str]:
+        """Make what follows from the copies; return its hashes."""
+        return {}
+
+    def draws(self, seed: int) -> ParameterDraws:
+        """Return draws of the calibrated parameter."""
+        return draw_parameter(self._scenario.calibration, seed, self.model)
+
+    def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
+        """Return what is there at the sensors (E, S, U, G) where they do not show it, else None."""
+        return None
+
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write nothing: there is no mesh."""
+        return False
+
+
 class AssetBelief(BeliefSection):
     """The twin asks what is flown itself what to expect: for assets without memory."""
 
@@ -146,9 +248,7 @@ class PairedSource:
     """
 
     def __init__(self, asset: AssetSource, model: AssetSource, *, differ: bool = True) -> None:
-        self._asset = asset
-        self._model = model
-        self._differ = differ
+        self._asset, self._model, self._differ = asset, model, differ
 
     @property
     def origin(self) -> FlownAndBelieved:
@@ -197,9 +297,16 @@ FLOWN_DESIGN_HASH = "flown_design"
 """Under which a source that packs a wing tells the hash of its design; that of the model is `design`."""
 
 
-def named_files(scenario: Scenario, section: FileSection) -> dict[str, Path]:
-    """Return what a table names, and the calibration file, by the places of their copies in a run folder."""
-    return {**section.all_files(), **scenario.calibration.all_files()}
+BINDING_COPY = "asset/binding.toml"
+PATCH_COPY = "asset/patch.json"
+MODEL_PATCH_COPY = "asset/model_patch.json"
+HASHED = {
+    "binding": BINDING_COPY,
+    "calibration": CALIBRATION_COPY,
+    "patch": PATCH_COPY,
+    "model_patch": MODEL_PATCH_COPY,
+}
+"""Files whose hashes a run tells, and where their copies stand in its folder."""
 
 
 def read_files(files: Mapping[str, Path]) -> dict[str, bytes]:

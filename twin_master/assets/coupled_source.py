@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -10,9 +10,8 @@ from fmu_asset.companions import COMPANION_NAMES
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import FlownAndBelieved
-from twin_master.assets.fmu_source import BINDING_COPY, FmuSection, FmuSource
-from twin_master.assets.parameter import check_calibration, read_calibration
+from twin_master.assets.asset_source import BINDING_COPY
+from twin_master.assets.fmu_source import FmuSection, FmuSource
 from twin_master.errors import MissionInputError
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, FileSection
 from twin_master.scenario.schema import Scenario
@@ -84,9 +83,7 @@ class SspSection(SeveralSection):
     kind: Literal["ssp"] = "ssp"
     file: str
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copies of binding and SSP file stand in a run folder."""
-        return {"binding": BINDING_COPY, "file": SSP_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": SSP_COPY}
 
     def source(self, scenario: Scenario) -> "SspSource":
         """Return the system of the file."""
@@ -140,52 +137,27 @@ class SeveralSource(FmuSource):
         Its table `asset`; variables of the binding are connectors of the system, or `component.variable`.
     """
 
-    def __init__(self, scenario: Scenario, section: SeveralSection) -> None:
-        super().__init__(scenario, section)
-        self._several = section
-
     def wiring(self) -> "Wiring":
         """Return the system as it is flown, once prepared."""
         raise NotImplementedError
 
-    def check(self) -> None:
-        """Read what is given where it is; join what needs no packing first.
-
-        Raises
-        ------
-        MissionInputError, SspError, CouplingError, FmuError, InvalidDesignError
-            Something cannot be read or does not fit.
-        """
-        from fmu_asset.door.binding import load_binding
+    def _fitted(self, binding: "Binding", folder: Path) -> "Binding":
+        """Join what needs no packing first."""
         from fmu_asset.folders import scratch_folder
 
-        read_calibration(self._scenario.calibration)
-        self.files()
-        binding = load_binding(self._section.binding_path)
-        check_calibration(self._scenario.calibration, binding.parameter, f"the binding {binding.name}")
-        self._observed(binding)
-        self._inner_roles(binding)
-        self._check_names(binding)
-        with scratch_folder() as folder, self._told_of_means():
-            self._check_system(binding, folder)
+        with scratch_folder() as extracted:
+            self._check_system(binding, extracted)
+        return binding
 
     def _check_system(self, binding: "Binding", folder: Path) -> None:
         raise NotImplementedError
 
     def _join(self, wiring: "Wiring", binding: "Binding") -> "CoupledAsset":
-        several = self._several
         from fmu_asset.coupling.asset import CoupledAsset
 
-        return CoupledAsset(
-            wiring,
-            binding,
-            algorithm=several.algorithm,
-            iterations=several.iterations,
-            tolerance=several.tolerance,
-            isolated=several.isolated,
-            step_timeout=several.step_timeout,
-            parameters=self.parameters(),
-        )
+        keys = ("algorithm", "iterations", "tolerance", "isolated", "step_timeout")
+        said = {key: getattr(self._section, key) for key in keys}
+        return CoupledAsset(wiring, binding, parameters=self.parameters(), **said)
 
     def _session(self) -> "Session":
         return self._join(self.wiring(), self.binding())
@@ -194,23 +166,20 @@ class SeveralSource(FmuSource):
 class SspSource(SeveralSource):
     """The system of an SSP file."""
 
-    @property
-    def origin(self) -> FlownAndBelieved:
-        """The system, twice."""
-        return FlownAndBelieved("system of an SSP file", "system of an SSP file")
+    label = "system of an SSP file"
 
     def wiring(self) -> "Wiring":
         """Return the system as it is flown, once prepared."""
         from fmu_asset.ssp.check import join_ssp
         from fmu_asset.ssp.reader import read_ssp
 
-        return join_ssp(read_ssp(self._path(SSP_COPY), self._path(COMPONENT_FOLDER)))
+        return join_ssp(read_ssp(self.path(SSP_COPY), self.path(COMPONENT_FOLDER)))
 
     def _check_system(self, binding: "Binding", folder: Path) -> None:
         from fmu_asset.ssp.check import join_ssp, left_out_sentence
         from fmu_asset.ssp.reader import read_ssp
 
-        file = self._section.all_files()[SSP_COPY]
+        file = self.path(SSP_COPY)
         wiring = join_ssp(read_ssp(file, folder))
         if sentence := left_out_sentence(wiring, file):
             raise MissionInputError(sentence)
@@ -218,27 +187,24 @@ class SspSource(SeveralSource):
 
     def _make(self, progress: Progress) -> dict[str, str]:
         self._session().close()  # what does not fit is said before anything is flown
-        return {"ssp": hash_file(self._path(SSP_COPY))}
+        return {"ssp": hash_file(self.path(SSP_COPY))}
 
 
 class CoupledSource(SeveralSource):
     """The FMUs that the scenario joins."""
 
-    def __init__(self, scenario: Scenario, section: CoupledSection) -> None:
-        super().__init__(scenario, section)
-        self._coupled = section
+    _section: CoupledSection
 
     @property
-    def origin(self) -> FlownAndBelieved:
-        """The FMUs together, twice."""
-        words = f"{len(self._coupled.component)} coupled FMUs"
-        return FlownAndBelieved(words, words)
+    def words(self) -> str:
+        """How many there are."""
+        return f"{len(self._section.component)} coupled FMUs"
 
     def _check_system(self, binding: "Binding", folder: Path) -> None:
         from fe.wing.design import load_design
         from fmu_asset.coupling.wiring import Wiring
 
-        components = self._coupled.component
+        components = self._section.component
         for component in components:
             if component.design not in (None, CALIBRATED_DESIGN_NAME):
                 load_design(component.design_path)
@@ -252,7 +218,7 @@ class CoupledSource(SeveralSource):
         """Pack what is not an FMU yet."""
         hashes = {}
         with progress.stage("Packing the FMUs"):
-            for component in self._coupled.component:
+            for component in self._section.component:
                 hashes[f"fmu_{component.name}"] = hash_file(self._packed(component, progress))
         self._session().close()  # what does not fit is said before anything is flown
         return hashes
@@ -262,34 +228,35 @@ class CoupledSource(SeveralSource):
         from fe.wing.design import load_design
         from fmu_asset.packing.wing_packing import pack_wing
 
-        target = self._path(component.copies()["fmu"])
+        target = self.path(component.copies()["fmu"])
         if target.exists():
             return target
         if component.design is None:
             return _given_fmu(component, target.parent)
+        tailored = None
         if component.design == CALIBRATED_DESIGN_NAME:
             from calibration.result.file import load_calibration
             from calibration.result.plain import tailoring
 
             wing = load_calibration(Path(self._scenario.calibration.file or ""))
-            pack_wing(wing.wing_design, target, tailoring=tailoring(wing), replace=True, progress=progress)
+            design, tailored = wing.wing_design, tailoring(wing)
         else:
             design = load_design(component.design_path)
-            pack_wing(design, target, replace=True, progress=progress)
+        pack_wing(design, target, tailoring=tailored, replace=True, progress=progress)
         return target
 
     def wiring(self) -> "Wiring":
         """Return the system as it is flown, once prepared."""
         from fmu_asset.coupling.wiring import Wiring
 
-        files = {component.name: component.copies()["fmu"] for component in self._coupled.component}
-        return Wiring(self._structure({name: self._path(copy) for name, copy in files.items()}))
+        files = {component.name: component.copies()["fmu"] for component in self._section.component}
+        return Wiring(self._structure({name: self.path(copy) for name, copy in files.items()}))
 
     def _structure(self, fmus: Mapping[str, Path]) -> "SystemStructure":
         """Return the system of the scenario's components and connections."""
         from fmu_asset.coupling.structure import Component, Connector, SystemStructure, expand_connection
 
-        asset = self._coupled
+        asset = self._section
         names = [component.name for component in asset.component]
         connections = tuple(
             connection

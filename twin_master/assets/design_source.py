@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,22 +10,16 @@ from numpy.typing import NDArray
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import (
+    BINDING_COPY,
     FLOWN_DESIGN_HASH,
+    MODEL_PATCH_COPY,
+    PATCH_COPY,
     AssetSource,
-    FlownAndBelieved,
-    keep_files,
-    named_files,
-    read_files,
+    Source,
 )
-from twin_master.assets.fmu_source import BINDING_COPY, FmuSection, FmuSource
-from twin_master.assets.interface import Asset
-from twin_master.assets.parameter import (
-    OWN_OF_WING,
-    ParameterDraws,
-    check_calibration,
-    draw_parameter,
-    read_calibration,
-)
+from twin_master.assets.fmu_source import FmuSection, FmuSource
+from twin_master.assets.parameter import OWN_OF_WING, ParameterDraws, check_calibration, read_calibration
+from twin_master.assets.reduced_model import ReducedModelSource, check_wing_scenario
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, BeliefSection
@@ -42,8 +36,6 @@ Float = NDArray[np.float64]
 
 DESIGN_COPY = "asset/design.toml"
 FLOWN_DESIGN_COPY = "asset/flown_design.toml"
-MODEL_PATCH_COPY = "asset/model_patch.json"
-PATCH_COPY = "asset/patch.json"
 
 
 class DesignSection(FmuSection):
@@ -57,9 +49,11 @@ class DesignSection(FmuSection):
     packed: Literal["python", "compiled"] = "python"
     """What evaluates the FMU: Python, or C compiled here, which carries no patch."""
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copies of binding, design and patch stand in a run folder."""
-        return {"binding": BINDING_COPY, "design": FLOWN_DESIGN_COPY, "patch": PATCH_COPY}
+    kept: ClassVar[Mapping[str, str]] = {
+        "binding": BINDING_COPY,
+        "design": FLOWN_DESIGN_COPY,
+        "patch": PATCH_COPY,
+    }
 
     def differs_from(self, belief: BeliefSection) -> bool:
         """Return whether the asset has hidden effects, or the twin believes in some."""
@@ -85,9 +79,7 @@ class DesignBelief(BeliefSection):
     patch: str | None = None
     """A patch file: effects that the model carries."""
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copies of design and patch stand in a run folder."""
-        return {"design": DESIGN_COPY, "patch": MODEL_PATCH_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"design": DESIGN_COPY, "patch": MODEL_PATCH_COPY}
 
     @property
     def departs(self) -> bool:
@@ -111,22 +103,20 @@ class _Wing:
 
     Parameters
     ----------
-    scenario : Scenario
-        What is flown.
+    source : Source
+        Of whose files it is made.
     section : DesignSection or DesignBelief
         What names the wing.
     """
 
-    def __init__(self, scenario: Scenario, section: DesignSection | DesignBelief) -> None:
-        self._section = section
-        self.places = named_files(scenario, section)
+    def __init__(self, source: Source, section: DesignSection | DesignBelief) -> None:
+        self._source, self._section = source, section
+        self.name = ""
 
-    def keep(self, folder: Path) -> dict[str, str]:
-        """Copy what is given into the run folder and use the copies from then on; return the hashes."""
-        keep_files(folder, read_files(self.places))
-        self.places = {copy: folder / copy for copy in self.places}
-        hashed = {"calibration": CALIBRATION_COPY, "patch": PATCH_COPY, "model_patch": MODEL_PATCH_COPY}
-        return {name: hash_file(folder / copy) for name, copy in hashed.items() if copy in self.places}
+    @property
+    def words(self) -> str:
+        """The model of the design, which has its name once prepared."""
+        return f"reduced model of the design {self.name}".rstrip()
 
     def calibration(self) -> "Calibration | None":
         """Return the calibration that the wing is tailored to; None for a design of its own.
@@ -140,9 +130,9 @@ class _Wing:
             return None
         from calibration.result.file import load_calibration
 
-        if CALIBRATION_COPY not in self.places:
+        if CALIBRATION_COPY not in self._source.places:
             raise MissionInputError("the design of a calibration is asked for, and there is no such file.")
-        return load_calibration(self.places[CALIBRATION_COPY])
+        return load_calibration(self._source.path(CALIBRATION_COPY))
 
     def design(self) -> "WingDesign":
         """Return the design.
@@ -157,12 +147,62 @@ class _Wing:
         calibration = self.calibration()
         if calibration is not None:
             return calibration.wing_design
-        return load_design(self.places[self._section.copies()["design"]])
+        return load_design(self._source.path(self._section.copies()["design"]))
+
+    def reduced(self, progress: Progress) -> "ReducedModel":
+        """Reduce the design."""
+        from fe.reduction.model_cache import reduced_model
+
+        design = self.design()
+        self.name = design.name
+        return reduced_model(design, progress=progress)
 
     @property
     def patch_path(self) -> Path | None:
         """The patch file, if there is one."""
-        return self.places.get(self._section.copies()["patch"])
+        copy = self._section.copies()["patch"]
+        return self._source.path(copy) if copy in self._source.places else None
+
+    def patch(self) -> "PatchFile | None":
+        """Return the patch, if there is one."""
+        from fmu_asset.packing.patch_file import load_patch
+
+        return None if self.patch_path is None else load_patch(self.patch_path)
+
+    def write_field(
+        self,
+        path: Path,
+        scenario: Scenario,
+        mean: float,
+        state: Mapping[str, float],
+        control: Mapping[str, float],
+    ) -> bool:
+        """Write displacement and strain under a state and a control as VTU; return whether there is a field.
+
+        Young's modulus is that of the true wing where the scenario tells it, else the mean of the
+        calibration.
+
+        Raises
+        ------
+        FileNotWrittenError
+            The disk is full or the folder cannot be written.
+        """
+        from fe.reduction.fields import write_wing_vtu
+        from fe.reduction.model_cache import wing_fields
+        from reporting.files import write_error
+
+        design = self.design() if self.name else None
+        if design is None or {*state} != {*design.regions} or {*control} != {"load_factor"}:
+            return False
+        try:
+            wing = wing_fields(design)
+            e = scenario.asset.true_parameters.get("young_modulus_factor", mean)
+            force = scenario.asset.constant_load.get("tip_force", 0.0)
+            values = {**control, "young_modulus_factor": e, "tip_force": force}
+            write_wing_vtu(path, wing, wing.model.vector(values, state))
+        except OSError as error:
+            raise write_error(error, path) from error
+        return True
 
 
 class WingFmuSource(FmuSource):
@@ -170,90 +210,55 @@ class WingFmuSource(FmuSource):
 
     def __init__(self, scenario: Scenario, section: DesignSection) -> None:
         super().__init__(scenario, section)
-        self._of = _Wing(scenario, section)
+        self._of = _Wing(self, section)
         self._packed = section.packed
-        self._design: WingDesign | None = None
-        self._wing: ReducedModel | None = None
         self._mean = 1.0
 
     @property
-    def origin(self) -> FlownAndBelieved:
-        """The FMU, twice; it has the name of its design once prepared."""
-        name = "" if self._design is None else self._design.name
-        words = f"FMU of the {_model_of(name)}"
-        words = f"{words}, with hidden effects" if self._of.patch_path is not None else words
-        return FlownAndBelieved(words, words)
-
-    @property
-    def wing(self) -> "ReducedModel | None":
-        """The reduced model that was packed, once prepared."""
-        return self._wing
-
-    def check(self) -> None:
-        """Read what is given where it is, without building anything.
-
-        Raises
-        ------
-        MissionInputError, InvalidDesignError, FmuError
-            A file cannot be read or is wrong, or the binding does not fit the scenario.
-        CalibrationRecordError
-            The calibration file is damaged or of another kind, or has no samples of the parameter.
-        """
-        from fmu_asset.compiled.compiler import find_compiler
-        from fmu_asset.door.binding import load_binding
-        from fmu_asset.packing.structure_fmu import check_kind
-
-        read_calibration(self._scenario.calibration)
-        self.files()
-        if self._packed == "compiled":
-            find_compiler()  # before the wing is reduced, which can take minutes
-            if self._of.patch_path is not None:
-                check_kind(self._packed)
-        design = self._of.design()
-        gauges = len(design.gauges.positions)
-        binding = load_binding(self._section.binding_path).with_regions(design.regions)
-        effects: tuple[str, ...] = ()
-        if self._of.patch_path is not None:
-            from twin_master.assets.patches import effect_names
-
-            effects = effect_names(self._of.patch_path, gauges)
-        known, where = (*binding.parameter, *effects), f"the binding {binding.name}"
-        check_calibration(self._scenario.calibration, known, where, advice=OWN_OF_WING)
-        self._check_names(binding, effects)
-        self._observed(binding)
-        self._inner_roles(binding)
+    def words(self) -> str:
+        """The FMU; it has the name of its design once prepared."""
+        return f"FMU of the {self._of.words}{'' if self._of.patch_path is None else ', with hidden effects'}"
 
     def binding(self) -> "Binding":
-        """Return the binding with the damage regions of the design, once prepared."""
+        """Return the binding with the damage regions of the design."""
         return super().binding().with_regions(self._of.design().regions)
+
+    def _effects(self) -> tuple[str, ...]:
+        from fmu_asset.compiled.compiler import find_compiler
+        from fmu_asset.packing.structure_fmu import check_kind
+        from twin_master.assets.patches import effect_names
+
+        if self._packed == "compiled":
+            find_compiler()  # before the wing is reduced, which can take minutes
+        if self._of.patch_path is None:
+            return ()
+        if self._packed == "compiled":
+            check_kind(self._packed)
+        return effect_names(self._of.patch_path, len(self._of.design().gauges.positions))
+
+    def _check_calibration(self, binding: "Binding", effects: tuple[str, ...]) -> None:
+        known, where = (*binding.parameter, *effects), f"the binding {binding.name}"
+        check_calibration(self._scenario.calibration, known, where, advice=OWN_OF_WING)
+
+    def _fitted(self, binding: "Binding", folder: Path) -> "Binding":
+        return binding
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the design and pack the FMU."""
-        from fe.reduction.model_cache import reduced_model
-        from fmu_asset.packing.patch_file import load_patch
         from fmu_asset.packing.wing_packing import pack_wing
 
-        hashes = self._of.keep(self._path(""))
-        calibration, patch = self._of.calibration(), self._of.patch_path
-        self._design = self._of.design()
-        self._wing = reduced_model(self._design, progress=progress)
-        tailored = None
+        self.model, tailored = self._of.reduced(progress), None
+        calibration = self._of.calibration()
         if calibration is not None:
             from calibration.result.plain import tailoring  # takes a second to load
 
             tailored = tailoring(calibration)
         with progress.stage("Packing the FMU"):
             pack_wing(
-                self._design,
-                self.fmu_path(),
-                tailoring=tailored,
-                kind=self._packed,
-                patch=None if patch is None else load_patch(patch),
-                activate=True,
-                replace=True,
-                progress=progress,
-            )
-        return {**hashes, FLOWN_DESIGN_HASH: self._wing.design_hash, "fmu": hash_file(self.fmu_path())}
+                self._of.design(), self.fmu_path(), tailoring=tailored, kind=self._packed,
+                patch=self._of.patch(), activate=True, replace=True, progress=progress,
+            )  # fmt: skip
+        return {FLOWN_DESIGN_HASH: self.model.design_hash, "fmu": hash_file(self.fmu_path())}
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the calibrated parameter."""
@@ -263,12 +268,10 @@ class WingFmuSource(FmuSource):
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain of the wing as VTU."""
-        if self._design is None:
-            return False
-        return write_design_field(path, self._scenario, self._design, self._mean, state, control)
+        return self._of.write_field(path, self._scenario, self._mean, state, control)
 
 
-class DesignSource:
+class DesignSource(ReducedModelSource):
     """The reduced model of a design file, or of the design inside a calibration file, as what is believed.
 
     Parameters
@@ -280,26 +283,13 @@ class DesignSource:
     """
 
     def __init__(self, scenario: Scenario, section: DesignBelief) -> None:
-        self._scenario = scenario
-        self._of = _Wing(scenario, section)
-        self._design: WingDesign | None = None
-        self._wing: ReducedModel | None = None
-        self._mean = 1.0
+        super().__init__(scenario, section=section)
+        self._of = _Wing(self, section)
 
     @property
-    def origin(self) -> FlownAndBelieved:
-        """The reduced model, twice; it has the name of its design once prepared."""
-        model = _model_of("" if self._design is None else self._design.name)
-        if self._of.patch_path is not None:
-            model = f"{model}, with effects"
-        return FlownAndBelieved(model, model)
-
-    @property
-    def wing(self) -> "ReducedModel":
-        """The reduced model, once prepared."""
-        if self._wing is None:
-            raise MissionInputError("the model was not prepared: call `prepare` first.")
-        return self._wing
+    def words(self) -> str:
+        """The reduced model; it has the name of its design once prepared."""
+        return f"{self._of.words}{'' if self._of.patch_path is None else ', with effects'}"
 
     def check(self) -> None:
         """Read the design without building anything.
@@ -314,127 +304,45 @@ class DesignSource:
             The scenario's states, controls, parameter or sensors are not those of the design's model.
         """
         from fe.reduction.settings import ReductionSettings
-        from twin_master.assets.wing_model import check_wing_scenario
+        from twin_master.assets.patches import check_model_patch
 
-        read_calibration(self._scenario.calibration)
+        calibration = self._scenario.calibration
+        read_calibration(calibration)
         self.files()
         design = self._of.design()
-        where = f"the {_model_of(design.name)}"
         ranges = {"young_modulus_factor": ReductionSettings().young_modulus_factor}
         check_calibration(
-            self._scenario.calibration,
-            ranges,
-            where,
-            ranges=ranges,
-            design_hash=design.hash,
-            advice=OWN_OF_WING,
-        )
-        gauges = len(design.gauges.positions)
+            calibration, ranges, f"the reduced model of the design {design.name}", ranges=ranges,
+            design_hash=design.hash, advice=OWN_OF_WING,
+        )  # fmt: skip
+        gauges, patch = len(design.gauges.positions), self._of.patch()
         check_wing_scenario(self._scenario, design.regions, gauges)
-        if self._of.patch_path is not None:
-            from fmu_asset.packing.patch_file import load_patch
-            from twin_master.assets.patches import check_model_patch
+        if patch is not None:
+            check_model_patch(patch, gauges, str(self._of.patch_path))
 
-            check_model_patch(load_patch(self._of.patch_path), gauges, str(self._of.patch_path))
-
-    def files(self) -> dict[str, bytes]:
-        """Return design, patch and calibration as they are given.
-
-        Raises
-        ------
-        MissionInputError
-            One cannot be read.
-        """
-        return read_files(self._of.places)
-
-    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Copy what is given into the run folder and reduce the design; return the hashes.
-
-        Raises
-        ------
-        MissionInputError, InvalidDesignError
-            The design cannot be read, or is wrong.
-        """
-        from fe.reduction.model_cache import reduced_model
-
-        hashes = self._of.keep(folder)
-        self._design = self._of.design()
-        self._wing = reduced_model(self._design, progress=progress)
-        return {**hashes, "design": self._wing.design_hash}
-
-    def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of e."""
-        draws = draw_parameter(self._scenario.calibration, seed, self.wing)
-        self._mean = draws.mean
-        return draws
+    def _make(self, progress: Progress) -> dict[str, str]:
+        self.model = self._of.reduced(progress)
+        return super()._make(progress)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the strains (E, S, U, G)."""
-        return self._strains(draws, model, self._patch())
+        return self._strains(draws, model, self._of.patch())
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
         """Return the strains of the structure itself (E, S, U, G); None where no effect is of its gauges."""
-        patch = self._patch()
+        patch = self._of.patch()
         kept = None if patch is None else patch.of_structure
         return None if kept == patch else self._strains(draws, model, kept)
 
-    def _patch(self) -> "PatchFile | None":
-        from fmu_asset.packing.patch_file import load_patch
-
-        return None if self._of.patch_path is None else load_patch(self._of.patch_path)
-
     def _strains(self, draws: ParameterDraws, model: GraphicalModel, patch: "PatchFile | None") -> Float:
-        from twin_master.assets.patches import model_observation_table
+        if patch is None or not patch.effects:
+            return super().observation_table(draws, model)
+        from twin_master.assets.patches import patched_observation_table
 
         where, design = str(self._of.patch_path), self._of.design()
-        return model_observation_table(self.wing, self._scenario, draws, model, patch, design, where)
-
-    def open(self) -> Asset:
-        """Return the model as an asset."""
-        from twin_master.assets.wing_model import wing_asset
-
-        return wing_asset(self.wing, self._scenario)
+        return patched_observation_table(self.wing, self._scenario, draws, model, patch, design, where)
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain of the wing as VTU."""
-        if self._design is None:
-            return False
-        return write_design_field(path, self._scenario, self._design, self._mean, state, control)
-
-
-def _model_of(name: str) -> str:
-    return f"reduced model of the design {name}".rstrip()
-
-
-def write_design_field(
-    path: Path,
-    scenario: Scenario,
-    design: "WingDesign",
-    mean: float,
-    state: Mapping[str, float],
-    control: Mapping[str, float],
-) -> bool:
-    """Write the field of a design under a state and a control as VTU; return whether it has one.
-
-    Young's modulus is that of the true wing where the scenario tells it, else the mean of the calibration.
-
-    Raises
-    ------
-    FileNotWrittenError
-        The disk is full or the folder cannot be written.
-    """
-    from fe.reduction.fields import write_wing_vtu
-    from fe.reduction.model_cache import wing_fields
-    from reporting.files import write_error
-
-    if {*state} != {*design.regions} or {*control} != {"load_factor"}:
-        return False
-    try:
-        wing = wing_fields(design)
-        e = scenario.asset.true_parameters.get("young_modulus_factor", mean)
-        force = scenario.asset.constant_load.get("tip_force", 0.0)
-        values = {**control, "young_modulus_factor": e, "tip_force": force}
-        write_wing_vtu(path, wing, wing.model.vector(values, state))
-    except OSError as error:
-        raise write_error(error, path) from error
-    return True
+        mean = self._means.get("young_modulus_factor", 1.0)
+        return self._of.write_field(path, self._scenario, mean, state, control)

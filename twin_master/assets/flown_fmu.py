@@ -61,10 +61,7 @@ class FmuAsset:
         load: Mapping[str, float],
         inner: InnerRoles | None = None,
     ) -> None:
-        self._session = session
-        self._observation = observation
-        self._load = dict(load)
-        self._inner = inner
+        self._session, self._observation, self._load, self._inner = session, observation, dict(load), inner
         binding, recorded = session.binding, session.recorded_units
         taken = {*binding.control, *binding.observation, *_TAKEN}
         self._names = {name: _plain_name(name, taken) for name in recorded}

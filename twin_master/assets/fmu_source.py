@@ -14,36 +14,29 @@ from fmu_asset.archive.fmu_file import packed_design_hash
 from fmu_asset.errors import FmuInputError
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import (
-    FLOWN_DESIGN_HASH,
-    AssetBelief,
-    FlownAndBelieved,
-    keep_files,
-    named_files,
-    read_files,
-)
-from twin_master.assets.interface import Asset
+from twin_master.assets.asset_source import BINDING_COPY, FLOWN_DESIGN_HASH, AssetBelief, Source, read_files
+from twin_master.assets.flown_fmu import FmuAsset, InnerRoles
+from twin_master.assets.interface import Asset, asked_table
 from twin_master.assets.parameter import (
     ParameterDraws,
     calibrated_means,
     check_calibration,
-    draw_parameter,
+    read_calibration,
 )
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, check_names
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import AssetSection
-from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
+from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Flag, Name, Number, Positive
 from twin_master.seeds import generator
 
 if TYPE_CHECKING:
-    from fe.runtime.reduced import ReducedModel
     from fmu_asset.door.binding import Binding
-    from twin_master.assets.flown_fmu import InnerRoles, Session
+    from fmu_asset.door.session import FmiAsset
+    from twin_master.assets.flown_fmu import Session
 
 Float = NDArray[np.float64]
 
-BINDING_COPY = "asset/binding.toml"
 FMU_COPY = "asset/asset.fmu"
 LARGEST_SEED = 2**31 - 1
 """Of an FMU's integer parameter."""
@@ -62,9 +55,7 @@ class FmuSection(AssetSection):
     seeds: tuple[Name, ...] = ()
     """Parameters of the binding that are given a number drawn from the seed of the run."""
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copy of the binding stands in a run folder."""
-        return {"binding": BINDING_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
 
     @property
     def true_parameters(self) -> Mapping[str, float]:
@@ -95,9 +86,7 @@ class FmuFileSection(FmuSection):
     kind: Literal["fmu"] = "fmu"
     file: str
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copies of binding and FMU stand in a run folder."""
-        return {"binding": BINDING_COPY, "file": FMU_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": FMU_COPY}
 
     def source(self, scenario: Scenario) -> "FmuSource":
         """Return the FMU."""
@@ -110,9 +99,7 @@ class ScriptSection(FmuSection):
     kind: Literal["script"] = "script"
     script: str
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copies of binding and script stand; the script's is the FMU made of it."""
-        return {"binding": BINDING_COPY, "script": FMU_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "script": FMU_COPY}
 
     def portable(self) -> FmuFileSection:
         """Return the FMU that was packed: from then on it is what is flown."""
@@ -125,7 +112,7 @@ class ScriptSection(FmuSection):
         return ScriptSource(scenario, self)
 
 
-class FmuSource:
+class FmuSource(Source):
     """An FMU from a file.
 
     Parameters
@@ -136,20 +123,11 @@ class FmuSource:
         Its table `asset`.
     """
 
+    label = "FMU"  # it may hold any model, also that of a design: whether they differ is not known
+
     def __init__(self, scenario: Scenario, section: FmuSection) -> None:
-        self._scenario = scenario
+        super().__init__(scenario, section)
         self._section = section
-        self._folder: Path | None = None
-
-    @property
-    def origin(self) -> FlownAndBelieved:
-        """The FMU, twice. It may hold any model, also that of a design: whether they differ is not known."""
-        return FlownAndBelieved("FMU", "FMU")
-
-    @property
-    def wing(self) -> "ReducedModel | None":
-        """The reduced model of the wing that was packed, once prepared; None for any other FMU."""
-        return None
 
     @property
     def step_timeout(self) -> float | None:
@@ -157,19 +135,14 @@ class FmuSource:
         return self._section.step_timeout
 
     def binding(self) -> "Binding":
-        """Return the binding, once prepared."""
+        """Return the binding: where it is given, or its copy once prepared."""
         from fmu_asset.door.binding import load_binding
 
-        return load_binding(self._path(BINDING_COPY))
+        return load_binding(self._section.binding_path if self._folder is None else self.path(BINDING_COPY))
 
     def fmu_path(self) -> Path:
         """Return the FMU, once prepared."""
-        return self._path(FMU_COPY)
-
-    def _path(self, name: str) -> Path:
-        if self._folder is None:
-            raise MissionInputError("the asset was not prepared: call `prepare` first.")
-        return self._folder / name
+        return self.path(FMU_COPY)
 
     def check(self) -> None:
         """Read what is given where it is, without copying or starting anything.
@@ -180,23 +153,32 @@ class FmuSource:
             A file cannot be read, or the binding observes another number of values than the scenario.
         CalibrationRecordError
             The calibration file is damaged or of another kind, or has no samples of the parameter.
-        FmuError
-            Binding, FMU or script is wrong, or the binding does not fit the FMU.
+        FmuError, FiniteElementError
+            Binding, FMU, script, design or structure is wrong, or the binding does not fit the FMU.
         """
-        from fmu_asset.door.binding import load_binding
-
+        read_calibration(self._scenario.calibration)
         self.files()
-        binding = load_binding(self._section.binding_path)
-        believed = isinstance(self._scenario.belief, AssetBelief)
-        check_calibration(
-            self._scenario.calibration, binding.parameter, f"the binding {binding.name}",
-            design_hash=packed_design_hash(self._section.all_files()[FMU_COPY]) if believed else "",
-        )  # fmt: skip
-        self._check_names(binding)
+        binding, effects = self.binding(), self._effects()
+        self._check_calibration(binding, effects)
+        self._check_names(binding, effects)
         with TemporaryDirectory(prefix="uav_twin_") as folder, self._told_of_means():
             binding = self._fitted(binding, Path(folder))
-        self._observed(binding)
+        self._check_sensors(binding)
         self._inner_roles(binding)
+
+    def _effects(self) -> tuple[str, ...]:
+        """Return what parameters by the FMU's own names there are beside those of the binding."""
+        return ()
+
+    def _check_calibration(self, binding: "Binding", effects: tuple[str, ...]) -> None:
+        believed = isinstance(self._scenario.belief, AssetBelief)
+        design_hash = packed_design_hash(self.path(FMU_COPY)) if believed and FMU_COPY in self.places else ""
+        known = (*binding.parameter, *effects)
+        where = f"the binding {binding.name}"
+        check_calibration(self._scenario.calibration, known, where, design_hash=design_hash)
+
+    def _check_sensors(self, binding: "Binding") -> None:
+        self._observed(binding)
 
     @contextmanager
     def _told_of_means(self) -> Iterator[None]:
@@ -205,11 +187,8 @@ class FmuSource:
             yield
         except FmuInputError as error:
             means = calibrated_means(self._scenario.calibration)
-            own = [
-                f"{name} = {value:.6g}"
-                for name, value in means.items()
-                if name not in self._section.parameters
-            ]
+            given = self._section.parameters
+            own = [f"{name} = {value:.6g}" for name, value in means.items() if name not in given]
             if not own:
                 raise
             raise MissionInputError(
@@ -221,91 +200,50 @@ class FmuSource:
         """Return the binding as the FMU fits it: only with that it is known how many values an array has."""
         from fmu_asset.door.session import FmiAsset
 
-        fmu = self._section.all_files()[FMU_COPY]
-        return FmiAsset(fmu, binding, parameters=self.parameters()).binding
+        return FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters()).binding
 
-    def files(self) -> dict[str, bytes]:
-        """Return binding, FMU and whatever else is given, by the places of the copies.
-
-        Raises
-        ------
-        MissionInputError
-            A file cannot be read.
-        """
-        return read_files(named_files(self._scenario, self._section))
-
-    def _check_names(self, binding: "Binding", effects: tuple[str, ...] = ()) -> None:
-        """Check the scenario's names against the binding; `effects` are parameters by the FMU's own names."""
+    def _check_names(self, binding: "Binding", effects: tuple[str, ...]) -> None:
         scenario, section = self._scenario, self._section
-        for what, names, known in (
-            ("control input", scenario.control[0].values, binding.control),
-            ("state", () if scenario.truth.kind == "asset" else scenario.state_names, binding.health),
-            ("load", section.load, binding.load),
-            ("parameter", (*section.parameters, *section.seeds), [*binding.parameter, *effects]),
-        ):
-            unknown = sorted({*names} - {*known})
-            if unknown:
-                raise MissionInputError(
-                    f"the scenario has the {what} {', '.join(unknown)}, which the binding {binding.name} "
-                    f"does not know; it knows {', '.join(known) or 'none'}."
-                )
-
-    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Copy what is given into the run folder and make the FMU; return the hashes.
-
-        Raises
-        ------
-        MissionInputError
-            A file cannot be read.
-        FmuError
-            Binding or FMU is wrong.
-        """
-        self._folder = folder
-        contents = self.files()
-        keep_files(folder, contents)
-        hashed = {"binding": BINDING_COPY, "calibration": CALIBRATION_COPY}
-        hashes = {name: hash_file(self._path(copy)) for name, copy in hashed.items() if copy in contents}
-        return hashes | self._make(progress)
-
-    def use(self, folder: Path) -> None:
-        """Fly what an earlier `prepare` left in a folder, without making it again."""
-        self._folder = folder
+        check_names(
+            "the scenario has the",
+            f"the binding {binding.name}",
+            (
+                ("control input", scenario.control[0].values, binding.control),
+                ("state", () if scenario.truth.kind == "asset" else scenario.state_names, binding.health),
+                ("load", section.load, binding.load),
+                ("parameter", (*section.parameters, *section.seeds), [*binding.parameter, *effects]),
+            ),
+        )
 
     def _make(self, progress: Progress) -> dict[str, str]:
-        """Make what is flown of the copies; return the hashes."""
         packed = packed_design_hash(self.fmu_path())
         return ({FLOWN_DESIGN_HASH: packed} if packed else {}) | {"fmu": hash_file(self.fmu_path())}
-
-    def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of the calibrated parameter."""
-        return draw_parameter(self._scenario.calibration, seed, self.wing)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Ask the FMU for its observation (E, S, U, G) at every draw, state and control.
 
         That holds for assets without memory.
         """
-        scenario = self._scenario
-        states, controls = model.states.coordinates, scenario.control
-        table = np.empty((len(draws.values), len(states), len(controls), scenario.observation.count))
+        scenario, load, rows = self._scenario, self._section.load, []
+        controls = [control.values for control in scenario.control]
         with self._session() as session:
             chosen = self._observed(session.binding)
             for row, value in enumerate(draws.values):
                 others = {name: float(values[row]) for name, values in draws.others.items()}
                 session.reset({**self.parameters(), **others, draws.name: float(value)})
-                for state, levels in enumerate(states):
-                    health = dict(zip(scenario.state_names, levels.tolist(), strict=True))
-                    for index, control in enumerate(controls):
-                        reading = session.step(control.values, health, self._section.load)
-                        table[row, state, index] = reading.values[chosen]
-        return table
+                rows.append(
+                    asked_table(
+                        scenario.state_names,
+                        model.states.coordinates,
+                        controls,
+                        lambda control, health: session.step(control, health, load).values[chosen],
+                    )
+                )
+        return np.array(rows)
 
-    def _observed(self, binding: "Binding") -> slice:
-        """Return where the observed quantity stands among the observations of the binding."""
-        return self._measured(binding, self._scenario.observation.role)
-
-    def _measured(self, binding: "Binding", role: str) -> slice:
-        """Return where a role stands whose units are those that the scenario says, if it says any."""
+    def _observed(self, binding: "Binding", role: str = "") -> slice:
+        """Return where a role stands among the observations of the binding, in the units of the scenario."""
+        role = role or self._scenario.observation.role
         chosen = self._slice(binding, role)
         bound, said = binding.observation[role].units, self._scenario.observation.sensor_units
         for number, (there, here) in enumerate(zip(bound, said, strict=True), 1):
@@ -326,7 +264,7 @@ class FmuSource:
             )
         return chosen
 
-    def _inner_roles(self, binding: "Binding") -> "InnerRoles | None":
+    def _inner_roles(self, binding: "Binding") -> InnerRoles | None:
         """Return where the asset tells of its own damage and sensors; None where the truth is the scenario's.
 
         Raises
@@ -334,8 +272,6 @@ class FmuSource:
         MissionInputError
             The binding has no such monitor or observation.
         """
-        from twin_master.assets.flown_fmu import InnerRoles
-
         truth = self._scenario.truth
         if truth.kind != "asset":
             return None
@@ -344,15 +280,11 @@ class FmuSource:
                 "an asset that carries its own damage cannot be asked what the twin should expect of each "
                 "state: name a model for the twin in the table `belief`."
             )
-        unknown = sorted({*truth.state.values()} - {*binding.monitor})
-        if unknown:
-            raise MissionInputError(
-                f"`truth.state` names the monitor {', '.join(unknown)}, which the binding {binding.name} "
-                f"does not know; it knows {', '.join(binding.monitor) or 'none'}."
-            )
+        rows = [("monitor", truth.state.values(), binding.monitor)]
+        check_names("`truth.state` names the", f"the binding {binding.name}", rows)
         return InnerRoles(
             state=truth.state,
-            observation=self._measured(binding, truth.observation or self._scenario.observation.role),
+            observation=self._observed(binding, truth.observation or ""),
             received=None if truth.received is None else self._slice(binding, truth.received),
         )
 
@@ -367,15 +299,16 @@ class FmuSource:
         return calibrated_means(self._scenario.calibration) | section.parameters | seeds
 
     def _session(self) -> "Session":
+        return self._opened(self.binding(), self.parameters())
+
+    def _opened(self, binding: "Binding", parameters: Mapping[str, float]) -> "FmiAsset":
         from fmu_asset.door.session import FmiAsset
 
+        section = self._section
         return FmiAsset(
-            self._path(FMU_COPY),
-            self.binding(),
-            isolated=self._section.isolated,
-            step_timeout=self._section.step_timeout,
-            parameters=self.parameters(),
-        )
+            self.fmu_path(), binding, isolated=section.isolated, step_timeout=section.step_timeout,
+            parameters=parameters,
+        )  # fmt: skip
 
     def open(self) -> Asset:
         """Return the FMU at its start, with the parameters of the scenario.
@@ -387,8 +320,6 @@ class FmuSource:
         MissionInputError
             The FMU observes another number of values than the scenario.
         """
-        from twin_master.assets.flown_fmu import FmuAsset
-
         session = self._session()
         chosen, inner = self._observed(session.binding), self._inner_roles(session.binding)
         try:
@@ -397,10 +328,6 @@ class FmuSource:
             session.close()
             raise
         return FmuAsset(session, chosen, self._section.load, inner)
-
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write nothing: an FMU shows no field."""
-        return False
 
 
 class ScriptSource(FmuSource):
@@ -418,7 +345,7 @@ class ScriptSource(FmuSource):
         """
         from fmu_asset.packing.script import script_fmu
 
-        given = named_files(self._scenario, self._section)
+        given = dict(self.places)
         script = given.pop(FMU_COPY)
         return {**read_files(given), FMU_COPY: script_fmu(script)[0]}
 

@@ -3,17 +3,16 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, keep_files
+from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, Source
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
-from twin_master.assets.interface import Asset
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import InvalidObservationLibraryError, MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
@@ -37,9 +36,7 @@ class LibraryBelief(BeliefSection):
     design: str | None = None
     """The wing whose stiffness curve the calibration takes, and whose field is drawn, where there is one."""
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copies of library and design stand in a run folder."""
-        return {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "LibrarySource":
         """Return the library.
@@ -57,38 +54,41 @@ class LibraryBelief(BeliefSection):
         model: AssetSource = flown
         if self.design is not None:
             model = DesignSource(scenario, DesignBelief(design=self.design))
-        return LibrarySource(scenario, model, scenario.asset.binding_path, Path(self.file))
+        return LibrarySource(scenario, self, model, scenario.asset.binding_path)
 
 
-class LibrarySource:
+class LibrarySource(Source):
     """Predicted observations from an observation library.
 
     Parameters
     ----------
     scenario : Scenario
         What is flown.
+    section : LibraryBelief
+        What is believed.
     model : AssetSource
         Gives the draws of the parameter and the field: what is flown, or the model of a design.
     binding : Path
         Binding of what is flown.
-    library : Path
-        The observation library.
     """
 
-    def __init__(self, scenario: Scenario, model: AssetSource, binding: Path, library: Path) -> None:
-        self._scenario = scenario
-        self._model = model
-        self._binding = binding
-        self._path = library
+    def __init__(self, scenario: Scenario, section: LibraryBelief, model: AssetSource, binding: Path) -> None:
+        super().__init__(scenario, section)
+        self._model, self._binding = model, binding
         self._library: ObservationLibrary | None = None
         self._other_fmu: bool | None = False
+        self.open = model.open  # a library is flown by nobody
+
+    @property
+    def words(self) -> str:
+        """The library; it differs from the asset if it was sampled from another FMU."""
+        other = {True: " of another FMU", False: " of it", None: ""}[self._other_fmu]
+        return f"observation library{other}"
 
     @property
     def origin(self) -> FlownAndBelieved:
-        """The library, twice; it differs from the asset if it was sampled from another FMU."""
-        other = {True: " of another FMU", False: " of it", None: ""}[self._other_fmu]
-        words = f"observation library{other}"
-        return FlownAndBelieved(words, words, differ=self._other_fmu is True)
+        """The library, twice."""
+        return FlownAndBelieved(self.words, self.words, differ=self._other_fmu is True)
 
     def check(self) -> None:
         """Check that the library has what the scenario asks for.
@@ -101,27 +101,27 @@ class LibrarySource:
         self._read()
 
     def files(self) -> dict[str, bytes]:
-        """Return the library, and the design if one is named."""
-        try:
-            content = self._path.read_bytes()
-        except OSError as error:
-            raise InvalidObservationLibraryError(
-                f"the observation library {self._path} cannot be read: {error.strerror or error}."
-            ) from error
-        design = self._model.files() if isinstance(self._model, DesignSource) else {}
-        return {**design, OBSERVATIONS_COPY: content}
+        """Return the library, and the design if one is named.
 
-    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Copy the library, and prepare the design if one is named; return the hashes.
-
-        What is flown is prepared before.
+        Raises
+        ------
+        InvalidObservationLibraryError
+            One cannot be read.
         """
-        keep_files(folder, self.files())
-        hashes = self._model.prepare(folder, progress) if isinstance(self._model, DesignSource) else {}
-        self._path, fmu = folder / OBSERVATIONS_COPY, folder / FMU_COPY
+        try:
+            return super().files()
+        except MissionInputError as error:
+            raise InvalidObservationLibraryError(f"the observation library: {error}") from error
+
+    def _make(self, progress: Progress) -> dict[str, str]:
+        """Prepare the design if one is named; what is flown is prepared before."""
+        assert self._folder is not None
+        own = isinstance(self._model, DesignSource)
+        hashes = self._model.prepare(self._folder, progress) if own else {}
+        fmu = self._folder / FMU_COPY
         library = self._read()
         self._other_fmu = library.fmu_hash != hash_file(fmu) if fmu.exists() else None  # several have several
-        return {**hashes, "observation_library": hash_file(self._path)}
+        return {**hashes, "observation_library": hash_file(self.path(OBSERVATIONS_COPY))}
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the parameter, from the calibration of the scenario."""
@@ -145,10 +145,6 @@ class LibrarySource:
         rows, controls = self._places(library, model)
         return library.at_draws(draws.name, draws.values)[:, rows][:, :, controls]
 
-    def open(self) -> Asset:
-        """Return what gives the draws and the field as an asset; a library is flown by nobody."""
-        return self._model.open()
-
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write the field of the model."""
         return self._model.write_field(path, state, control)
@@ -163,33 +159,28 @@ class LibrarySource:
         from twin_master.assets.observation_library import load_observation_library
         from twin_master.network.twin import build_graphical_model
 
-        library = load_observation_library(self._path)
+        library = load_observation_library(self.path(OBSERVATIONS_COPY))
         scenario = self._scenario
-        section, vector = (
-            scenario.observation,
-            load_binding(self._binding).observation.get(scenario.observation.role),
-        )
+        section = scenario.observation
+        vector = load_binding(self._binding).observation.get(section.role)
         flown = () if vector is None else vector.variables
+        units = zip(library.states.names, library.state_units, strict=True)
         for what, has, wanted in (
             ("observes", (library.role,), (section.role,)),
             ("has the sensors", library.sensors, flown),
             ("has them in", library.sensor_units, section.sensor_units),
             (
                 "has the states in",
-                tuple(
-                    sorted(
-                        f"{n}: {u}" for n, u in zip(library.states.names, library.state_units, strict=True)
-                    )
-                ),
+                tuple(sorted(f"{name}: {unit}" for name, unit in units)),
                 tuple(sorted(f"{factor.name}: {factor.unit}" for factor in scenario.state)),
             ),
             ("was sampled under the load", _shown(library.load), _shown(scenario.asset.constant_load)),
         ):
             if has != wanted:
                 raise InvalidObservationLibraryError(
-                    f"the observation library {self._path.name} {what} {', '.join(has) or 'none'}, and the "
-                    f"scenario with its binding asks for {', '.join(wanted) or 'none'}: sample one for this "
-                    "scenario."
+                    f"the observation library {self.path(OBSERVATIONS_COPY).name} {what} "
+                    f"{', '.join(has) or 'none'}, and the scenario with its binding asks for "
+                    f"{', '.join(wanted) or 'none'}: sample one for this scenario."
                 )
         if not library.parameter or library.parameter == scenario.calibration.parameter:
             self._places(library, build_graphical_model(scenario))

@@ -3,6 +3,7 @@
 A `Misfit` says what the difference does to an estimate.
 """
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuCallError
-from twin_master.assets.interface import Asset
+from twin_master.assets.interface import Asset, asked_table
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
@@ -95,15 +96,15 @@ def find_misfit(
     asset : Asset
         What is flown.
     """
-    names = scenario.state_names
-    observation = np.full(sensor_model.mean.shape, np.nan)
-    start = asset.save_state()
-    for state, levels in enumerate(model.states.coordinates):
-        health = dict(zip(names, levels.tolist(), strict=True))
-        for index, control in enumerate(scenario.control):
-            asset.restore_state(start)  # an asset with hidden effects may remember
-            with suppress(FmuCallError):
-                observation[state, index] = asset.step(control.values, health).values
+    start, controls = asset.save_state(), [control.values for control in scenario.control]
+
+    def ask(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+        asset.restore_state(start)  # an asset with hidden effects may remember
+        with suppress(FmuCallError):
+            return asset.step(control, health).values
+        return np.full(sensor_model.sensor_count, np.nan)
+
+    observation = asked_table(scenario.state_names, model.states.coordinates, controls, ask)
     return Misfit(sensor_model.mean - observation, observation, _gain(model, sensor_model))
 
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -32,12 +30,15 @@ RESERVED = ("draw", "control", "sensor", "observation", "parameter_value", "sens
 """Names that a state cannot have, because the file has them already."""
 
 _SAME = 1e-12
-_RECORDS = ("load", "parameters", "control_units")
 
 
-@dataclass(frozen=True)
 class ObservationLibrary:
     """Observations over a grid of E draws, S states, U controls and G sensors.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Of the layout that `sampled_dataset` makes.
 
     Attributes
     ----------
@@ -55,40 +56,52 @@ class ObservationLibrary:
         Names of the controls, labels only.
     control_values : dict of str to (U,)
         Value of each control input under each control.
-    control_units : dict of str to str
-        Unit of each control input.
-    parameter, parameter_unit : str
+    parameter : str
         The uncertain parameter; empty without one.
     draws : (E,)
         Its values; NaN without one.
-    load, parameters : dict of str to float
+    load : dict of str to float
         What else was set.
     settling_steps : int
         Steps from a fresh start at every point; 0: the FMU has no memory, and each point is one step.
-    fmu_hash, binding_hash : str
-        SHA-256 of the files.
-    version : str
-        Version of uav-twin that sampled it.
+    fmu_hash : str
+        SHA-256 of the FMU.
+
+    Raises
+    ------
+    KeyError, ValueError, TypeError, InvalidModelError
+        It is no such dataset.
     """
 
-    values: Float
-    role: str
-    sensors: tuple[str, ...]
-    sensor_units: tuple[str, ...]
-    states: StateSpace
-    state_units: tuple[str, ...]
-    controls: tuple[str, ...]
-    control_values: Mapping[str, Float]
-    control_units: Mapping[str, str]
-    parameter: str
-    parameter_unit: str
-    draws: Float
-    load: Mapping[str, float]
-    parameters: Mapping[str, float]
-    settling_steps: int
-    fmu_hash: str
-    binding_hash: str
-    version: str
+    def __init__(self, dataset: xr.Dataset) -> None:
+        about = dataset.attrs
+        names: list[str] = json.loads(about["states"])
+        self.dataset = dataset
+        self.states = StateSpace(tuple(Factor(name, tuple(dataset[name].values.tolist())) for name in names))
+        self.state_units = tuple(str(dataset[name].attrs["units"]) for name in names)
+        self.role, self.parameter, self.fmu_hash = (
+            str(about[name]) for name in ("role", "parameter", "fmu_sha256")
+        )
+        self.settling_steps = int(about["settling_steps"])
+        self.load: Mapping[str, float] = json.loads(about["load"])
+        self.sensors, self.sensor_units, self.controls = (
+            tuple(str(text) for text in dataset[name].values) for name in ("sensor", "sensor_unit", "control")
+        )
+        inputs = [f"control_{name}" for name in json.loads(about["control_units"])]
+        for name in (*inputs, *["parameter_value"] * bool(self.parameter)):
+            if not np.all(np.isfinite(dataset[name].values)):
+                raise ValueError(f"a value of {name} is not finite")
+        self.control_values: dict[str, Float] = {
+            name.removeprefix("control_"): np.asarray(dataset[name].values, np.float64) for name in inputs
+        }
+        self.draws: Float = np.asarray(dataset["parameter_value"].values, np.float64)
+        table = dataset["observation"].transpose("draw", *names, "control", "sensor").values
+        self.values: Float = np.array(table, np.float64).reshape(
+            len(table), self.states.size, *table.shape[-2:]
+        )
+        if not np.all(np.isfinite(self.values)):
+            raise ValueError("an observation is not finite")
+        self.values.setflags(write=False)
 
     def rows_of(self, names: tuple[str, ...], coordinates: Float) -> list[int]:
         """Return the index of each state (N, F), whose factors are named in any order.
@@ -181,54 +194,6 @@ class ObservationLibrary:
         """Return whether every value of the parameter was sampled, so that nothing is interpolated."""
         return bool(np.isin(draws, self.draws).all())
 
-    def to_dataset(self) -> xr.Dataset:
-        """Return the library as a labelled dataset; a state factor is a dimension of its own."""
-        names = self.states.names
-        taken = sorted({*names} & {*RESERVED})
-        if taken:
-            raise InvalidObservationLibraryError(
-                f"a state cannot be called {taken[0]} in an observation library: give it another name in the "
-                "binding."
-            )
-        sensor = {"long_name": f"FMU variable of each value of {self.role}"}
-        coordinates: dict[str, xr.Variable] = {
-            "sensor": xr.Variable("sensor", np.array(self.sensors), sensor),
-            "sensor_unit": xr.Variable("sensor", np.array(self.sensor_units), {"long_name": "unit"}),
-            "control": xr.Variable("control", np.array(self.controls), {"long_name": "control"}),
-            "parameter_value": xr.Variable(
-                "draw", self.draws, {"long_name": self.parameter or "none", "units": self.parameter_unit}
-            ),
-        }
-        for factor, unit in zip(self.states.factors, self.state_units, strict=True):
-            levels = np.array(factor.levels)
-            coordinates[factor.name] = xr.Variable(factor.name, levels, {"long_name": "state", "units": unit})
-        for name, values in self.control_values.items():
-            attributes = {"long_name": f"control input {name}", "units": self.control_units[name]}
-            coordinates[f"control_{name}"] = xr.Variable("control", values, attributes)
-        shape = (len(self.draws), *self.states.shape, *self.values.shape[2:])
-        return xr.Dataset(
-            {
-                "observation": (
-                    ("draw", *names, "control", "sensor"),
-                    self.values.reshape(shape),
-                    {"long_name": f"{self.role} without noise", "units": "see sensor_unit"},
-                )
-            },
-            coords=coordinates,
-            attrs={
-                "kind": KIND,
-                "format": FORMAT,
-                "role": self.role,
-                "states": json.dumps(names),
-                "parameter": self.parameter,
-                "settling_steps": self.settling_steps,
-                "fmu_sha256": self.fmu_hash,
-                "binding_sha256": self.binding_hash,
-                "uav_twin_version": self.version,
-            }
-            | {name: json.dumps(dict(getattr(self, name)), sort_keys=True) for name in _RECORDS},
-        )
-
 
 def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
     """Write a library in one step; equal libraries give equal bytes.
@@ -238,7 +203,7 @@ def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    return atomic_write_bytes(path, bytes(library.to_dataset().to_netcdf(engine="h5netcdf")))
+    return atomic_write_bytes(path, bytes(library.dataset.to_netcdf(engine="h5netcdf")))
 
 
 def load_observation_library(path: Path) -> ObservationLibrary:
@@ -264,55 +229,12 @@ def load_observation_library(path: Path) -> ObservationLibrary:
             f"{path} is no observation library of this version (format {FORMAT}): sample it again."
         )
     try:
-        return _from_dataset(dataset)
+        return ObservationLibrary(dataset)
     except (KeyError, ValueError, TypeError, InvalidModelError) as error:
         reason = error.args[0] if error.args else error
         raise InvalidObservationLibraryError(
             f"{path} does not have the layout of an observation library ({reason}): sample it again."
         ) from error
-
-
-def _from_dataset(dataset: xr.Dataset) -> ObservationLibrary:
-    names: list[str] = json.loads(dataset.attrs["states"])
-    states = StateSpace(tuple(Factor(name, tuple(dataset[name].values.tolist())) for name in names))
-    records: dict[str, dict[str, Any]] = {name: json.loads(dataset.attrs[name]) for name in _RECORDS}
-    table = dataset["observation"].transpose("draw", *names, "control", "sensor").values
-    values = np.array(table, dtype=np.float64).reshape(len(table), states.size, *table.shape[-2:])
-    if not np.all(np.isfinite(values)):
-        raise ValueError("an observation is not finite")
-    values.setflags(write=False)
-    parameter = str(dataset.attrs["parameter"])
-    nodes = [f"control_{name}" for name in records["control_units"]] + ["parameter_value"] * bool(parameter)
-    for name in nodes:
-        if not np.all(np.isfinite(dataset[name].values)):
-            raise ValueError(f"a value of {name} is not finite")
-    return ObservationLibrary(
-        values=values,
-        role=str(dataset.attrs["role"]),
-        sensors=_texts(dataset["sensor"]),
-        sensor_units=_texts(dataset["sensor_unit"]),
-        states=states,
-        state_units=tuple(str(dataset[name].attrs["units"]) for name in names),
-        controls=_texts(dataset["control"]),
-        control_values={
-            name: np.asarray(dataset[f"control_{name}"].values, dtype=np.float64)
-            for name in records["control_units"]
-        },
-        control_units=records["control_units"],
-        parameter=parameter,
-        parameter_unit=str(dataset["parameter_value"].attrs["units"]),
-        draws=np.asarray(dataset["parameter_value"].values, dtype=np.float64),
-        load=records["load"],
-        parameters=records["parameters"],
-        settling_steps=int(dataset.attrs["settling_steps"]),
-        fmu_hash=str(dataset.attrs["fmu_sha256"]),
-        binding_hash=str(dataset.attrs["binding_sha256"]),
-        version=str(dataset.attrs["uav_twin_version"]),
-    )
-
-
-def _texts(variable: xr.DataArray) -> tuple[str, ...]:
-    return tuple(str(value) for value in variable.values)
 
 
 def _listed(values: Float) -> str:

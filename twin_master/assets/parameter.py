@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.errors import MissingObservationModelError, MissionInputError
+from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
 from twin_master.scenario.schema import Calibration
 from twin_master.seeds import generator, seed_sequence
 
@@ -225,12 +225,8 @@ def check_calibration(
     if found is None:
         return
     names = {prior.name for prior in found.priors}
-    unknown = sorted(names - {*known})
-    if unknown:
-        raise MissionInputError(
-            f"the calibration of {found.asset} has the parameter {', '.join(unknown)}, which {where} "
-            f"does not know; it knows {', '.join(known) or 'none'}: {advice}."
-        )
+    rows = [("parameter", names, known)]
+    check_names(f"the calibration of {found.asset} has the", where, rows, advice=advice)
     if design_hash and found.design_hash not in ("", design_hash):
         raise MissionInputError(
             f"the calibration of {found.asset} is of the model {found.model} with the design "

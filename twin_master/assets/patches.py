@@ -1,5 +1,7 @@
 """Missing effects in a mission: in the asset that flies, and in the model that the twin believes."""
 
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +20,8 @@ from fmu_asset.packing.patched_runtime import (
 from fmu_asset.packing.wing_packing import arrays_for
 from fmu_asset.slaves.base import UnacceptableValuesError
 from fmu_asset.slaves.table import structure_table
+from twin_master.assets.interface import asked_table
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.assets.wing_model import check_wing_scenario, wing_observation_table
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
@@ -48,27 +50,22 @@ def check_model_patch(patch: PatchFile, gauge_count: int, where: str = "The patc
                 )
 
 
-def model_observation_table(
+def patched_observation_table(
     wing: ReducedModel,
     scenario: Scenario,
     draws: ParameterDraws,
     model: GraphicalModel,
-    patch: PatchFile | None,
+    patch: PatchFile,
     design: WingDesign,
-    where: str = "The patch",
+    where: str,
 ) -> Float:
-    """Return the strains (E, S, U, G) that the twin predicts, with the effects of its patch if it has one.
+    """Return the strains (E, S, U, G) that the twin predicts with the effects of its patch.
 
     Raises
     ------
-    MissingObservationModelError, OutsideModelError
-        As `wing_observation_table`.
     PatchFileError, MissionInputError
         The model cannot carry the patch.
     """
-    if patch is None or not patch.effects:
-        return wing_observation_table(wing, scenario, draws, model)
-    check_wing_scenario(scenario, wing.regions, wing.gauge_count)
     check_model_patch(patch, wing.gauge_count, where)
     effects = plain_effects(patch.for_outputs(output_channels(wing.gauge_count)))
     behaviour = patched_behaviour(wing, effects, arrays_for(design, patch))
@@ -76,23 +73,19 @@ def model_observation_table(
     rows = structure_table(wing, {})[0]
     nominal = {row.name: row.start or 0.0 for row in rows}
     names = [row.name for row in rows if row.causality == "input"]
-    healths = [f"health.{region}" for region in wing.regions]
-    states, controls = model.states.coordinates, scenario.control
-    order = [scenario.state_names.index(name) for name in wing.regions]
     force = scenario.asset.constant_load.get("tip_force", 0.0)
-    table = np.empty((len(draws.values), len(states), len(controls), wing.gauge_count))
+
+    def ask(start: Mapping[str, float], control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+        given = {**control, **{f"health.{name}": loss for name, loss in health.items()}, "tip_force": force}
+        return np.array(behaviour.start(start, 0.0, [given[name] for name in names])[: wing.gauge_count])
+
+    names_of_states, states = scenario.state_names, model.states.coordinates
+    controls = [control.values for control in scenario.control]
+    drawn = [{**nominal, "young_modulus_factor": float(value)} for value in draws.values]
     try:
-        for row, value in enumerate(draws.values):
-            parameters = {**nominal, "young_modulus_factor": float(value)}
-            for state, levels in enumerate(states):
-                for index, control in enumerate(controls):
-                    given = {**control.values, "tip_force": force}
-                    given |= zip(healths, levels[order].tolist(), strict=True)
-                    inputs = [given[name] for name in names]
-                    table[row, state, index] = behaviour.start(parameters, 0.0, inputs)[: wing.gauge_count]
+        return np.array([asked_table(names_of_states, states, controls, partial(ask, e)) for e in drawn])
     except UnacceptableValuesError as error:
         raise MissionInputError(f"the twin's model cannot carry {where}: {error}") from error
-    return table
 
 
 def effect_names(patch_file: Path, gauge_count: int) -> tuple[str, ...]:

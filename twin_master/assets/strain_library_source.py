@@ -2,18 +2,18 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import AssetBelief, AssetSource, FlownAndBelieved, read_files
+from twin_master.assets.asset_source import AssetBelief, AssetSource, Source
 from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.strain_library import FILE_NAME, StrainLibrary, load_strain_library
-from twin_master.errors import MissingObservationModelError, MissionInputError
+from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
@@ -32,9 +32,7 @@ class StrainLibrarySection(AssetSection):
     kind: Literal["strain_library"] = "strain_library"
     file: str | None = None
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copy of the library stands in a run folder."""
-        return {"file": LIBRARY_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
     def differs_from(self, belief: BeliefSection) -> bool:
         """Return whether the twin believes something else."""
@@ -68,9 +66,7 @@ class StrainLibraryBelief(BeliefSection):
     kind: Literal["strain_library"] = "strain_library"
     file: str
 
-    def copies(self) -> Mapping[str, str]:
-        """Return where the copy of the library stands in a run folder."""
-        return {"file": LIBRARY_COPY}
+    kept: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
     @property
     def departs(self) -> bool:
@@ -99,16 +95,17 @@ def _read(scenario: Scenario, path: Path) -> "StrainLibrarySource":
     return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)
 
 
-class StrainLibrarySource:
+class StrainLibrarySource(Source):
     """A strain library in the format of the authors of Kapteyn et al. 2021, as model and as asset."""
+
+    label = "strain library"
 
     def __init__(
         self, scenario: Scenario, library: StrainLibrary, content_hash: str, path: Path | None = None
     ) -> None:
-        self._path = path
-        self._scenario = scenario
-        self._library = library
-        self._hash = content_hash
+        super().__init__(scenario)
+        self.places = {} if path is None else {LIBRARY_COPY: path}
+        self._library, self._hash = library, content_hash
         self._control_index = self._find_controls()
         if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
             raise MissingObservationModelError(
@@ -117,29 +114,12 @@ class StrainLibrarySource:
                 f"and {', '.join(scenario.state_names)}."
             )
 
-    @property
-    def origin(self) -> FlownAndBelieved:
-        """The library, twice."""
-        return FlownAndBelieved("strain library", "strain library")
-
     def _find_controls(self) -> list[int]:
-        missing = [name for name in self._scenario.control_names if name not in self._library.controls]
-        if missing:
-            raise MissingObservationModelError(
-                f"the strain library has the controls {', '.join(self._library.controls)}, and the scenario "
-                f"asks for {', '.join(missing)}."
-            )
+        rows = [("control", self._scenario.control_names, self._library.controls)]
+        check_names("the scenario has the", "the strain library", rows, MissingObservationModelError)
         return [self._library.controls.index(name) for name in self._scenario.control_names]
 
-    def check(self) -> None:
-        """Accept what was read already."""
-
-    def files(self) -> dict[str, bytes]:
-        """Return the library."""
-        return {} if self._path is None else read_files({LIBRARY_COPY: self._path})
-
-    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Return the hash of the library."""
+    def _make(self, progress: Progress) -> dict[str, str]:
         return {"strain_library": self._hash}
 
     def draws(self, seed: int) -> ParameterDraws:
@@ -173,10 +153,6 @@ class StrainLibrarySource:
             return AssetReading(self._library.strain_at([health[name] for name in names], index))
 
         return StatelessAsset(observe)
-
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write nothing: there is no mesh."""
-        return False
 
 
 def check_load_factors(scenario: Scenario) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from twin_master.assets.parameter import check_calibration
-from twin_master.errors import MissingObservationModelError, MissionInputError
+from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
 from twin_master.scenario.modes import ROLE
 from twin_master.scenario.schema import Scenario
 
@@ -34,46 +34,35 @@ def check_observed(scenario: Scenario, design: "StructureDesign") -> None:
     """
     from fe.reduction.settings import ModalSettings
 
-    known = {
-        "strain": len(design.gauge),
-        "displacement": len(design.displacement),
-        "frequency": frequencies_observed(scenario) or 1,
+    where, role, modes = f"the structure {design.name}", scenario.observation.role, scenario.observation.modes
+    names = {
+        "strain": [part.name for part in design.gauge],
+        "displacement": [part.name for part in design.displacement],
     }
-    role, modes = scenario.observation.role, scenario.observation.modes
-    own = [part.name for part in design.acceleration]
+    known = {name: len(sensors) for name, sensors in names.items()}
+    known |= {"frequency": frequencies_observed(scenario) or 1}
+    row, table = ("observation", [role], [name for name, count in known.items() if count]), role
     if modes is not None:
         known[ROLE] = scenario.observation.count
-        for name in modes.accelerometers:
-            if name not in own:
-                raise MissingObservationModelError(
-                    f"the scenario has the accelerometer {name}, and the structure {design.name} has "
-                    f"{', '.join(own) or 'none'}: give it in a table [[acceleration]]."
-                )
+        there = [part.name for part in design.acceleration]
+        row, table = ("accelerometer", [*modes.accelerometers], there), "acceleration"
         most = ModalSettings().mode_count
         if max(modes.places) >= most:
             raise MissingObservationModelError(
                 f"a structure tells its first {most} modes, and mode {max(modes.places) + 1} is observed."
             )
-    if not known.get(role):
-        there = [name for name, count in known.items() if count]
-        raise MissingObservationModelError(
-            f"the scenario has the observation {role}, which the model of the structure {design.name} does "
-            f"not know; it knows {', '.join(there)}."
-        )
+    advice = f"give it in a table [[{table}]]"
+    check_names("the scenario has the", where, [row], MissingObservationModelError, advice)
     if scenario.observation.count != known[role]:
         raise MissingObservationModelError(
-            f"the structure {design.name} has {known[role]} sensors of `{role}`, and the scenario "
-            f"expects {scenario.observation.count}."
+            f"{where} has {known[role]} sensors of `{role}`, and the scenario expects "
+            f"{scenario.observation.count}."
         )
-    names = {
-        "strain": [part.name for part in design.gauge],
-        "displacement": [part.name for part in design.displacement],
-    }.get(role, [])
-    titles = [*scenario.observation.titles]
-    if titles != names and sorted(titles) == sorted(names):
+    titles, own = [*scenario.observation.titles], names.get(role, [])
+    if titles != own and sorted(titles) == sorted(own):
         raise MissionInputError(
-            f"`observation.titles` are {', '.join(titles)}, and the structure {design.name} has these "
-            f"sensors in the order {', '.join(names)}: give the titles in that order."
+            f"`observation.titles` are {', '.join(titles)}, and {where} has these sensors in the order "
+            f"{', '.join(own)}: give the titles in that order."
         )
 
 
@@ -96,11 +85,8 @@ def check_parameter(scenario: Scenario, design: "StructureDesign", believed: Pat
     found = "" if believed is None else structure_hash(design, believed.parent)
     where = f"the structure {design.name}"
     check_calibration(calibration, known, where, ranges=ranges, design_hash=found)
-    if calibration.parameter not in known:
-        raise MissionInputError(
-            f"the calibrated parameter {calibration.parameter} is none of the structure {design.name}, which "
-            f"has {', '.join(known) or 'none: give one in a table [[parameter]]'}."
-        )
+    rows = [("parameter", [calibration.parameter], known)]
+    check_names("the scenario calibrates the", where, rows, advice="give it in a table [[parameter]]")
 
 
 def check_ranges(scenario: Scenario, design: "StructureDesign", parameters: Mapping[str, float]) -> None:

@@ -111,13 +111,13 @@ class _Unpacked:
 
     def model(self, parameters: Mapping[str, float]) -> Asset:
         """Return the reduced model as an asset with true parameters; one object for all that share them."""
-        from twin_master.assets.wing_model import wing_asset
+        from twin_master.assets.reduced_model import ReducedModelSource
 
         assert self._wing is not None
         if parameters:
-            return wing_asset(self._wing, with_parameters(self.scenario, parameters))
+            return ReducedModelSource(with_parameters(self.scenario, parameters), self._wing).open()
         if self._model is None:
-            self._model = wing_asset(self._wing, self.scenario)
+            self._model = ReducedModelSource(self.scenario, self._wing).open()
         return self._model
 
     def told(self, sentence: str) -> str:

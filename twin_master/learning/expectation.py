@@ -164,31 +164,28 @@ class LearntExpectation:
     def _of(self, hypotheses: Hypotheses, weight: Float, controls: slice, seen: Float | None) -> Expected:
         """Return what is expected under B beliefs (B, K, S, U') over hypotheses, states and controls."""
         weight = weight / weight.sum(axis=(1, 2, 3), keepdims=True)
-        shown = shown_by(hypotheses, self._value[:, :, controls], self._deviation[:, controls])
-        beliefs, count = len(weight), shown.mean.shape[-1]
+        shown, shown_variance, noise2 = shown_by(
+            hypotheses, self._value[:, :, controls], self._deviation[:, controls]
+        )
+        beliefs, count = len(weight), shown.shape[-1]
         flat = weight.reshape(beliefs, -1)
-        center = shown.mean[0].mean(axis=(0, 1))  # near enough that squares do not cancel
-        first = shown.mean - center
-        second = shown.variance + first**2
+        center = shown[0].mean(axis=(0, 1))  # near enough that squares do not cancel
+        first = shown - center
+        second = shown_variance + first**2
         by_state = weight.sum(axis=1).reshape(beliefs, -1)
         means = np.einsum("bksu,ksug->bsug", weight, first).reshape(beliefs, -1, count)
         squares = np.einsum("bksu,ksug->bsug", weight, second).reshape(beliefs, -1, count)
         mean = means.sum(axis=1)
         deviation = np.sqrt(np.maximum(squares.sum(axis=1) - mean**2, 0.0))
-        noise = np.sqrt(flat @ np.broadcast_to(shown.noise2, shown.mean.shape).reshape(-1, count))
+        noise = np.sqrt(flat @ noise2.reshape(-1, count))
         quantiles = np.empty((beliefs, 2, count))
         for b in range(beliefs):
             kept = np.flatnonzero(by_state[b] > _NEGLIGIBLE)
             share = by_state[b, kept]
             own = means[b, kept] / share[:, None]
             wide = np.sqrt(np.maximum(squares[b, kept] / share[:, None] - own**2, 0.0))
-            quantiles_of(
-                share / share.sum(), np.ascontiguousarray(own.T), np.ascontiguousarray(wide.T), mean[b],
-                deviation[b], _LEVELS, quantiles[b],
-            )  # fmt: skip
-        rewards = self._rewards.expectation_of(
-            weight, hypotheses.draw, controls, shown.mean, shown.variance, seen
-        )
+            quantiles[b] = quantiles_of(share / share.sum(), own, wide, _LEVELS)
+        rewards = self._rewards.expectation_of(weight, hypotheses.draw, controls, shown, shown_variance, seen)
         return Expected(
             mean + center, deviation, quantiles[:, 0] + center, quantiles[:, 1] + center, noise,
             rewards.mean, rewards.standard_deviation,

@@ -1,21 +1,18 @@
 """What a learning filter believes of a turn, hypothesis by hypothesis, and what its sensors then show."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
-from fe.compilation import compiled
-
-__all__ = ["Hypotheses", "Shown", "quantiles_of", "shown_by"]
+__all__ = ["Hypotheses", "quantiles_of", "shown_by"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _NEGLIGIBLE = 1e-9
 """Share of a belief below which a hypothesis tells nothing."""
-ROOT_TWO = math.sqrt(2.0)
 HALVINGS = 18
 REACH = 6.5
 """Standard deviations from the mean within which a quantile between 2.5 and 97.5 % lies, by Cantelli."""
@@ -56,25 +53,10 @@ class Hypotheses:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Shown:
-    """What the G sensors show without noise, and the noise, for each hypothesis, state and control.
+def shown_by(hypotheses: Hypotheses, value: Float, total_deviation: Float) -> tuple[Float, Float, Float]:
+    """Return mean and variance of what the sensors show, normally distributed, and the variance of noise.
 
-    Attributes
-    ----------
-    mean, variance : (K, S, U, G)
-        Of what is shown, normally distributed.
-    noise2 : (K, S, U, G)
-        Variance of noise and model error.
-    """
-
-    mean: Float
-    variance: Float
-    noise2: Float
-
-
-def shown_by(hypotheses: Hypotheses, value: Float, total_deviation: Float) -> Shown:
-    """Return what the sensors show.
+    Each is (K, S, U, G): of each hypothesis, state and control; the noise has the model error in it.
 
     Parameters
     ----------
@@ -89,36 +71,23 @@ def shown_by(hypotheses: Hypotheses, value: Float, total_deviation: Float) -> Sh
         part[:, None, None]
         for part in (hypotheses.gain, hypotheses.offset, hypotheses.covariance, hypotheses.scale2)
     )
-    return Shown(
-        mean=own * (1.0 + gain) + offset,
-        variance=spread[..., 0] + own * (2.0 * spread[..., 1] + own * spread[..., 2]),
-        noise2=scale2 * total_deviation**2,
-    )
+    mean = own * (1.0 + gain) + offset
+    variance = spread[..., 0] + own * (2.0 * spread[..., 1] + own * spread[..., 2])
+    return mean, variance, np.broadcast_to(scale2 * total_deviation**2, mean.shape)
 
 
-@compiled
-def quantiles_of(
-    weight: Float, mean: Float, deviation: Float, center: Float, spread: Float, levels: Float, result: Float
-) -> None:
-    """Fill result (P, G) with quantiles of mixtures of N normal distributions.
+def quantiles_of(weight: Float, mean: Float, deviation: Float, levels: Float) -> Float:
+    """Return quantiles (P, G) of mixtures of N normal distributions.
 
-    weight is (N,), mean and deviation (G, N); center and spread (G,) are those of the mixtures. Levels lie
-    between 2.5 and 97.5 %.
+    weight is (N,), mean and deviation (N, G). Levels lie between 2.5 and 97.5 %.
     """
-    for g in range(mean.shape[0]):
-        for level in range(len(levels)):
-            low, high = center[g] - REACH * spread[g], center[g] + REACH * spread[g]
-            for _ in range(HALVINGS):
-                middle = 0.5 * (low + high)
-                reached = 0.0
-                for n in range(len(weight)):
-                    z = middle - mean[g, n]
-                    if deviation[g, n] > 0.0:
-                        reached += weight[n] * 0.5 * math.erfc(-z / (deviation[g, n] * ROOT_TWO))
-                    elif z >= 0.0:
-                        reached += weight[n]
-                if reached >= levels[level]:
-                    high = middle
-                else:
-                    low = middle
-            result[level, g] = high
+    center = weight @ mean
+    spread = np.sqrt(weight @ (deviation**2 + (mean - center) ** 2))
+    low, high = (np.tile(center + side * REACH * spread, (len(levels), 1)) for side in (-1.0, 1.0))
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        distance = middle[:, None] - mean
+        below = ndtr(np.divide(distance, deviation, out=np.copysign(np.inf, distance), where=deviation > 0.0))
+        over = np.einsum("n,png->pg", weight, below) >= levels[:, None]
+        low, high = np.where(over, low, middle), np.where(over, middle, high)
+    return high

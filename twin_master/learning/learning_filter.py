@@ -5,15 +5,7 @@ stay what they are. Each has a filter of its own over the states, and its weight
 
     p(D_t, k | o_0..o_t) ~ p(o_t | D_t, k, o_0..o_t-1) sum over i of T_k[i, D_t] p(D_t-1 = i, k | o_0..o_t-1),
 
-which is exact. What a gauge g has of its own, given the hypothesis, is a regression with the noise scale:
-
-    o_g = h_g(D_t, k) (1 + gain_g) + offset_g + lambda_g sigma_g noise,
-    lambda_g² ~ inverse gamma(degrees / 2, degrees / 2),
-    offset_g, gain_g | lambda_g ~ N(0, lambda_g² times their prior variance),
-
-so that the predictive density is Student's (Gelman et al., Bayesian Data Analysis, 3rd ed., section 14.2).
-Its sums are exact given the path of the state; over the paths they are expected sums, under the filtered
-belief of each turn given the hypothesis.
+which is exact. What a gauge has of its own, given the hypothesis, is a `GaugeRegression`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,24 +14,17 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaincinv, gammaln
+from scipy.special import gammaincinv, gammaln, logsumexp
 
-from twin_master.errors import InvalidModelError
+from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.learning.hypotheses import Hypotheses, shown_by
-from twin_master.learning.kernels import (
-    forecast_all,
-    gauge_statistics,
-    log_likelihood,
-    normalise,
-    regression,
-)
 from twin_master.learning.posterior import INTERVAL, DrawsPosterior
+from twin_master.learning.regression import GaugeRegression
 from twin_master.network.estimator import Carried, Estimate, Learnt
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import ObservationContext
-from twin_master.network.kernels import backward_pass
+from twin_master.network.inference import log_forecast, smooth_many
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.network.transition import SparseTransition
+from twin_master.network.transition import TransitionModel
 
 __all__ = ["LearningFilter", "LearntPriors"]
 
@@ -112,7 +97,7 @@ class LearningFilter:
     sensor_model : GaussianSensorModel
         Predictions (E, S, U, G), weights of the draws, and the noise that is assumed.
     priors : LearntPriors
-    transitions : sequence of (U, S, S), optional
+    transitions : sequence of TransitionModel, optional
         Transitions for each of `transition_factors`; those of the model if there is one factor.
     name : str
         Name of the twin, for messages.
@@ -128,7 +113,7 @@ class LearningFilter:
         model: GraphicalModel,
         sensor_model: GaussianSensorModel,
         priors: LearntPriors,
-        transitions: Sequence[ArrayLike] | None = None,
+        transitions: Sequence[TransitionModel] | None = None,
         name: str = "twin",
     ) -> None:
         if sensor_model.averages_inside:
@@ -136,53 +121,36 @@ class LearningFilter:
                 "learning needs the average over the draws outside the product over the sensors: inside, "
                 "each sensor has a parameter of its own"
             )
-        matrices = [np.asarray(item) for item in (transitions or [model.transition.matrix])]
-        if len(matrices) != len(priors.transition_factors):
+        moves = transitions or [model.transition]
+        if len(moves) != len(priors.transition_factors):
             raise InvalidModelError(
                 f"expected one transition table for each of {len(priors.transition_factors)} factors, "
-                f"got {len(matrices)}"
+                f"got {len(moves)}"
             )
-        self._model, self._sensor_model, self._name = model, sensor_model, name
+        self.model, self.sensor_model, self._name = model, sensor_model, name
         self.priors = priors
-        draws, factors, sensors = sensor_model.draw_count, len(matrices), sensor_model.sensor_count
-        self._sparse = SparseTransition.from_matrix(np.concatenate(matrices))
+        draws, factors, sensors = sensor_model.draw_count, len(moves), sensor_model.sensor_count
+        blocks = zip(*(move.blocks for move in moves), strict=True)
+        self._transition = TransitionModel(tuple(map(np.concatenate, blocks)))  # one factor after the other
         self._draw: Index = np.tile(np.arange(draws), factors)
-        self._factor: Index = np.repeat(np.arange(factors), draws)
-        weight = np.tile(sensor_model.draw_weight / factors, factors)
+        self._first_control: Index = np.repeat(np.arange(factors), draws) * len(model.controls)
         with np.errstate(divide="ignore"):
-            self._log_weight: Float = np.log(weight)
-        self._value = [
-            np.ascontiguousarray(sensor_model.value_per_draw[:, :, control])
-            for control in range(sensor_model.control_count)
-        ]
-        self._inverse = [
-            np.ascontiguousarray(1.0 / sensor_model.independent_standard_deviation[:, control])
-            for control in range(sensor_model.control_count)
-        ]
-        self._log_scale = [np.log(scale) for scale in self._inverse]
-        self._gain: Float = np.broadcast_to(np.asarray(priors.gain, np.float64), (sensors,)).copy()
-        self._offset: Float = np.broadcast_to(np.asarray(priors.offset, np.float64), (sensors,)).copy()
-        self._regresses = bool(np.any(self._gain > 0.0) or np.any(self._offset > 0.0))
-        self._learns_gauges = self._regresses or priors.noise_degrees > 0.0
+            self._log_weight: Float = np.log(np.tile(sensor_model.draw_weight / factors, factors))
+        self._inverse = 1.0 / sensor_model.independent_standard_deviation
+        offset, gain = (
+            np.broadcast_to(np.asarray(prior, np.float64), (sensors,)).copy()
+            for prior in (priors.offset, priors.gain)
+        )
+        self._gauges = GaugeRegression(offset, gain, priors.noise_degrees)
         self._of_draws = (
             None if priors.draws is None else DrawsPosterior(priors.draws, sensor_model.draw_weight)
         )
         self._of_factors = DrawsPosterior(priors.transition_factors, np.full(factors, 1.0 / factors))
 
     @property
-    def model(self) -> GraphicalModel:
-        """States, controls, prior and transitions."""
-        return self._model
-
-    @property
-    def sensor_model(self) -> GaussianSensorModel:
-        """Predictions and assumed noise."""
-        return self._sensor_model
-
-    @property
     def prior(self) -> Mapping[str, Learnt]:
         """What is believed of all that is learnt before the first observation, by name."""
-        sensors = self._sensor_model.sensor_count
+        sensors = self.sensor_model.sensor_count
         weight = np.exp(self._log_weight)[:, None]
         return self._learnt(weight, np.zeros((len(weight), sensors, 6)), np.zeros(sensors))
 
@@ -192,23 +160,26 @@ class LearningFilter:
         See `Estimator.turn`; `learnt` of the estimate holds by name the parameter, `transition_factor`,
         and `noise_scale[g]`, `gauge_gain[g]`, `gauge_offset[g]` for the sensors g from 1.
         """
-        seen, told = self._sensor_model.apart(observation)
+        seen, told = self.sensor_model.apart(observation)
         forecast, statistics, count = self._forecast(before)
-        near = self._sensor_model.nearest(seen, control_index, self._value[control_index])
+        value, inverse = (
+            self.sensor_model.value_per_draw[:, :, control_index],
+            self._inverse[:, control_index],
+        )
+        near = self.sensor_model.nearest(seen, control_index, value)
         log_belief = forecast + told + near.log_density[self._draw]
-        log_belief += self._log_likelihood(seen, near.value, control_index, statistics, count)
-        filtered = np.empty_like(log_belief)
-        evidence = normalise(log_belief, filtered)
+        log_belief += self._gauges.log_density(seen, near.value[self._draw], inverse, statistics, count)
+        evidence = float(logsumexp(log_belief))
         if evidence == -np.inf:
-            raise ObservationContext(
-                self._name, turn, lambda _turn: self._sensor_model.worst_residuals(seen, control_index)
-            ).impossible(0)
-        statistics = statistics.copy()
-        if self._learns_gauges:
-            gauge_statistics(
-                seen, self._draw, near.alone, self._inverse[control_index] * np.sqrt(near.left),
-                self._offset, self._gain, log_belief, statistics,
-            )  # fmt: skip
+            worst = self.sensor_model.worst_residuals(seen, control_index)
+            raise ImpossibleObservation(self._name, turn, worst)
+        log_belief -= evidence
+        filtered = np.exp(log_belief)
+        if self._gauges.learns:
+            log_share = logsumexp(log_belief, axis=1, keepdims=True)
+            given = np.exp(log_belief - np.where(np.isfinite(log_share), log_share, 0.0))
+            scale = inverse * np.sqrt(near.left)
+            statistics = statistics + self._gauges.told(seen, near.alone[self._draw], scale, given)
         count = count + ~np.isnan(seen)
         arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}
         return Estimate(
@@ -222,35 +193,15 @@ class LearningFilter:
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
         """Return log p(D_t, k | o_0..o_t-1) (K, S), and statistics (K, G, 6) and counts (G,) until then."""
-        hypotheses, sensors = len(self._draw), self._sensor_model.sensor_count
+        hypotheses, sensors = len(self._draw), self.sensor_model.sensor_count
         if before is None:
-            forecast = self._log_weight[:, None] + self._model.log_prior
+            forecast = self._log_weight[:, None] + self.model.log_prior
             return forecast, np.zeros((hypotheses, sensors, 6)), np.zeros(sensors)
         log_before = before.arrays["log_belief"]
-        forecast = np.empty_like(log_before)
-        size, controls = self._model.states.size, len(self._model.controls)
-        forecast_all(
-            log_before, (self._factor * controls + before.control_index) * size, self._sparse.start,
-            self._sparse.source, self._sparse.probability, self._sparse.log_probability, forecast,
-        )  # fmt: skip
+        forecast = log_forecast(self._transition, self._first_control + before.control_index, log_before)
         if self.priors.parameter is None:
             forecast = self._averaged_anew(forecast)
         return forecast, before.arrays["statistics"], before.arrays["count"]
-
-    def _log_likelihood(
-        self, observation: Float, value: Float, control_index: int, statistics: Float, count: Float
-    ) -> Float:
-        """Return log p(o_t | D_t, k, o_0..o_t-1) for each hypothesis and state: (K, S)."""
-        fitted = np.zeros_like(statistics)
-        if self._learns_gauges:
-            regression(statistics, fitted)
-        result = np.empty((len(self._draw), self._model.states.size))
-        log_likelihood(
-            observation, self._draw, value, self._inverse[control_index],
-            self._log_scale[control_index], self._offset, self._gain, fitted, count,
-            self.priors.noise_degrees, result,
-        )  # fmt: skip
-        return result
 
     def hypotheses(self, carried: Carried) -> Hypotheses:
         """Return what is believed of each hypothesis after a turn."""
@@ -258,10 +209,8 @@ class LearningFilter:
         return self._hypotheses(np.exp(arrays["log_belief"]), arrays["statistics"], arrays["count"])
 
     def _hypotheses(self, weight: Float, statistics: Float, count: Float) -> Hypotheses:
-        fitted = np.zeros_like(statistics)
-        if self._learns_gauges:
-            regression(statistics, fitted)
-        scale2, offset, gain = self._scale2(fitted, count), self._offset, self._gain
+        fitted = self._gauges.fitted(statistics)
+        scale2, offset, gain = self._gauges.scale2(fitted, count), self._gauges.offset, self._gauges.gain
         covariance = np.stack(
             [offset**2 * fitted[..., 2], offset * gain * fitted[..., 3], gain**2 * fitted[..., 4]], axis=-1
         )
@@ -270,29 +219,18 @@ class LearningFilter:
             scale2[..., None] * covariance, scale2,
         )  # fmt: skip
 
-    def _scale2(self, fitted: Float, count: Float) -> Float:
-        """Return the posterior mean of the squared noise scale of each hypothesis and sensor: (K, G)."""
-        degrees = self.priors.noise_degrees
-        if not degrees > 0.0:
-            return np.ones_like(fitted[..., 5])
-        return np.asarray((degrees + fitted[..., 5]) / np.maximum(degrees + count - 2.0, 1.0))
-
     def _expected(
         self, filtered: Float, statistics: Float, count: Float, control: int
     ) -> tuple[Float, Float]:
         """Return for each sensor what it shows in the mean, and the deviation of its noise: two of (G,)."""
         own = self._hypotheses(filtered, statistics, count).counting(filtered)
-        model = self._sensor_model
+        model = self.sensor_model
         in_force = slice(control, control + 1)
-        shown = shown_by(
+        mean, _, noise2 = shown_by(
             own, model.value_per_draw[:, :, in_force], model.total_standard_deviation[:, in_force]
         )
         weight = own.weight.ravel() / own.weight.sum()
-        mean, noise2 = (
-            weight @ np.broadcast_to(part, shown.mean.shape).reshape(weight.size, -1)
-            for part in (shown.mean, shown.noise2)
-        )
-        return mean, np.sqrt(noise2)
+        return weight @ mean.reshape(weight.size, -1), np.sqrt(weight @ noise2.reshape(weight.size, -1))
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
@@ -300,36 +238,26 @@ class LearningFilter:
 
     def smoothed_hypotheses(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_i, k | o_0..o_t) for the turns i of `carried`, which end at t: (n, K, S)."""
-        size, controls = self._model.states.size, len(self._model.controls)
-        result = np.zeros((len(carried), len(self._draw), size))
+        result = np.zeros((len(carried), len(self._draw), self.model.states.size))
         if not len(carried):
             return result
         rows = np.array([turn.arrays["log_belief"] for turn in carried])  # (n, K, S)
-        control = np.array([turn.control_index for turn in carried], dtype=np.int64)
         if self.priors.parameter is None and len(self._draw) > 1:
             rows = np.stack([self._averaged_anew(row) for row in rows])
         weight = np.exp(rows[-1]).sum(axis=1)
-        for k in np.flatnonzero(weight > 0.0):
-            own = np.ascontiguousarray(rows[:, k])
-            with np.errstate(over="ignore"):
-                own = own - np.logaddexp.reduce(own, axis=1, keepdims=True)
-            part = np.empty_like(own)
-            backward_pass(
-                self._sparse.start, self._sparse.source, self._sparse.probability,
-                self._sparse.log_probability, control + self._factor[k] * controls, np.exp(own), own, part,
-            )  # fmt: skip
-            result[:, k] = weight[k] * part
+        held = np.flatnonzero(weight > 0.0)
+        own = rows[:, held] - logsumexp(rows[:, held], axis=2, keepdims=True)
+        control = self._first_control[held, None] + np.array([turn.control_index for turn in carried])
+        parts = smooth_many(self._transition, control, np.ascontiguousarray(own.swapaxes(0, 1)))
+        result[:, held] = weight[held, None] * parts.swapaxes(0, 1)
         return result
 
     def _averaged_anew(self, log_belief: Float) -> Float:
         """Return a belief (K, S) in which the draws have their first weights again, whatever the state."""
         factors = len(self.priors.transition_factors)
         by_factor = log_belief.reshape(factors, -1, log_belief.shape[1])
-        merged = np.logaddexp.reduce(by_factor, axis=1)
-        with np.errstate(divide="ignore"):
-            log_draw = np.log(self._sensor_model.draw_weight)
-        result: Float = (merged[:, None] + log_draw[None, :, None]).reshape(log_belief.shape)
-        return result
+        merged = np.repeat(np.logaddexp.reduce(by_factor, axis=1), by_factor.shape[1], axis=0)
+        return np.asarray(merged + self._log_weight[:, None] + np.log(factors))
 
     def _learnt(self, filtered: Float, statistics: Float, count: Float) -> Mapping[str, Learnt]:
         """Return the posterior of everything that is learnt."""
@@ -342,16 +270,14 @@ class LearningFilter:
         if len(factors) > 1:
             own = weight.reshape(len(factors), -1).sum(axis=1)
             result["transition_factor"] = self._of_factors.of(own)
-        if self._learns_gauges:
+        if self._gauges.learns:
             result |= self._learnt_of_gauges(weight, statistics, count)
         return result
 
     def _learnt_of_gauges(self, weight: Float, statistics: Float, count: Float) -> dict[str, Learnt]:
-        fitted = np.empty_like(statistics)
-        regression(statistics, fitted)
-        degrees = self.priors.noise_degrees
+        fitted, degrees = self._gauges.fitted(statistics), self._gauges.degrees
         result: dict[str, Learnt] = {}
-        scale2 = self._scale2(fitted, count)
+        scale2 = self._gauges.scale2(fitted, count)
         if degrees > 0.0:
             shape, left = 0.5 * (degrees + count), weight @ (degrees + fitted[..., 5])
             # The square is inverse gamma (shape, left / 2): its quantiles, and the moments of its root.
@@ -363,8 +289,8 @@ class LearningFilter:
                     float(mean[g]), float(deviation[g]), float(low[g]), float(high[g])
                 )
         for column, prior, name, unit in (
-            (0, self._offset, "gauge_offset", self.priors.sensor_unit),
-            (1, self._gain, "gauge_gain", "1"),
+            (0, self._gauges.offset, "gauge_offset", self.priors.sensor_unit),
+            (1, self._gauges.gain, "gauge_gain", "1"),
         ):
             mean = weight @ fitted[..., column]
             spread = weight @ (fitted[..., column] ** 2 + scale2 * fitted[..., 2 + 2 * column]) - mean**2

@@ -20,22 +20,15 @@ from numpy.typing import NDArray
 
 from twin_master.errors import InvalidModelError
 from twin_master.learning import switching
-from twin_master.learning.monitor_kernels import (
-    forecast_rows,
-    mix_onset,
-    weigh_gauges,
-    weigh_model,
-    weigh_none,
-)
-from twin_master.learning.monitor_settings import MonitorSettings, Words
+from twin_master.learning.rivals import Shown, mix_onset, weigh_gauges, weigh_model, weigh_none
 from twin_master.learning.switching import GAUGES, MENDED, NONE
+from twin_master.learning.words import Words
 from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
-from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.scenario.notice import MOST_DRAWS
+from twin_master.scenario.notice import MOST_DRAWS, Noticing
 
-__all__ = ["MonitorSettings", "WatchfulEstimator", "Words"]
+__all__ = ["WatchfulEstimator", "Words"]
 
 Float = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
@@ -73,7 +66,7 @@ class WatchfulEstimator:
         Predictions (E, S, U, G) and assumed noise.
     draws : (E,)
         Values of the parameter.
-    settings : MonitorSettings, optional
+    settings : Noticing, optional
     words : Words, optional
 
     Raises
@@ -87,7 +80,7 @@ class WatchfulEstimator:
         inner: Estimator,
         sensor_model: GaussianSensorModel,
         draws: Float,
-        settings: MonitorSettings | None = None,
+        settings: Noticing | None = None,
         words: Words | None = None,
     ) -> None:
         if sensor_model.averages_inside:
@@ -95,8 +88,8 @@ class WatchfulEstimator:
                 "noticing needs the average over the draws outside the product over the sensors: inside, "
                 "each sensor has a parameter of its own"
             )
-        self._inner, self._sensor_model = inner, sensor_model
-        self._settings = settings = settings or MonitorSettings()
+        self._inner, self._sensor_model, self.model = inner, sensor_model, inner.model
+        self._settings = settings = settings or Noticing()
         self._words = words or Words()
         places, self._draw_weight = _spread(np.asarray(draws, np.float64), sensor_model.draw_weight)
         table, deviation = sensor_model.value_per_draw[places], sensor_model.total_standard_deviation
@@ -114,7 +107,7 @@ class WatchfulEstimator:
         controls = range(sensor_model.control_count)
         self._value = [np.ascontiguousarray(table[:, :, u]) for u in controls]
         independent = sensor_model.independent_standard_deviation
-        self._inverse = [np.ascontiguousarray(1.0 / independent[:, u]) for u in controls]
+        self._inverse = [1.0 / independent[:, u] for u in controls]
         reach = settings.absurd_deviations * deviation
         self._low = (sensor_model.value_per_draw.min(axis=0) - reach).min(axis=0)  # (U, G)
         self._high = (sensor_model.value_per_draw.max(axis=0) + reach).max(axis=0)
@@ -126,11 +119,6 @@ class WatchfulEstimator:
         of_gauges = np.repeat(self._log_prior - np.log(len(_GAINS)), len(_GAINS))
         self._begins: Float = np.log(0.5) + np.concatenate([[-np.inf, -np.inf, 0.0], of_gauges])
         self._names = tuple(f"{self._words.sensors([g])} off" for g in range(sensors))
-
-    @property
-    def model(self) -> GraphicalModel:
-        """States, controls, prior and transitions."""
-        return self._inner.model
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S).
@@ -201,7 +189,7 @@ class WatchfulEstimator:
         weight = np.log(_FROM_THE_START)
         return {
             "model": model,
-            "gauge": np.broadcast_to(model, self._shape).astype(np.float32),
+            "gauge": np.broadcast_to(model, self._shape).astype(np.float32, order="C"),
             "none": model[None].astype(np.float32),
             "mended": model.copy(),
             "share": switching.at_first(2.0 * self._settings.prior * _FROM_THE_START, self._begins),
@@ -224,29 +212,20 @@ class WatchfulEstimator:
     def _advanced(self, before: Carried) -> Arrays:
         """Return what was carried, one transition later, with the rivals that begin in this turn."""
         own = self._unpacked(before.arrays)
-        sparse, states = self.model.transition.sparse, self._shape[-1]
         for name in ("model", "gauge", "none", "mended"):
-            rows, own[name] = own[name].reshape(-1, states), np.empty_like(own[name])
-            forecast_rows(
-                sparse.start, sparse.source, sparse.probability, before.control_index * states,
-                rows, own[name].reshape(-1, states),
-            )  # fmt: skip
+            rows = own[name].reshape(-1, self._shape[-1])
+            held = rows.any(axis=1)  # draws may be left out
+            rows[held] = self.model.transition.forward(before.control_index, rows[held])
         turn = float(own["turns"][0])
         inflow = np.log(self._to_begin(turn - 1.0) - self._to_begin(turn))
-        gains = self._shape[1]
-        keep = np.empty(self._shape[:2])
-        mix_onset(
-            own["model"], own["gauge"].reshape(-1, *self._shape[2:]), own["log_gauge"].reshape(-1),
-            np.full(keep.size, inflow - np.log(gains)), turn, own["gauge_onset"].reshape(-1),
-            keep.reshape(-1),
-        )  # fmt: skip
+        gauges = own["gauge"].reshape(-1, *self._shape[2:])
+        weight, onset = own["log_gauge"].reshape(-1), own["gauge_onset"].reshape(-1)
+        keep = mix_onset(own["model"], gauges, weight, inflow - np.log(self._shape[1]), turn, onset)
+        keep = keep.reshape(self._shape[:2])
         fading = np.exp(-1.0 / self._settings.memory_turns)
         own["gauge_sums"] *= fading * keep[..., None]
         own["gauge_squares"] = keep * own["gauge_squares"] + (1.0 - keep) * own["model_squares"][:, None]
-        kept = np.empty(1)
-        mix_onset(
-            own["model"], own["none"], own["log_none"], np.full(1, inflow), turn, own["none_onset"], kept
-        )
+        kept = mix_onset(own["model"], own["none"], own["log_none"], inflow, turn, own["none_onset"])
         statistics, fresh = own["none_statistics"], 1.0 - kept[0]
         statistics[:, 0] += fresh * (_FREE - statistics[:, 0])
         statistics[:, [1, 4]] += fresh * (own["model_squares"][:, None] - statistics[:, [1, 4]])
@@ -301,29 +280,30 @@ class WatchfulEstimator:
         # By the noise that is learnt: else a gauge that is off would pull the place, and with it all others.
         precision = np.minimum((degrees + count) / (degrees + own["model_squares"]), 1.0)
         near = self._sensor_model.nearest(seen, control_index, self._value[control_index], precision)
-        near.log_density[:] += told
-        value, inverse = near.value, self._inverse[control_index]
-        known, log_likelihood = np.ones(value.shape), near.log_density.copy()
+        inverse, there = np.where(np.isnan(seen), 0.0, self._inverse[control_index]), ~np.isnan(seen)
+        size = (near.value * inverse).reshape(-1, len(seen))
+        residual = (np.where(there, seen - near.value, 0.0) * inverse).reshape(size.shape)
+        shown = Shown(there, residual, size, 0.5 * (degrees + count + 1.0), degrees)
+        prior = near.log_density + told + np.log(inverse[:, there]).sum(axis=1)
         before, mended = own["model_squares"].copy(), own["mended_squares"].copy()
-        ratio = np.zeros_like(own["share"])
-        ratio[MENDED] = weigh_model(
-            seen, value, inverse, degrees, count, own["mended_squares"], own["mended"], known, log_likelihood
-        ) + 0.5 * np.sum(np.log((degrees + before) / (degrees + mended)), where=~np.isnan(seen))
-        of_gauges, log_likelihood = own["log_gauge"].copy(), near.log_density
-        log_model = weigh_model(
-            seen, value, inverse, degrees, count, own["model_squares"], own["model"], known, log_likelihood
-        )
-        weigh_gauges(
-            seen, value, inverse, self._gains, self._reach, degrees, count, before, known, log_likelihood,
-            log_model, own["gauge"], own["log_gauge"], own["gauge_squares"], own["gauge_sums"],
-        )  # fmt: skip
-        log_none = weigh_none(
-            seen, value, inverse, self._settings.all_gain, degrees, count, before, known, log_likelihood,
-            own["none"][0], own["none_statistics"],
-        )  # fmt: skip
+        log_mended, _ = weigh_model(shown, own["mended_squares"], own["mended"].reshape(-1), prior.flatten())
+        log_mended += 0.5 * np.sum(np.log((degrees + before) / (degrees + mended)), where=there)
+        log_likelihood = prior.flatten()
+        log_model, known = weigh_model(shown, own["model_squares"], own["model"].reshape(-1), log_likelihood)
+        of_model = before, known, log_likelihood
+        gauges = own["gauge"].reshape(-1, len(size))
+        with np.errstate(divide="ignore"):  # what is ruled out has the logarithm minus infinity
+            log_gauges = weigh_gauges(
+                shown, self._gains, self._reach, *of_model, gauges, own["gauge_squares"], own["gauge_sums"]
+            )
+            log_none = weigh_none(
+                shown, self._settings.all_gain, *of_model, own["none"].reshape(-1), own["none_statistics"]
+            )
+        own["log_gauge"] += log_gauges - log_model
         own["log_none"] += log_none - log_model
-        ratio[MENDED] -= log_model
-        ratio[NONE], ratio[GAUGES:] = log_none - log_model, (own["log_gauge"] - of_gauges).ravel()
+        ratio = np.zeros_like(own["share"])
+        ratio[MENDED], ratio[NONE] = log_mended - log_model, log_none - log_model
+        ratio[GAUGES:] = (log_gauges - log_model).ravel()
         own["share"] += ratio
         own["share"] -= np.logaddexp.reduce(own["share"])
         count += ~np.isnan(seen)

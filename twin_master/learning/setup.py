@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator, Words
+from twin_master.learning.monitor import WatchfulEstimator, Words
 from twin_master.network.estimator import Estimator, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -46,7 +46,7 @@ def scenario_estimator(
         learning or ExactFilter(model, sensor_model, scenario.mission.name),
         sensor_model,
         draws,
-        MonitorSettings(**dict(scenario.notice)),
+        scenario.notice,
         words_of(scenario),
     )
 
@@ -85,5 +85,5 @@ def learning_filter(
         transition_factors=factors,
         sensor_unit=units.pop() if len(units) == 1 else "",
     )
-    tables = [build_graphical_model(scenario, factor).transition.matrix for factor in factors]
+    tables = [build_graphical_model(scenario, factor).transition for factor in factors]
     return LearningFilter(model, sensor_model, priors, tables, scenario.mission.name)

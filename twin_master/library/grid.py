@@ -1,10 +1,8 @@
-"""The grid over which an FMU is sampled, and one process's way through a block of it."""
+"""The grid over which an FMU is sampled, and one worker's way through a block of it."""
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from math import prod
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +27,7 @@ _LONG_BLOCK = 32
 
 @dataclass(frozen=True)
 class SamplingGrid:
-    """What is sampled; plain values, sent to the processes as JSON.
+    """What is sampled; plain values.
 
     Attributes
     ----------
@@ -90,18 +88,6 @@ class SamplingGrid:
         }
         return draw, state, list(self.controls)[control]
 
-    def to_json(self) -> str:
-        """Return the grid as text."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> "SamplingGrid":
-        """Return the grid of a text."""
-        record: dict[str, Any] = json.loads(text)
-        record["draws"] = tuple(record["draws"])
-        record["states"] = {name: tuple(levels) for name, levels in record["states"].items()}
-        return cls(**record)
-
 
 class GridSampler:
     """An FMU that is asked for the observations of blocks of a grid.
@@ -145,13 +131,12 @@ class GridSampler:
             self._start(begin)
             parts.append(self._ask(begin, end))
         values = np.concatenate(parts)
-        if self._grid.settling_steps:
-            self._check_settled(last - 1, values[-1])
-        else:
-            # Once more, with other points in between and in another order; one is enough of a short block.
-            again = {begin, (begin + last) // 2} if last - first >= _LONG_BLOCK else {begin}
-            for index in sorted(again):
-                self._check_memory(index, values[index - first])
+        # Once more, with other points in between and in another order; one is enough of a short block.
+        again = {last - 1} if self._grid.settling_steps else {begin}
+        if not self._grid.settling_steps and last - first >= _LONG_BLOCK:
+            again.add((begin + last) // 2)
+        for index in sorted(again):
+            self._check_again(index, values[index - first])
         return values
 
     def _start(self, index: int) -> None:
@@ -204,27 +189,26 @@ class GridSampler:
             parts.append(f"{grid.parameter} = {grid.draws[draw]:g}")
         return ", ".join(parts)
 
-    def _check_memory(self, index: int, before: Float) -> None:
+    def _check_again(self, index: int, before: Float) -> None:
+        """Ask for a point once more: an FMU without memory shows the same, one that has settled nearly so."""
+        steps = self._grid.settling_steps
         again = self._ask(index, index + 1)[0]
         change = np.abs(again - before)
-        if np.any(change > MEMORY_TOLERANCE * np.maximum(np.abs(before), np.abs(again))):
-            worst = int(np.argmax(change))
+        tolerance = SETTLED_TOLERANCE if steps else MEMORY_TOLERANCE
+        if not np.any(change > tolerance * np.maximum(np.abs(before), np.abs(again))):
+            return
+        worst = int(np.argmax(change))
+        shown = f"{self._sensor(worst)} = {before[worst]:.9g}"
+        if steps:
             raise InvalidObservationLibraryError(
-                f"the FMU {self._grid.fmu} remembers earlier steps: at {self._name(index)} it shows "
-                f"{self._sensor(worst)} = {before[worst]:.9g} and, on a later visit, {again[worst]:.9g}. "
-                "Give --settle STEPS, in which it settles from a fresh start at each point."
+                f"the FMU {self._grid.fmu} has not settled after {steps} steps: at {self._name(index)} it "
+                f"shows {shown}, and as many steps later {again[worst]:.9g}. Give a larger --settle."
             )
-
-    def _check_settled(self, index: int, before: Float) -> None:
-        after = self._ask(index, index + 1)[0]
-        change = np.abs(after - before)
-        if np.any(change > SETTLED_TOLERANCE * np.maximum(np.abs(before), np.abs(after))):
-            worst = int(np.argmax(change))
-            raise InvalidObservationLibraryError(
-                f"the FMU {self._grid.fmu} has not settled after {self._grid.settling_steps} steps: at "
-                f"{self._name(index)} it shows {self._sensor(worst)} = {before[worst]:.9g}, and as many "
-                f"steps later {after[worst]:.9g}. Give a larger --settle."
-            )
+        raise InvalidObservationLibraryError(
+            f"the FMU {self._grid.fmu} remembers earlier steps: at {self._name(index)} it shows {shown} and, "
+            f"on a later visit, {again[worst]:.9g}. Give --settle STEPS, in which it settles from a fresh "
+            "start at each point."
+        )
 
     def _sensor(self, sensor: int) -> str:
         return self._asset.binding.observation[self._grid.role].variables[sensor]

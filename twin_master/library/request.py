@@ -10,10 +10,10 @@ import numpy as np
 
 from fmu_asset.door.binding import Binding, load_binding
 from reporting.progress import Progress
-from twin_master.assets.asset_source import AssetBelief, PairedSource
+from twin_master.assets.asset_source import BINDING_COPY, AssetBelief, PairedSource
 from twin_master.assets.coupled_source import SeveralSource
 from twin_master.assets.design_source import DesignBelief
-from twin_master.assets.fmu_source import BINDING_COPY, FMU_COPY, FmuSource
+from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.library_source import LibraryBelief
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import InvalidObservationLibraryError

@@ -4,36 +4,42 @@ import itertools
 import json
 import os
 import shutil
+import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuError
 from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftovers, write_error
 from reporting.json_file import parse_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file
-from twin_master.assets.observation_library import ObservationLibrary, write_observation_library
-from twin_master.errors import InvalidObservationLibraryError
-from twin_master.library.grid import Float, SamplingGrid
-from twin_master.library.worker import SamplingProcess
-from twin_master.network.graphical_model import Factor, StateSpace
+from twin_master.assets.observation_library import (
+    FORMAT,
+    KIND,
+    RESERVED,
+    ObservationLibrary,
+    write_observation_library,
+)
+from twin_master.errors import InvalidObservationLibraryError, TwinMasterError, check_names
+from twin_master.library.grid import Float, GridSampler, SamplingGrid
 from twin_master.network.memory import NUMBER, check_fits
 
 PLAN_NAME = "grid.json"
 _COPIES = 3  # of what was sampled: the blocks, all of them, and the library
-_AHEAD = 2  # blocks that a process has been asked for, so that it need not wait for its parent
 
 
 @dataclass(frozen=True)
@@ -92,7 +98,7 @@ def sample_library(
     out : Path
         The NetCDF file. Finished blocks are kept in the folder `blocks_folder(out)` until it is written.
     workers : int, optional
-        Number of processes; by default one for each processor.
+        Number of FMUs, each in a process; by default one for each processor.
     resume : bool
         Go on with the finished blocks of an interrupted sampling of the same grid.
     replace_existing : bool
@@ -133,59 +139,67 @@ def sample_library(
                 found[number] = values
                 stage.advance(1)
         seconds = time.perf_counter() - begin
-        library = _library(grid, binding, record, np.concatenate([found[n] for n in sorted(found)]))
+        rows = np.concatenate([found[number] for number in sorted(found)])
+        library = ObservationLibrary(sampled_dataset(grid, binding, record, rows))
         write_observation_library(out, library)
         shutil.rmtree(folder, ignore_errors=True)
     return SamplingOutcome(out, library, len(grid.blocks) - len(todo), len(grid.blocks), count, seconds)
 
 
 def _sampled(grid: SamplingGrid, todo: list[int], count: int) -> Iterator[tuple[int, Float]]:
-    """Yield number and observations of each block as they come."""
-    waiting = list(reversed(todo))
-    workers: list[SamplingProcess] = []
+    """Yield number and observations of each block as they come; each thread waits for an FMU of its own."""
+    own = threading.local()
+    samplers: list[GridSampler] = []
+    failures: list[BaseException] = []
+
+    def sample(number: int) -> tuple[int, Float | None]:
+        try:
+            if not failures:
+                if not hasattr(own, "sampler"):
+                    own.sampler = GridSampler(grid)
+                    samplers.append(own.sampler)
+                return number, own.sampler.block(*grid.blocks[number])
+        except (FmuError, TwinMasterError, OSError) as error:  # what came before is kept
+            failures.append(error)
+        return number, None
+
+    pool = ThreadPoolExecutor(count)
     try:
-        if todo:
-            workers.extend(SamplingProcess(grid) for _ in range(count))
-        while True:
-            for _ in range(_AHEAD):  # one each before anyone has two
-                for worker in workers:
-                    if waiting and worker.load < _AHEAD:
-                        number = waiting.pop()
-                        worker.ask(number, *grid.blocks[number])
-            busy = {worker.connection: worker for worker in workers if worker.load}
-            if not busy:
-                return
-            for connection in wait(list(busy)):
-                worker = busy[connection]  # type: ignore[index]
-                result = worker.take()
-                if waiting and worker.load < _AHEAD:  # before the block is written
-                    number = waiting.pop()
-                    worker.ask(number, *grid.blocks[number])
-                yield result
+        for done in as_completed([pool.submit(sample, number) for number in todo]):
+            number, values = done.result()
+            if values is not None:
+                yield number, values
+        if failures:
+            raise failures[0]
+    except BaseException as error:
+        failures.append(error)
+        raise
     finally:
-        for worker in workers:
-            worker.close()
+        for sampler in samplers:
+            sampler.close()
+        pool.shutdown(cancel_futures=True)
 
 
 def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
     """Check names against the binding and the binding against the FMU, before anything is started."""
-    wanted: dict[str, tuple[Iterable[str], Mapping[str, object]]] = {
-        "state": (grid.states, binding.health),
-        "control input": (next(iter(grid.controls.values()), {}), binding.control),
-        "load": (grid.load, binding.load),
-        "parameter": ([*grid.parameters, *([grid.parameter] if grid.parameter else [])], binding.parameter),
-    }
-    for what, (names, known) in wanted.items():
-        unknown = sorted({*names} - {*known})
-        if unknown:
-            raise InvalidObservationLibraryError(
-                f"the grid has the {what} {', '.join(unknown)}, which the binding {binding.name} does not "
-                f"know; it knows {', '.join(known) or 'none'}."
-            )
+    parameters = [*grid.parameters, *([grid.parameter] if grid.parameter else [])]
+    rows = (
+        ("state", grid.states, binding.health),
+        ("control input", next(iter(grid.controls.values()), {}), binding.control),
+        ("load", grid.load, binding.load),
+        ("parameter", parameters, binding.parameter),
+    )
+    check_names("the grid has the", f"the binding {binding.name}", rows, InvalidObservationLibraryError)
     binding.observation_slice(grid.role)
     if not grid.states or not grid.controls or not grid.draws:
         raise InvalidObservationLibraryError(
             "a grid needs at least one state and one control with values: give --grid NAME=VALUES for them."
+        )
+    taken = sorted({*grid.states} & {*RESERVED})
+    if taken:
+        raise InvalidObservationLibraryError(
+            f"a state cannot be called {taken[0]} in an observation library: give it another name in the "
+            "binding."
         )
     for name, levels in grid.states.items():
         if any(b <= a for a, b in itertools.pairwise(levels)):
@@ -202,7 +216,7 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
 
 def _record(grid: SamplingGrid) -> dict[str, Any]:
     """Return what a library is a function of: the grid with hashes in the place of files."""
-    record: dict[str, Any] = json.loads(grid.to_json())
+    record: dict[str, Any] = json.loads(json.dumps(asdict(grid)))
     del record["step_timeout"]
     hashes = {"fmu": hash_file(Path(grid.fmu)), "binding": hash_file(Path(grid.binding))}
     return record | hashes | {"version": version("uav-twin")}
@@ -297,29 +311,44 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _library(grid: SamplingGrid, binding: Binding, record: dict[str, Any], rows: Float) -> ObservationLibrary:
-    vector = binding.observation[grid.role]
-    states = StateSpace(tuple(Factor(name, levels) for name, levels in grid.states.items()))
-    inputs = list(next(iter(grid.controls.values())))
-    return ObservationLibrary(
-        values=rows.reshape(len(grid.draws), states.size, len(grid.controls), -1),
-        role=grid.role,
-        sensors=vector.variables,
-        sensor_units=vector.units,
-        states=states,
-        state_units=tuple(binding.health[name].unit for name in grid.states),
-        controls=tuple(grid.controls),
-        control_values={
-            name: np.array([control[name] for control in grid.controls.values()]) for name in inputs
-        },
-        control_units={name: binding.control[name].unit for name in inputs},
-        parameter=grid.parameter,
-        parameter_unit=binding.parameter[grid.parameter].unit if grid.parameter else "1",
-        draws=np.array(grid.draws) if grid.parameter else np.array([np.nan]),
-        load=dict(grid.load),
-        parameters=dict(grid.parameters),
-        settling_steps=grid.settling_steps,
-        fmu_hash=record["fmu"],
-        binding_hash=record["binding"],
-        version=record["version"],
+def sampled_dataset(
+    grid: SamplingGrid, binding: Binding, record: Mapping[str, Any], rows: Float
+) -> xr.Dataset:
+    """Return observations (N, G) of a grid as a labelled dataset; each state factor is a dimension."""
+    vector, inputs = binding.observation[grid.role], list(next(iter(grid.controls.values())))
+    units = {name: binding.control[name].unit for name in inputs}
+    of_parameter = {
+        "long_name": grid.parameter or "none",
+        "units": binding.parameter[grid.parameter].unit if grid.parameter else "1",
+    }
+    sensor = {"long_name": f"FMU variable of each value of {grid.role}"}
+    draws = np.array(grid.draws) if grid.parameter else np.array([np.nan])
+    coordinates = {
+        "sensor": xr.Variable("sensor", np.array(vector.variables), sensor),
+        "sensor_unit": xr.Variable("sensor", np.array(vector.units), {"long_name": "unit"}),
+        "control": xr.Variable("control", np.array(list(grid.controls)), {"long_name": "control"}),
+        "parameter_value": xr.Variable("draw", draws, of_parameter),
+    }
+    for name, levels in grid.states.items():
+        about = {"long_name": "state", "units": binding.health[name].unit}
+        coordinates[name] = xr.Variable(name, np.array(levels), about)
+    for name in inputs:
+        about = {"long_name": f"control input {name}", "units": units[name]}
+        values = np.array([control[name] for control in grid.controls.values()])
+        coordinates[f"control_{name}"] = xr.Variable("control", values, about)
+    dimensions = ("draw", *grid.states, "control", "sensor")
+    shown = {"long_name": f"{grid.role} without noise", "units": "see sensor_unit"}
+    records = {"load": dict(grid.load), "parameters": dict(grid.parameters), "control_units": units}
+    attributes: dict[str, Any] = {
+        "kind": KIND,
+        "format": FORMAT,
+        "role": grid.role,
+        "parameter": grid.parameter,
+    }
+    attributes |= {"states": json.dumps(list(grid.states)), "settling_steps": grid.settling_steps}
+    attributes |= {"fmu_sha256": record["fmu"], "binding_sha256": record["binding"]}
+    attributes |= {"uav_twin_version": record["version"]}
+    attributes |= {name: json.dumps(value, sort_keys=True) for name, value in records.items()}
+    return xr.Dataset(
+        {"observation": (dimensions, rows.reshape(*grid.shape, -1), shown)}, coordinates, attributes
     )

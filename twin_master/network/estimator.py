@@ -12,8 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import ObservationContext, filter_step, smooth
+from twin_master.network.inference import filter_step, smooth
 
 __all__ = [
     "Carried",
@@ -241,34 +242,25 @@ class ExactFilter:
     """
 
     def __init__(self, model: GraphicalModel, sensor_model: SensorModel, name: str = "twin") -> None:
-        self._model = model
-        self._sensor_model = sensor_model
-        self._name = name
-
-    @property
-    def model(self) -> GraphicalModel:
-        """States, controls, prior and transitions."""
-        return self._model
+        self.model = model
+        self._sensor_model, self._name = sensor_model, name
 
     def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
         """Advance the belief to turn t and correct it by an observation, see `Estimator.turn`."""
-
-        def worst(_step: int) -> Mapping[str, float]:
+        likelihood = self._sensor_model.log_likelihood(observation, control_index)
+        log_before = None if before is None else before.arrays["log_filtered"]
+        control_before = None if before is None else before.control_index
+        try:
+            step = filter_step(self.model, log_before, control_before, likelihood)
+        except ImpossibleObservation:
             own = getattr(self._sensor_model, "worst_residuals", None)
-            return {} if own is None else dict(own(observation, control_index))
-
-        step = filter_step(
-            self._model,
-            None if before is None else before.arrays["log_filtered"],
-            None if before is None else before.control_index,
-            self._sensor_model.log_likelihood(observation, control_index),
-            ObservationContext(self._name, turn, worst),
-        )
+            worst = None if own is None else own(observation, control_index)
+            raise ImpossibleObservation(self._name, turn, worst) from None
         carried = Carried(control_index, {"log_filtered": step.log_filtered})
-        return Estimate(step.forecast, step.filtered, step.log_evidence, carried)
+        return Estimate(step.forecast, step.filtered, float(step.log_evidence), carried)
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
-        size = self._model.states.size
+        size = self.model.states.size
         rows = np.array([turn.arrays["log_filtered"] for turn in carried]).reshape(-1, size)
-        return smooth(self._model, [turn.control_index for turn in carried], rows).smoothed
+        return smooth(self.model, [turn.control_index for turn in carried], rows).smoothed

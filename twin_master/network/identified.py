@@ -68,7 +68,3 @@ class IdentifiedSensorModel(GaussianSensorModel):
             exponent = np.log(self.draw_weight) - 0.5 * np.sum(white**2, axis=1)
         largest = exponent.max(axis=1)
         return np.asarray(largest + np.log(np.exp(exponent - largest[:, None]).sum(axis=1)) - scale)
-
-    def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
-        """Return the sensors that fit worst; see `GaussianSensorModel`."""
-        return super().worst_residuals(np.asarray(observation)[: self.sensor_count], control_index)

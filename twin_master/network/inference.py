@@ -7,31 +7,29 @@ The order of one turn t: control u_t is in force, the state is D_t, the observat
 Hence D_t follows D_{t-1} through u_{t-1}, and the first state follows the prior.
 """
 
-import os
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.kernels import backward_pass, forward_pass, smooth_many
-from twin_master.network.product_kernels import product_backward_pass, product_forward_pass
+from twin_master.network.kernels import backward_pass, forward_pass, move
+from twin_master.network.transition import TransitionModel
 
 __all__ = [
-    "FilterStep",
     "Filtered",
-    "ObservationContext",
     "Predicted",
     "Smoothed",
+    "filter_many",
     "filter_sequence",
     "filter_step",
     "known_control",
+    "log_forecast",
     "predict",
     "smooth",
-    "smooth_many_twins",
+    "smooth_many",
 ]
 
 Float = NDArray[np.float64]
@@ -39,66 +37,18 @@ Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class ObservationContext:
-    """Who observes, for the message of `ImpossibleObservation`.
-
-    Attributes
-    ----------
-    twin : str
-        Name of the twin.
-    first_step : int
-        Step of the first row of the log-likelihoods.
-    worst_residuals : callable or None
-        Gives, for a step, the names of the worst sensors with their standardised residuals.
-    """
-
-    twin: str = "twin"
-    first_step: int = 0
-    worst_residuals: Callable[[int], Mapping[str, float]] | None = None
-
-    def impossible(self, row: int) -> ImpossibleObservation:
-        """Return the exception for the observation in row `row` of the log-likelihoods."""
-        step = self.first_step + row
-        return ImpossibleObservation(
-            self.twin, step, self.worst_residuals(step) if self.worst_residuals else None
-        )
-
-
-@dataclass(frozen=True)
-class FilterStep:
-    """One filtered step.
-
-    Attributes
-    ----------
-    forecast : (S,)
-        p(D_t | o_0..o_{t-1}): the belief before the observation.
-    filtered : (S,)
-        p(D_t | o_0..o_t).
-    log_filtered : (S,)
-        Its logarithm; carry this to the next step.
-    log_evidence : float
-        log p(o_t | o_0..o_{t-1}).
-    """
-
-    forecast: Float
-    filtered: Float
-    log_filtered: Float
-    log_evidence: float
-
-
-@dataclass(frozen=True)
 class Filtered:
-    """Filtered beliefs of T steps.
+    """Filtered beliefs; the leading axes are twins and steps, as far as there are several.
 
     Attributes
     ----------
-    forecast : (T, S)
-        p(D_t | o_0..o_{t-1}).
-    filtered : (T, S)
+    forecast : (..., S)
+        p(D_t | o_0..o_{t-1}): the belief before the observation.
+    filtered : (..., S)
         p(D_t | o_0..o_t).
-    log_filtered : (T, S)
-        Its logarithm.
-    log_evidence : (T,)
+    log_filtered : (..., S)
+        Its logarithm; carry this to the next step.
+    log_evidence : (...)
         log p(o_t | o_0..o_{t-1}); the sum is the log evidence of all observations.
     """
 
@@ -106,6 +56,10 @@ class Filtered:
     filtered: Float
     log_filtered: Float
     log_evidence: Float
+
+    def __getitem__(self, place: Any) -> "Filtered":
+        """Return the beliefs at a place of the leading axes."""
+        return Filtered(*(np.asarray(values)[place] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -167,44 +121,47 @@ def _checked_rows(model: GraphicalModel, control: Index, rows: ArrayLike, *, wha
     return rows
 
 
-def _forward(
-    model: GraphicalModel,
-    control: Index,
-    log_likelihood: Float,
-    first: int,
-    forecast: Float,
-    filtered: Float,
-    log_filtered: Float,
-    log_evidence: Float,
-) -> int:
-    """Fill the rows from `first` on; return -1, or the row whose observation is impossible."""
-    if model.transition.is_product:
-        levels, row, begin, source, probability, power = model.transition.forward_lists.arrays
-        return product_forward_pass(
-            model.log_prior, levels, row, begin, source, probability, power,
-            control, log_likelihood, first, forecast, filtered, log_filtered, log_evidence,
-        )  # fmt: skip
-    sparse = model.transition.sparse
-    return forward_pass(
-        model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-        control, log_likelihood, first, forecast, filtered, log_filtered, log_evidence,
-    )  # fmt: skip
+def log_forecast(transition: TransitionModel, control: ArrayLike, log_filtered: ArrayLike) -> Float:
+    """Return the logarithms of beliefs (B, S) one transition later, each under its control (B,)."""
+    before = np.array(log_filtered, dtype=np.float64, order="C")
+    after = np.empty_like(before)
+    move(transition.forward_lists.arrays, np.array(control, dtype=np.int64), before, after)
+    return after
 
 
-def _backward(
-    model: GraphicalModel, control: Index, filtered: Float, log_filtered: Float, smoothed: Float
-) -> None:
-    """Fill the smoothed rows."""
-    transition = model.transition
-    if transition.is_product:
-        lists = (*transition.forward_lists.arrays, *transition.backward_lists.arrays[1:])
-        product_backward_pass(*lists, control, filtered, log_filtered, smoothed)
-        return
-    sparse = transition.sparse
-    backward_pass(
-        sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-        control, filtered, log_filtered, smoothed,
-    )  # fmt: skip
+def filter_many(
+    model: GraphicalModel, control: Index, rows: Float, log_first: Float
+) -> tuple[Filtered, Index]:
+    """Filter B twins without any check.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+    control : (B, T)
+    rows : (B, T, S)
+        log p(o_t | D_t, u_t).
+    log_first : (B, S) or (S,)
+        Logarithm of the belief before the first of the observations.
+
+    Returns
+    -------
+    tuple of Filtered, (B,)
+        The latter is -1, or the row whose observation is impossible; the rest of such a twin means nothing.
+    """
+    forecast, filtered, log_filtered = (np.zeros_like(rows) for _ in range(3))
+    log_evidence, failed = np.zeros(rows.shape[:2]), np.empty(len(rows), dtype=np.int64)
+    log_filtered[:, :1] = np.broadcast_to(log_first, (len(rows), rows.shape[2]))[:, None]
+    lists = model.transition.forward_lists.arrays
+    forward_pass(lists, control, rows, forecast, filtered, log_filtered, log_evidence, failed)
+    return Filtered(forecast, filtered, log_filtered, log_evidence), failed
+
+
+def smooth_many(transition: TransitionModel, control: Index, log_filtered: Float) -> Float:
+    """Smooth the filtered beliefs (B, T, S) of B twins under controls (B, T), without any check."""
+    smoothed = np.empty_like(log_filtered)
+    lists = transition.forward_lists.arrays, transition.backward_lists.arrays
+    backward_pass(*lists, control, np.ascontiguousarray(log_filtered), smoothed)
+    return smoothed
 
 
 def filter_step(
@@ -212,8 +169,7 @@ def filter_step(
     previous_log_filtered: ArrayLike | None,
     previous_control_index: int | None,
     log_likelihood: ArrayLike,
-    context: ObservationContext | None = None,
-) -> FilterStep:
+) -> Filtered:
     """Assimilate one observation: Kapteyn et al. 2021, eqs. (2), (28)-(31).
 
     Parameters
@@ -225,8 +181,6 @@ def filter_step(
         Control u_{t-1} that was in force in the step before; None at the first step.
     log_likelihood : (S,)
         log p(o_t | D_t, u_t), zeros when nothing was observed.
-    context : ObservationContext, optional
-        Names the twin if the observation is impossible; its `first_step` is this step.
 
     Raises
     ------
@@ -239,26 +193,22 @@ def filter_step(
         raise InvalidModelError(
             "the previous belief and the previous control go together: give both or neither"
         )
-    first = 0 if previous_control_index is None else 1
-    control = _checked_controls(model, [previous_control_index or 0] * (first + 1))
-    rows = np.zeros((first + 1, model.states.size))
-    rows[first] = _checked_rows(model, control[0], log_likelihood, what="log-likelihood")
-    log_filtered, filtered, forecast = np.empty_like(rows), np.empty_like(rows), np.empty_like(rows)
-    log_evidence = np.empty(first + 1)
+    control = _checked_controls(model, previous_control_index or 0)
+    rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
+    first = model.log_prior
     if previous_log_filtered is not None:
-        log_filtered[0] = _checked_rows(model, control[0], previous_log_filtered, what="previous log belief")
-        np.exp(log_filtered[0], out=filtered[0])
-    failed = _forward(model, control, rows, first, forecast, filtered, log_filtered, log_evidence)
-    if failed >= 0:
-        raise (context or ObservationContext()).impossible(0)
-    return FilterStep(forecast[first], filtered[first], log_filtered[first], float(log_evidence[first]))
+        before = _checked_rows(model, control, previous_log_filtered, what="previous log belief")
+        first = log_forecast(model.transition, control[None], before[None])
+    found, failed = filter_many(model, control[None, None], rows[None, None], first)
+    if failed[0] >= 0:
+        raise ImpossibleObservation("twin", 0)
+    return found[0, 0]
 
 
 def filter_sequence(
     model: GraphicalModel,
     control_index: ArrayLike,
     log_likelihood: ArrayLike,
-    context: ObservationContext | None = None,
 ) -> Filtered:
     """Filter a whole sequence: Kapteyn et al. 2021, eqs. (2), (28)-(31).
 
@@ -269,8 +219,6 @@ def filter_sequence(
         Control u_t in force in each step.
     log_likelihood : (T, S)
         log p(o_t | D_t, u_t), a row of zeros where nothing was observed.
-    context : ObservationContext, optional
-        Names twin and steps if an observation is impossible.
 
     Raises
     ------
@@ -281,12 +229,10 @@ def filter_sequence(
     if control.ndim != 1:
         raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
     rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
-    log_filtered, filtered, forecast = np.empty_like(rows), np.empty_like(rows), np.empty_like(rows)
-    log_evidence = np.empty(len(rows))
-    failed = _forward(model, control, rows, 0, forecast, filtered, log_filtered, log_evidence)
-    if failed >= 0:
-        raise (context or ObservationContext()).impossible(failed)
-    return Filtered(forecast, filtered, log_filtered, log_evidence)
+    found, failed = filter_many(model, control[None], rows[None], model.log_prior)
+    if failed[0] >= 0:
+        raise ImpossibleObservation("twin", int(failed[0]))
+    return found[0]
 
 
 def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayLike) -> Smoothed:
@@ -309,74 +255,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
     if control.ndim != 1:
         raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
     rows = _checked_rows(model, control, log_filtered, what="log belief")
-    smoothed = np.empty_like(rows)
-    _backward(model, control, np.exp(rows), rows, smoothed)
-    return Smoothed(smoothed)
-
-
-def smooth_many_twins(
-    model: GraphicalModel,
-    control_index: ArrayLike,
-    log_likelihood: ArrayLike,
-    context: Callable[[int], ObservationContext] | None = None,
-    workers: int | None = None,
-) -> tuple[Filtered, Smoothed]:
-    """Filter and smooth many independent twins of the same model.
-
-    Parameters
-    ----------
-    model : GraphicalModel
-    control_index : (B, T)
-    log_likelihood : (B, T, S)
-    context : callable, optional
-        Gives the context of twin number b if one of its observations is impossible.
-    workers : int, optional
-        Number of threads; by default the processors of the machine.
-
-    Returns
-    -------
-    tuple of Filtered, Smoothed
-        With a leading axis B.
-
-    Raises
-    ------
-    ImpossibleObservation, InvalidModelError, InvalidObservationError
-        As `filter_step`; the first twin that fails is named.
-    """
-    control = _checked_controls(model, control_index)
-    if control.ndim != 2:
-        raise InvalidModelError(f"expected controls of shape (twins, steps), got {control.shape}")
-    rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
-    forecast, filtered, log_filtered, smoothed = (np.empty_like(rows) for _ in range(4))
-    log_evidence = np.empty(rows.shape[:2])
-    failed = np.empty(len(rows), dtype=np.int64)
-
-    def run(part: slice) -> None:
-        if not model.transition.is_product:
-            sparse = model.transition.sparse
-            smooth_many(
-                model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-                control[part], rows[part], forecast[part], filtered[part], log_filtered[part],
-                log_evidence[part], smoothed[part], failed[part],
-            )  # fmt: skip
-            return
-        for twin in range(len(rows))[part]:
-            failed[twin] = _forward(
-                model, control[twin], rows[twin], 0,
-                forecast[twin], filtered[twin], log_filtered[twin], log_evidence[twin],
-            )  # fmt: skip
-            if failed[twin] < 0:
-                _backward(model, control[twin], filtered[twin], log_filtered[twin], smoothed[twin])
-
-    count = max(1, min(workers or os.cpu_count() or 1, len(rows)))
-    edges = [len(rows) * i // count for i in range(count + 1)]
-    with ThreadPoolExecutor(count) as pool:
-        list(pool.map(run, map(slice, edges[:-1], edges[1:])))
-    if np.any(failed >= 0):
-        twin = int(np.argmax(failed >= 0))
-        found = context(twin) if context else ObservationContext(twin=f"twin {twin}")
-        raise found.impossible(int(failed[twin]))
-    return Filtered(forecast, filtered, log_filtered, log_evidence), Smoothed(smoothed)
+    return Smoothed(smooth_many(model.transition, control[None], rows[None])[0])
 
 
 def predict(
@@ -418,24 +297,11 @@ def predict(
             f"expected a control index between 0 and {controls - 1} and a horizon of 0 or more steps, "
             f"got {control_index} and {horizon}"
         )
-    transition = model.transition
     predicted = np.empty((horizon, size))
-    if transition.is_product:
-        for h in range(horizon):
-            if h == 0:
-                predicted[h] = transition.forward(control_index, belief)
-                continue
-            flows = (transition.forward(u, predicted[h - 1] * policy[:, u]) for u in range(controls))
-            predicted[h] = sum(flows, np.zeros(size))
-    else:
-        matrix = transition.matrix
-        closed_loop = policy[:, 0, None] * matrix[0]
-        for control in range(1, controls):
-            closed_loop += policy[:, control, None] * matrix[control]
-        step = matrix[control_index]
-        for h in range(horizon):
-            np.dot(belief, step, out=predicted[h])
-            belief, step = predicted[h], closed_loop
+    now: Float = belief
+    for h in range(horizon):
+        flows = [(control_index, now)] if h == 0 else list(enumerate((now[:, None] * policy).T))
+        now = predicted[h] = np.sum([model.transition.forward(u, flow) for u, flow in flows], axis=0)
     joint = predicted[:, :, None] * policy
     return Predicted(predicted=predicted, control_probability=joint.sum(axis=1), joint=joint)
 

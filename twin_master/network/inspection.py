@@ -69,7 +69,3 @@ class InspectedSensorModel(GaussianSensorModel):
         residual = (read[..., None, :] - self.reading) / self.reading_deviation
         density = -0.5 * residual**2 - np.log(self.reading_deviation) - LOG_ROOT_TWO_PI
         return gauges, np.where(np.isnan(read)[..., None, :], 0.0, density).sum(axis=-1)
-
-    def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
-        """Return the sensors that fit worst; see `GaussianSensorModel`."""
-        return super().worst_residuals(np.asarray(observation)[: self.sensor_count], control_index)

@@ -1,8 +1,9 @@
-"""Compiled inner loops of inference over the non-zero transitions.
+"""Compiled loops of inference: one transition of a belief, the forward pass and the backward pass.
 
-Beliefs are kept in the log domain. Sums over predecessors are formed in the linear domain wherever the sum is
-at least `SAFE`: what underflowed then weighs less than one part in 1e27 of it, far below rounding. Elsewhere
-the sum is formed in the log domain. The result is that of the log domain at a third of its cost.
+Beliefs are kept as logarithms. A transition is a product of blocks, each applied along its own axis. Where
+most states are all but impossible, most of its sums underflow, and to form them in the log domain would take
+the product of all predecessors. So within a transition numbers are carried as value * 2^(512 power): they
+never underflow. The powers are whole numbers in floating point, so that the loops are vectorised.
 """
 
 import numpy as np
@@ -10,200 +11,141 @@ from numpy.typing import NDArray
 
 from fe.compilation import compiled
 
-__all__ = ["backward_pass", "forward_pass", "smooth_many", "step_many"]
+__all__ = ["Lists", "backward_pass", "forward_pass", "move"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
-Unsigned = NDArray[np.uint64]
+Lists = tuple[Index, Index, Index, Index, Float, Float]
+"""Levels, first row, start, source, probability and power of `TransitionLists`."""
 
-SAFE = 1e-280
-NEGLIGIBLE = -45.0
-"""Terms of a sum smaller than the largest by this many nats lie below its rounding error."""
-UNDERFLOW = -746.0
-"""The exponential function is zero in double precision below this."""
+STEP = 2.0**-512
+LEAST = 2.0**-256
+"""Smallest value of a number; the largest is 2^256 times the terms of a sum."""
+LOG_STEP = 512.0 * float(np.log(2.0))
+LOG_STEP_HIGH = 512.0 * float(np.float32(np.log(2.0)))
+"""Of 24 bits, so that its product with a whole number below 2^29 is exact."""
+LOG_STEP_LOW = 512.0 * -1.904654299957768e-09
+"""The rest of it."""
+NOTHING = -(2.0**40)
+"""Power of zero."""
 
 
 @compiled
-def _exp(value: float) -> float:
-    """Return exp(value), without the slow path of the library for values that underflow."""
-    return float(np.exp(value)) if value > UNDERFLOW else 0.0
+def _split(logarithm: Float, value: Float, power: Float) -> None:
+    """Fill value, in [2^-256, 2^256], and power of the exponential of each number."""
+    for i in range(len(logarithm)):
+        if logarithm[i] == -np.inf:
+            value[i], power[i] = 0.0, NOTHING
+        else:
+            steps = np.floor(logarithm[i] / LOG_STEP + 0.5)
+            value[i] = np.exp((logarithm[i] - steps * LOG_STEP_HIGH) - steps * LOG_STEP_LOW)
+            power[i] = steps
 
 
 @compiled
-def _log_forecast(
-    begin: int, end: int, source: Unsigned, log_probability: Float, log_filtered: Float
-) -> float:
-    """Return the log of the sum over the predecessors begin..end of one state."""
-    largest = -np.inf
-    for k in range(begin, end):
-        largest = max(largest, log_filtered[source[k]] + log_probability[k])
-    if largest == -np.inf or end - begin == 1:
-        return largest
-    total = 0.0
-    for k in range(begin, end):
-        difference = log_filtered[source[k]] + log_probability[k] - largest
-        if difference > NEGLIGIBLE:
-            total += np.exp(difference)
-    return float(largest + np.log(total)) if total > 1.0 else largest
+def _move_one(lists: Lists, control: int, before: Float, after: Float) -> None:
+    """Apply every block to one belief (S,), both as logarithms.
+
+    The first axis is applied and becomes the last, so that after all blocks the order is as before.
+    """
+    levels, first_row, start, source, probability, probability_power = lists
+    from_value, from_power = np.empty(len(before)), np.empty(len(before))
+    to_value, to_power = np.empty(len(before)), np.empty(len(before))
+    _split(before, to_value, to_power)
+    for block in range(len(levels)):
+        from_value[:] = to_value
+        from_power[:] = to_power
+        count = levels[block]
+        rest = len(before) // count
+        total, power = np.empty(rest), np.empty(rest)
+        for level in range(count):
+            row = first_row[block] + control * count + level
+            total[:] = 0.0
+            power[:] = NOTHING
+            for k in range(start[row], start[row + 1]):
+                share, share_power = probability[k], probability_power[k]
+                value = from_value[source[k] * rest : (source[k] + 1) * rest]
+                value_power = from_power[source[k] * rest : (source[k] + 1) * rest]
+                for i in range(rest):
+                    # What is two steps below the other is 2^-512 of it at most.
+                    its = value_power[i] + share_power
+                    largest = max(power[i], its)
+                    below, its_below = largest - power[i], largest - its
+                    weight = 1.0 if below == 0.0 else (STEP if below == 1.0 else 0.0)
+                    its_weight = 1.0 if its_below == 0.0 else (STEP if its_below == 1.0 else 0.0)
+                    total[i] = total[i] * weight + value[i] * its_weight * share
+                    power[i] = largest
+            for i in range(rest):
+                if 0.0 < total[i] < LEAST:
+                    total[i], power[i] = total[i] / STEP, power[i] - 1.0
+                to_value[i * count + level] = total[i]
+                to_power[i * count + level] = power[i]
+    for i in range(len(before)):
+        after[i] = np.log(to_value[i]) + to_power[i] * LOG_STEP if to_value[i] > 0.0 else -np.inf
+
+
+@compiled
+def move(lists: Lists, control: Index, before: Float, after: Float) -> None:
+    """Fill after (B, S) with the logarithms of beliefs one transition later, each under its control (B,)."""
+    for row in range(len(control)):
+        _move_one(lists, control[row], before[row], after[row])
 
 
 @compiled
 def forward_pass(
-    log_prior: Float,
-    start: Unsigned,
-    source: Unsigned,
-    probability: Float,
-    log_probability: Float,
+    lists: Lists,
     control: Index,
     log_likelihood: Float,
-    first: int,
     forecast: Float,
     filtered: Float,
     log_filtered: Float,
     log_evidence: Float,
-) -> int:
-    """Fill the rows from `first` on; return -1, or the row whose observation is impossible.
+    failed: Index,
+) -> None:
+    """Filter B twins over T turns; `failed` (B,) becomes -1, or the row whose observation is impossible.
 
-    Rows before `first` of `filtered` and `log_filtered` hold what came before.
+    The first rows of `log_filtered` (B, T, S) hold the logarithms of the first forecasts.
     """
-    steps, size = log_likelihood.shape
-    for t in range(first, steps):
-        best = -np.inf
-        for state in range(size):
-            if t == 0:
-                log_value = log_prior[state]
-                forecast[t, state] = _exp(log_value)
-            else:
-                row = control[t - 1] * size + state
-                total = 0.0
-                for k in range(start[row], start[row + 1]):
-                    total += filtered[t - 1, source[k]] * probability[k]
-                if total >= SAFE:
-                    log_value = np.log(total)
-                    forecast[t, state] = total
-                else:
-                    log_value = _log_forecast(
-                        start[row], start[row + 1], source, log_probability, log_filtered[t - 1]
-                    )
-                    forecast[t, state] = _exp(log_value)
-            log_value += log_likelihood[t, state]
-            log_filtered[t, state] = log_value
-            best = max(best, log_value)
-        if best == -np.inf:
-            return t
-        total = 0.0
-        for state in range(size):
-            filtered[t, state] = _exp(log_filtered[t, state] - best)
-            total += filtered[t, state]
-        evidence = best + np.log(total)
-        log_evidence[t] = evidence
-        for state in range(size):
-            filtered[t, state] /= total
-            log_filtered[t, state] -= evidence
-    return -1
+    for twin in range(len(control)):
+        failed[twin] = -1
+        for t in range(log_likelihood.shape[1]):
+            now = log_filtered[twin, t]
+            if t > 0:
+                _move_one(lists, control[twin, t - 1], log_filtered[twin, t - 1], now)
+            best = -np.inf
+            for state in range(len(now)):
+                forecast[twin, t, state] = np.exp(now[state])
+                now[state] += log_likelihood[twin, t, state]
+                best = max(best, now[state])
+            if best == -np.inf:
+                failed[twin] = t
+                break
+            filtered[twin, t] = np.exp(now - best)
+            total = filtered[twin, t].sum()
+            filtered[twin, t] /= total
+            log_evidence[twin, t] = best + np.log(total)
+            now -= log_evidence[twin, t]
 
 
 @compiled
 def backward_pass(
-    start: Unsigned,
-    source: Unsigned,
-    probability: Float,
-    log_probability: Float,
-    control: Index,
-    filtered: Float,
-    log_filtered: Float,
-    smoothed: Float,
+    forward: Lists, backward: Lists, control: Index, log_filtered: Float, smoothed: Float
 ) -> None:
-    """Fill the smoothed rows from the last to the first with p(D_t | D_{t+1}, o_0..o_t).
+    """Fill the smoothed rows (B, T, S) from the last to the first with p(D_t | D_{t+1}, o_0..o_t).
 
-    A smoothed probability that underflows never matters again: every entry of an earlier step is a weighted
-    mean of entries of the later one. So only the weights need care, where what they are made of underflows.
+    p(i) = filtered(i) sum_j T(i, j) later(j) / forecast(j). A smoothed probability that underflows never
+    matters again: every entry of an earlier step is a weighted mean of entries of the later one.
     """
-    steps, size = filtered.shape
-    if steps:
-        smoothed[steps - 1] = filtered[steps - 1]
-    for t in range(steps - 2, -1, -1):
-        for state in range(size):
-            smoothed[t, state] = 0.0
-        for state in range(size):
-            later = smoothed[t + 1, state]
-            if later > 0.0:
-                row = control[t] * size + state
-                begin, end = start[row], start[row + 1]
-                forecast = 0.0
-                for k in range(begin, end):
-                    forecast += filtered[t, source[k]] * probability[k]
-                linear = forecast >= SAFE
-                if linear:
-                    scale = later / forecast
-                    log_forecast = np.nan  # formed when the first predecessor needs it
-                else:
-                    scale = 0.0
-                    log_forecast = _log_forecast(begin, end, source, log_probability, log_filtered[t])
-                for k in range(begin, end):
-                    before = filtered[t, source[k]]
-                    if linear and before >= SAFE:
-                        smoothed[t, source[k]] += before * probability[k] * scale
-                    else:
-                        if np.isnan(log_forecast):
-                            log_forecast = np.log(forecast)
-                        weight = _exp(log_filtered[t, source[k]] + log_probability[k] - log_forecast)
-                        smoothed[t, source[k]] += weight * later
-        total = 0.0
-        for state in range(size):
-            total += smoothed[t, state]
-        for state in range(size):
-            smoothed[t, state] /= total
-
-
-@compiled
-def step_many(
-    log_prior: Float,
-    start: Unsigned,
-    source: Unsigned,
-    probability: Float,
-    log_probability: Float,
-    control: Index,
-    first: int,
-    log_likelihood: Float,
-    forecast: Float,
-    filtered: Float,
-    log_filtered: Float,
-    log_evidence: Float,
-    failed: Index,
-) -> None:
-    """Filter the rows from `first` on of each twin of a batch, as `forward_pass` those of one."""
-    for twin in range(len(control)):
-        failed[twin] = forward_pass(
-            log_prior, start, source, probability, log_probability, control[twin], log_likelihood[twin],
-            first, forecast[twin], filtered[twin], log_filtered[twin], log_evidence[twin],
-        )  # fmt: skip
-
-
-@compiled
-def smooth_many(
-    log_prior: Float,
-    start: Unsigned,
-    source: Unsigned,
-    probability: Float,
-    log_probability: Float,
-    control: Index,
-    log_likelihood: Float,
-    forecast: Float,
-    filtered: Float,
-    log_filtered: Float,
-    log_evidence: Float,
-    smoothed: Float,
-    failed: Index,
-) -> None:
-    """Filter and smooth each twin of a batch; `failed` gets -1 or the row of an impossible observation."""
-    for twin in range(len(control)):
-        failed[twin] = forward_pass(
-            log_prior, start, source, probability, log_probability, control[twin], log_likelihood[twin], 0,
-            forecast[twin], filtered[twin], log_filtered[twin], log_evidence[twin],
-        )  # fmt: skip
-        if failed[twin] < 0:
-            backward_pass(
-                start, source, probability, log_probability, control[twin], filtered[twin],
-                log_filtered[twin], smoothed[twin],
-            )  # fmt: skip
+    twins, steps, size = log_filtered.shape
+    forecast, ratio = np.empty(size), np.empty(size)
+    for twin in range(twins):
+        for t in range(steps - 1, -1, -1):
+            ratio[:] = 0.0
+            if t < steps - 1:
+                _move_one(forward, control[twin, t], log_filtered[twin, t], forecast)
+                for state in range(size):
+                    later = smoothed[twin, t + 1, state]
+                    forecast[state] = np.log(later) - forecast[state] if later > 0.0 else -np.inf
+                _move_one(backward, control[twin, t], forecast, ratio)
+            smoothed[twin, t] = np.exp(log_filtered[twin, t] + ratio)
+            smoothed[twin, t] /= smoothed[twin, t].sum()

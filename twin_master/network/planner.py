@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fe.compilation import compiled
 from twin_master.errors import PlanningError
 from twin_master.network.distributions import stochastic_matrix
 from twin_master.network.graphical_model import deterministic_policy
@@ -107,12 +106,7 @@ def _checked(
 ) -> tuple[TransitionModel, Float, Float]:
     """Return the transitions, the reward (S, U) and the discount (U,)."""
     if not isinstance(transition, TransitionModel):
-        matrix = stochastic_matrix(transition, name="transition[control, state]")
-        if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2]:
-            raise PlanningError(
-                f"expected transitions of shape (controls, states, states), got {matrix.shape}"
-            )
-        transition = TransitionModel((matrix,))
+        transition = TransitionModel((np.asarray(transition, dtype=np.float64),))
     rewards = np.array(reward, dtype=np.float64, order="C")
     if rewards.shape != transition.shape[1::-1]:
         raise PlanningError(
@@ -133,56 +127,11 @@ def _checked(
     return transition, rewards, np.broadcast_to(factors, rewards.shape[1:])
 
 
-@compiled
-def _sweep(
-    discounted: Float, reward: Float, limit: float, max_iterations: int, value: Float, action_value: Float
-) -> tuple[int, float]:
-    """Sweep until the value changes by no more than `limit`; return the sweeps and the last change.
-
-    `action_value` belongs to the value that it is returned with.
-    """
-    controls, states, _ = discounted.shape
-    change = np.inf
-    iterations = 0
-    while True:
-        for state in range(states):
-            for control in range(controls):
-                total = reward[state, control]
-                for following in range(states):
-                    total += discounted[control, state, following] * value[following]
-                action_value[state, control] = total
-        if change <= limit or iterations == max_iterations:
-            return iterations, change
-        change = 0.0
-        for state in range(states):
-            improved = action_value[state, 0]
-            for control in range(1, controls):
-                improved = max(improved, action_value[state, control])
-            change = max(change, abs(improved - value[state]))
-            value[state] = improved
-        iterations += 1
-
-
 def _action_value(transition: TransitionModel, reward: Float, discount: Float, value: Float) -> Float:
     """Return the reward of each control first and the value afterwards: (S, U)."""
     later = [transition.expected(control, value) for control in range(reward.shape[1])]
     result: Float = reward + discount * np.stack(later, axis=1)
     return result
-
-
-def _product_sweep(
-    transition: TransitionModel, reward: Float, discount: Float, limit: float, max_iterations: int
-) -> tuple[Float, Float, int, float]:
-    """Sweep over a product of tables as `_sweep` over one; return value, action value, sweeps and change."""
-    value: Float = np.zeros(len(reward))
-    change, iterations = np.inf, 0
-    while True:
-        action_value = _action_value(transition, reward, discount, value)
-        if change <= limit or iterations == max_iterations:
-            return value, action_value, iterations, change
-        improved = action_value.max(axis=1)
-        change = float(np.abs(improved - value).max())
-        value, iterations = improved, iterations + 1
 
 
 def value_iteration(
@@ -226,14 +175,14 @@ def value_iteration(
     scale = float(np.abs(rewards).max()) or 1.0
     # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
     limit = max(tolerance * scale * (1.0 - largest), 4e-16 * scale / (1.0 - largest))
-    value, action_value = np.zeros(len(rewards)), np.empty_like(rewards)
-    if model.is_product:
-        value, action_value, iterations, change = _product_sweep(
-            model, rewards, factors, limit, max_iterations
-        )
-    else:
-        discounted = factors[:, None, None] * model.matrix
-        iterations, change = _sweep(discounted, rewards, limit, max_iterations, value, action_value)
+    value: Float = np.zeros(len(rewards))
+    change, iterations = np.inf, 0
+    action_value = rewards
+    while change > limit and iterations < max_iterations:
+        improved = action_value.max(axis=1)
+        change = float(np.abs(improved - value).max())
+        value, iterations = improved, iterations + 1
+        action_value = _action_value(model, rewards, factors, value)
     if change > limit:
         raise PlanningError(
             f"value iteration still changes by {change:.3g} after {max_iterations} sweeps with discount "
@@ -295,8 +244,5 @@ def given_policy(
     value = evaluate_policy(transition, reward, discount, policy)
     model, rewards, factors = _checked(transition, reward, discount)
     rows = stochastic_matrix(policy, name="policy[state]")
-    if model.is_product:
-        action_value = _action_value(model, rewards, factors, value)
-    else:
-        action_value = rewards + factors * np.einsum("ust,t->su", model.matrix, value)
+    action_value = _action_value(model, rewards, factors, value)
     return PlannedPolicy(value, action_value, np.argmax(rows, axis=1).astype(np.int64), rows, 0)

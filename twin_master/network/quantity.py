@@ -58,6 +58,14 @@ class QuantityModel:
     draw_weight : (E,), optional
         Probability of each draw; equal by default.
 
+    Attributes
+    ----------
+    value_per_draw : (E, S, U, G)
+        SI, read-only.
+    draw_weight : (E,)
+        Read-only.
+    draw_count, state_count, control_count, sensor_count : int
+
     Raises
     ------
     InvalidModelError, InvalidDistributionError
@@ -76,60 +84,30 @@ class QuantityModel:
                 f"value at (draw, state, control, sensor) {where} is {values[where]}; expected finite values"
             )
         values.setflags(write=False)
-        draws = len(values)
-        weight = np.full(draws, 1.0 / draws) if draw_weight is None else draw_weight
-        self._value_per_draw: Float = values
-        self._draw_weight = distribution(weight, size=draws, name="draw weights")
-
-    @property
-    def value_per_draw(self) -> Float:
-        """Values (E, S, U, G), SI, read-only."""
-        return self._value_per_draw
-
-    @property
-    def draw_weight(self) -> Float:
-        """Probability of each draw (E,), read-only."""
-        return self._draw_weight
-
-    @property
-    def draw_count(self) -> int:
-        """Number E of draws."""
-        return int(self._value_per_draw.shape[0])
-
-    @property
-    def state_count(self) -> int:
-        """Number S of states."""
-        return int(self._value_per_draw.shape[1])
-
-    @property
-    def control_count(self) -> int:
-        """Number U of controls."""
-        return int(self._value_per_draw.shape[2])
-
-    @property
-    def sensor_count(self) -> int:
-        """Number G of sensors."""
-        return int(self._value_per_draw.shape[3])
+        self.value_per_draw: Float = values
+        self.draw_count, self.state_count, self.control_count, self.sensor_count = values.shape
+        weight = np.full(self.draw_count, 1.0 / self.draw_count) if draw_weight is None else draw_weight
+        self.draw_weight = distribution(weight, size=self.draw_count, name="draw weights")
 
     @cached_property
     def mean(self) -> Float:
         """Mean over the draws (S, U, G)."""
-        result: Float = np.tensordot(self._draw_weight, self._value_per_draw, axes=1)
+        result: Float = np.tensordot(self.draw_weight, self.value_per_draw, axes=1)
         return result
 
     @cached_property
     def variance(self) -> Float:
         """Variance over the draws (S, U, G)."""
-        result: Float = np.tensordot(self._draw_weight, (self._value_per_draw - self.mean) ** 2, axes=1)
+        result: Float = np.tensordot(self.draw_weight, (self.value_per_draw - self.mean) ** 2, axes=1)
         return result
 
     @cached_property
     def _sorted(self) -> tuple[Index, Index, Float, Float]:
         """Order (G, N) of all N = S * U * E points of each sensor, their owner, weight and value."""
-        points = self._value_per_draw.transpose(3, 1, 2, 0).reshape(self.sensor_count, -1)
+        points = self.value_per_draw.transpose(3, 1, 2, 0).reshape(self.sensor_count, -1)
         order = np.argsort(points, axis=1, kind="stable").astype(np.int64)
         owner, draw = np.divmod(order, self.draw_count)
-        return order, owner, self._draw_weight[draw], np.take_along_axis(points, order, axis=1)
+        return order, owner, self.draw_weight[draw], np.take_along_axis(points, order, axis=1)
 
     def _weights(self, joint: ArrayLike) -> Float:
         """Return the checked joint (..., S, U)."""

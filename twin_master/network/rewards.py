@@ -112,18 +112,13 @@ class RewardSettings:
     health_sensors: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("limit", "error_scale"):
-            value = getattr(self, name)
-            if not np.all(np.isfinite(value) & (np.asarray(value) > 0.0)):
-                raise InvalidModelError(f"reward setting {name!r} must be finite and positive, got {value}")
-        if not np.all(np.isfinite(self.control_reward)):
-            raise InvalidModelError(f"control rewards must be finite, got {self.control_reward}")
-        if self.control_normaliser is not None and not all(
-            np.isfinite(value) and value > 0.0 for value in self.control_normaliser
-        ):
-            raise InvalidModelError(
-                f"the normalisers of the controls must be finite and positive, got {self.control_normaliser}"
-            )
+        for name in ("limit", "error_scale", "control_normaliser", "control_reward"):
+            given = getattr(self, name)
+            value = np.asarray(1.0 if given is None else given)
+            signed = name == "control_reward"
+            if not np.all(np.isfinite(value) & (signed | (value > 0.0))):
+                must = "finite" if signed else "finite and positive"
+                raise InvalidModelError(f"reward setting {name!r} must be {must}, got {given}")
 
 
 @dataclass(frozen=True)

@@ -132,25 +132,23 @@ class GaussianSensorModel(QuantityModel):
         interval: ArrayLike | None = None,
     ) -> None:
         super().__init__(strain_per_draw, draw_weight)
-        deviation = np.array(standard_deviation, dtype=np.float64)
-        if deviation.shape not in ((), (self.sensor_count,)) or not np.all(
-            np.isfinite(deviation) & (deviation > 0.0)
+        for what, given, positive in (
+            ("positive noise standard deviation", standard_deviation, True),
+            ("relative model error that is not negative", model_error, False),
         ):
-            raise InvalidModelError(
-                f"expected one positive noise standard deviation, or one for each of {self.sensor_count} "
-                f"sensors, got {deviation}"
-            )
-        error = np.array(model_error, dtype=np.float64)
-        if error.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(error) & (error >= 0.0)):
-            raise InvalidModelError(
-                f"expected one relative model error that is not negative, or one for each of "
-                f"{self.sensor_count} sensors, got {error}"
-            )
+            value = np.array(given, dtype=np.float64)
+            enough = value > 0.0 if positive else value >= 0.0
+            if value.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(value) & enough):
+                raise InvalidModelError(
+                    f"expected one {what}, or one for each of {self.sensor_count} sensors, got {value}"
+                )
         if average not in ("outside", "inside"):
             raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
-        self._deviation: Float = np.broadcast_to(deviation, (self.sensor_count,)).copy()
-        self._model_error: Float = np.broadcast_to(error, (self.sensor_count,)).copy()
-        independent = np.hypot(self._deviation, self._model_error * self.mean)  # a root of a square rounds
+        self.standard_deviation: Float = np.full(self.sensor_count, standard_deviation, np.float64)
+        self.model_error: Float = np.full(self.sensor_count, model_error, np.float64)
+        independent = np.hypot(
+            self.standard_deviation, self.model_error * self.mean
+        )  # a root of a square rounds
         shape = independent.shape
         self.interval = np.zeros((*shape, 0)) if interval is None else np.array(interval, dtype=np.float64)
         if self.interval.shape[:-1] != shape or not np.all(np.isfinite(self.interval)):
@@ -167,25 +165,10 @@ class GaussianSensorModel(QuantityModel):
         self._scaled_interval = np.ascontiguousarray(
             self.interval.transpose(1, 0, 2, 3) * by_control[..., None]
         )
-        self._inside = average == "inside"
+        self.averages_inside = average == "inside"
         with np.errstate(divide="ignore"):
             self._log_weight: Float = np.log(self.draw_weight)
         self._by_control = np.ascontiguousarray(self.value_per_draw.transpose(2, 1, 3, 0))
-
-    @property
-    def averages_inside(self) -> bool:
-        """Whether each sensor averages over draws of its own, eq. (32) as printed."""
-        return self._inside
-
-    @property
-    def standard_deviation(self) -> Float:
-        """Noise standard deviation of each sensor (G,), SI."""
-        return self._deviation.copy()
-
-    @property
-    def model_error(self) -> Float:
-        """Relative standard deviation of the predicted value of each sensor (G,), dimensionless."""
-        return self._model_error.copy()
 
     def checked(self, observation: ArrayLike) -> Float:
         """Return observations (..., G) in which NaN stands for a lost sensor.
@@ -217,7 +200,9 @@ class GaussianSensorModel(QuantityModel):
     def sampled(self, state: Index, control_index: int, generator: np.random.Generator) -> Float:
         """Return one observation drawn in each of N states (N,) under a control: (N, G), SI."""
         size = len(state), self.sensor_count
-        draw = generator.choice(self.draw_count, size if self._inside else (size[0], 1), p=self.draw_weight)
+        draw = generator.choice(
+            self.draw_count, size if self.averages_inside else (size[0], 1), p=self.draw_weight
+        )
         values = self.value_per_draw[draw, state[:, None], control_index, np.arange(self.sensor_count)]
         within = generator.standard_normal((size[0], self.interval.shape[-1]))
         noise = self.independent_standard_deviation[state, control_index] * generator.standard_normal(size)
@@ -280,7 +265,7 @@ class GaussianSensorModel(QuantityModel):
         result = np.empty((len(observations), self.state_count, draws))
         log_densities(
             observations, control, self._by_control, self._inverse_deviation, self._log_scale,
-            self._scaled_interval, self._log_weight, self._inside and draws == 1, result,
+            self._scaled_interval, self._log_weight, self.averages_inside and draws == 1, result,
         )  # fmt: skip
         return result
 
@@ -317,10 +302,11 @@ class GaussianSensorModel(QuantityModel):
 
     def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
         """Return the sensors that fit worst in the state that fits best, in standard deviations."""
+        observation = np.asarray(observation)[: self.sensor_count]
         predicted = self.mean[:, control_index]
         deviation = self.total_standard_deviation[:, control_index]
         with np.errstate(over="ignore"):  # an absurd observation is what this is for
-            residual = (np.asarray(observation) - predicted) / deviation
+            residual = (observation - predicted) / deviation
             distance = np.nan_to_num(np.abs(residual), nan=0.0)
             best = int(np.argmin(distance.sum(axis=1)))
         order = np.argsort(-distance[best])[:_WORST_SHOWN]

@@ -5,10 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import filter_step
-from twin_master.network.kernels import step_many
+from twin_master.network.inference import filter_many, log_forecast
 from twin_master.network.planner import BeliefPolicy, PlannedPolicy
 
 __all__ = ["decide_many", "filter_step_many", "rationed"]
@@ -43,34 +41,13 @@ def filter_step_many(
         Whether the observation has probability zero wherever the belief has support; the rest of such a row
         means nothing.
     """
-    first = 0 if previous_control is None or previous_log_filtered is None else 1
-    count, size = log_likelihood.shape
-    rows = np.zeros((count, first + 1, size))
-    rows[:, first] = log_likelihood
-    control = np.zeros((count, first + 1), dtype=np.int64)
-    log_filtered, filtered, forecast = np.zeros_like(rows), np.zeros_like(rows), np.zeros_like(rows)
-    log_evidence, failed = np.zeros((count, first + 1)), np.full(count, -1)
+    first = model.log_prior
     if previous_control is not None and previous_log_filtered is not None:
-        control[:] = previous_control[:, None]
-        log_filtered[:, 0] = previous_log_filtered
-        filtered[:, 0] = np.exp(previous_log_filtered)
-    if model.transition.is_product:
-        for twin in range(count):
-            before, in_force = (log_filtered[twin, 0], int(control[twin, 0])) if first else (None, None)
-            try:
-                step = filter_step(model, before, in_force, rows[twin, first])
-            except ImpossibleObservation:
-                failed[twin] = first
-                continue
-            filtered[twin, first], log_filtered[twin, first] = step.filtered, step.log_filtered
-            log_evidence[twin, first] = step.log_evidence
-    else:
-        sparse = model.transition.sparse
-        step_many(
-            model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability, control,
-            first, rows, forecast, filtered, log_filtered, log_evidence, failed,
-        )  # fmt: skip
-    return filtered[:, first], log_filtered[:, first], log_evidence[:, first], failed >= 0
+        first = log_forecast(model.transition, previous_control, previous_log_filtered)
+    control = np.zeros((len(log_likelihood), 1), dtype=np.int64)
+    found, failed = filter_many(model, control, log_likelihood[:, None], first)
+    step = found[:, 0]
+    return step.filtered, step.log_filtered, step.log_evidence, failed >= 0
 
 
 def decide_many(

@@ -15,16 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import stochastic_matrix
+from twin_master.network.kernels import Lists
 from twin_master.network.memory import TRANSITION_COPIES, check_fits, transition_bytes
 
-__all__ = ["ProductTransition", "SparseTransition", "TransitionModel"]
+__all__ = ["SparseTransition", "TransitionLists", "TransitionModel"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 Unsigned = NDArray[np.uint64]
 
-JOINT_NON_ZEROS = 8192
-"""Non-zero transitions of a control up to which one table is used: it is applied in some ten microseconds."""
+JOINT_NON_ZEROS = 512
+"""Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""
 JOINT_LEVELS = 1024
 """Joint levels of neighbours up to which they may share a table: it has 8 MB for each control."""
 
@@ -64,7 +65,7 @@ class SparseTransition:
 
 
 @dataclass(frozen=True)
-class ProductTransition:
+class TransitionLists:
     """Predecessor lists of several blocks, one after the other, for the compiled loops.
 
     Attributes
@@ -89,12 +90,12 @@ class ProductTransition:
     power: Float
 
     @property
-    def arrays(self) -> tuple[Index, Index, Index, Index, Float, Float]:
+    def arrays(self) -> Lists:
         """All of them, as the compiled loops take them."""
         return self.levels, self.first_row, self.start, self.source, self.probability, self.power
 
     @classmethod
-    def from_blocks(cls, blocks: Sequence[Float]) -> "ProductTransition":
+    def from_blocks(cls, blocks: Sequence[Float]) -> "TransitionLists":
         """Build the lists from the transition arrays (U, L, L) of the blocks."""
         lists = [SparseTransition.from_matrix(block) for block in blocks]
         rows = [len(entry.start) - 1 for entry in lists]
@@ -160,16 +161,11 @@ class TransitionModel:
             ]
             for control, factor_tables in enumerate(tables)
         ]
-        for control, row in enumerate(checked):
-            if not row or any(t.ndim != 2 or t.shape[0] != t.shape[1] for t in row):
-                raise InvalidModelError(
-                    f"control {control}: expected a square table for each factor, "
-                    f"got shapes {[table.shape for table in row]}"
-                )
-        if len({tuple(table.shape for table in row) for row in checked}) != 1:
+        shapes = {tuple(table.shape for table in row) for row in checked}
+        if len(shapes) != 1 or not all(shapes) or any(s != s[:1] * 2 for row in shapes for s in row):
             raise InvalidModelError(
-                "every control needs the same states, got shapes "
-                f"{[[table.shape for table in row] for row in checked]}"
+                "expected for every control a square table for each factor, of the same states, got shapes "
+                f"{sorted(shapes)}"
             )
         return cls(tuple(_grouped([np.stack(factor) for factor in zip(*checked, strict=True)])))
 
@@ -214,14 +210,14 @@ class TransitionModel:
         return SparseTransition.from_matrix(self.matrix)
 
     @cached_property
-    def forward_lists(self) -> ProductTransition:
+    def forward_lists(self) -> TransitionLists:
         """The predecessors of each level of each block."""
-        return ProductTransition.from_blocks(self.blocks)
+        return TransitionLists.from_blocks(self.blocks)
 
     @cached_property
-    def backward_lists(self) -> ProductTransition:
+    def backward_lists(self) -> TransitionLists:
         """The successors of each level of each block."""
-        return ProductTransition.from_blocks([block.transpose(0, 2, 1) for block in self.blocks])
+        return TransitionLists.from_blocks([block.transpose(0, 2, 1) for block in self.blocks])
 
     def row(self, control: int, state: int) -> Float:
         """Return p(D_t | D_{t-1} = state, control): (S,)."""

@@ -8,6 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fe.runtime.errors import ReducedModelFileError
+from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network import graphical_model
 from twin_master.network.estimator import (
@@ -22,7 +24,6 @@ from twin_master.network.estimator import (
 )
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.inference import Predicted, predict
-from twin_master.network.packed_arrays import packed_arrays, unpacked_arrays
 from twin_master.network.planner import BeliefPolicy
 from twin_master.scenario.schema import Scenario
 
@@ -343,7 +344,7 @@ class Twin:
             arrays[f"{place}/observation"] = seen.observation
             arrays[f"{place}/control"] = np.array(seen.estimate.control_index)
             arrays |= {f"{place}/carried/{name}": value for name, value in seen.estimate.arrays.items()}
-        return packed_arrays(arrays)
+        return arrays_to_bytes(arrays)
 
     def restore_state(self, state: bytes) -> None:
         """Go on from a saved state of a twin of the same model, sensors and estimator, to the last bit.
@@ -353,8 +354,8 @@ class Twin:
         InvalidModelError
             It is no such state.
         """
-        arrays = unpacked_arrays(state)
         try:
+            arrays = arrays_from_bytes(state, "the state of the twin")
             turns, proposed = arrays["turns"].tolist()
             seen: list[_Seen] = []
             while f"{len(seen)}/control" in arrays:
@@ -366,7 +367,7 @@ class Twin:
                 }
                 control = int(arrays[f"{len(seen)}/control"])
                 seen.append(_Seen(arrays[f"{len(seen)}/observation"], Carried(control, own)))
-        except (KeyError, ValueError, TypeError) as error:
+        except (ReducedModelFileError, KeyError, ValueError, TypeError) as error:
             raise InvalidModelError(f"this is no saved state of a twin: {error}") from error
         self._turns, self._proposed = turns, proposed
         self._seen.clear()

@@ -37,9 +37,12 @@ class FileSection(Section):
         "structure": structure_files,
     }
 
+    kept: ClassVar[Mapping[str, str]] = {}
+    """For each key that names a file the place of its copy in a run folder."""
+
     def copies(self) -> Mapping[str, str]:
         """Return for each key that names a file where its copy stands in a run folder."""
-        return {}
+        return self.kept
 
     def own_files(self) -> dict[str, str]:
         """Return the paths of the files that are not shipped, by their keys."""

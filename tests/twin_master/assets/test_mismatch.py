@@ -26,10 +26,10 @@ from twin_master import workflow
 from twin_master.assets.asset_source import PairedSource
 from twin_master.assets.interface import AssetReading, StatelessAsset
 from twin_master.assets.mismatch import find_misfit
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
-from twin_master.assets.wing_model import ReducedModelSource
 from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError
 from twin_master.fleet.outcome import in_credible_set
 from twin_master.fleet.reading import Outcomes, fly_seeds

@@ -179,7 +179,10 @@ def test_the_field_of_the_last_estimate_is_written(flown: Path) -> None:
     ("changes", "sentence"),
     [
         ({"asset": {"structure": "nowhere.toml"}}, r"nowhere\.toml"),
-        ({"calibration": {"parameter": "stiffness"}}, "none of the structure bracket, which has e, pump"),
+        (
+            {"calibration": {"parameter": "stiffness"}},
+            "stiffness, which the structure bracket does not know; it knows e, pump",
+        ),
         ({"calibration": {"source": "static_test"}}, "`static_test` is for wings"),
         ({"observation": {"role": "displacement"}}, "expects 4"),
         ({"observation": {"count": 3, "titles": ["a", "b", "c"]}}, "expects 3"),

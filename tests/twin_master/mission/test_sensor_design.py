@@ -20,7 +20,7 @@ from fe.structure.mesh_file import read_mesh
 from fe.wing.design import load_design
 from scenarios import structure_files
 from tests.command_line import call
-from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import MissionInputError
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.sensor_design import Readings, chosen_sensors, drawn_readings, separations

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pickle
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
+from twin_master.network.estimator import Carried, ExactFilter
 from twin_master.network.graphical_model import (
     Factor,
     GraphicalModel,
@@ -18,13 +20,13 @@ from twin_master.network.graphical_model import (
     worsening_table,
 )
 from twin_master.network.inference import (
-    ObservationContext,
+    filter_many,
     filter_sequence,
     filter_step,
     known_control,
     predict,
     smooth,
-    smooth_many_twins,
+    smooth_many,
 )
 from twin_master.network.transition import TransitionModel
 
@@ -207,13 +209,14 @@ def test_many_twins_equal_one_by_one():
     rng = np.random.default_rng(6)
     control = rng.integers(0, 2, (7, 15))
     log_likelihood = rng.normal(size=(7, 15, 25)) * 100
-    for workers in (1, 2, 20, None):
-        filtered, smoothed = smooth_many_twins(MODEL, control, log_likelihood, workers=workers)
-        for twin in range(7):
-            alone, alone_smoothed = infer(MODEL, control[twin], log_likelihood[twin])
-            np.testing.assert_array_equal(filtered.filtered[twin], alone.filtered)
-            np.testing.assert_array_equal(filtered.log_evidence[twin], alone.log_evidence)
-            np.testing.assert_allclose(smoothed.smoothed[twin], alone_smoothed, rtol=1e-11, atol=1e-290)
+    filtered, failed = filter_many(MODEL, control, log_likelihood, MODEL.log_prior)
+    smoothed = smooth_many(MODEL.transition, control, filtered.log_filtered)
+    np.testing.assert_array_equal(failed, -1)
+    for twin in range(7):
+        alone, alone_smoothed = infer(MODEL, control[twin], log_likelihood[twin])
+        np.testing.assert_array_equal(filtered.filtered[twin], alone.filtered)
+        np.testing.assert_array_equal(filtered.log_evidence[twin], alone.log_evidence)
+        np.testing.assert_array_equal(smoothed[twin], alone_smoothed)
 
 
 def test_without_observation_the_belief_follows_the_dynamics():
@@ -240,18 +243,21 @@ def test_an_impossible_observation_names_twin_step_and_sensors():
     log_likelihood = np.zeros((5, 25))
     log_likelihood[3] = -np.inf
     log_likelihood[3, 24] = 0.0  # cannot be reached from no damage in three steps
-    context = ObservationContext("N57", 10, lambda step: {"gauge 17": 40.0 + step})
+    with pytest.raises(ImpossibleObservation, match="step 3:"):
+        filter_sequence(MODEL, [1] * 5, log_likelihood)
+    first = filter_sequence(MODEL, [1] * 3, log_likelihood[:3])
+    sensors = SimpleNamespace(
+        log_likelihood=lambda *_: log_likelihood[3], worst_residuals=lambda *_: {"gauge 17": 53.0}
+    )
+    before = Carried(1, {"log_filtered": first.log_filtered[-1]})
     with pytest.raises(ImpossibleObservation, match=r"'N57', step 13: .* gauge 17: \+53 sd") as caught:
-        filter_sequence(MODEL, [1] * 5, log_likelihood, context)
+        ExactFilter(MODEL, sensors, "N57").turn(before, np.zeros(1), 1, 13)
     assert (caught.value.twin, caught.value.step) == ("N57", 13)
     assert caught.value.worst_residuals == {"gauge 17": 53.0}
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
-    first = filter_sequence(MODEL, [1] * 3, log_likelihood[:3])
-    with pytest.raises(ImpossibleObservation, match="'N57', step 10"):
-        filter_step(MODEL, first.log_filtered[-1], 1, log_likelihood[3], ObservationContext("N57", 10))
     many = np.stack([np.zeros((5, 25)), log_likelihood, log_likelihood])
-    with pytest.raises(ImpossibleObservation, match="twin 1', step 3"):
-        smooth_many_twins(MODEL, np.ones((3, 5), dtype=int), many)
+    _, failed = filter_many(MODEL, np.ones((3, 5), dtype=int), many, MODEL.log_prior)
+    np.testing.assert_array_equal(failed, [-1, 3, 3])
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -273,8 +279,6 @@ def test_shapes_and_controls_are_checked():
         filter_sequence(MODEL, 1, np.zeros(25))
     with pytest.raises(InvalidModelError, match="one control for each step"):
         smooth(MODEL, [[1]], np.zeros((1, 1, 25)))
-    with pytest.raises(InvalidModelError, match=r"\(twins, steps\)"):
-        smooth_many_twins(MODEL, [1], np.zeros((1, 25)))
     with pytest.raises(InvalidModelError, match="both or neither"):
         filter_step(MODEL, None, 1, np.zeros(25))
     policy = deterministic_policy([0] * 25, 2)

@@ -83,9 +83,9 @@ def test_settings_are_checked():
     for bad in ({"limit": 0.0}, {"limit": np.nan}, {"error_scale": -1.0}):
         with pytest.raises(InvalidModelError, match="must be finite and positive"):
             RewardSettings(**({"limit": 1.0, "control_reward": (0.0,), "error_scale": 1.0} | bad))
-    with pytest.raises(InvalidModelError, match="normalisers"):
+    with pytest.raises(InvalidModelError, match="'control_normaliser' must be finite and positive"):
         RewardSettings(1.0, (0.0, 1.0), 1.0, (1.0, 0.0))
-    with pytest.raises(InvalidModelError, match="control rewards must be finite"):
+    with pytest.raises(InvalidModelError, match="'control_reward' must be finite"):
         RewardSettings(1.0, (0.0, np.inf), 1.0)
     _, quantity, joint = random_case(4)
     with pytest.raises(InvalidModelError, match="each of 2 controls, got 3"):

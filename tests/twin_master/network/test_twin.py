@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from fe.runtime.kept_arrays import arrays_to_bytes
 from scenarios import scenario_files
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
@@ -18,7 +19,6 @@ from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt
 from twin_master.network.inference import filter_sequence, smooth
-from twin_master.network.packed_arrays import packed_arrays
 from twin_master.network.twin import Twin, TwinTurn, build_graphical_model
 from twin_master.scenario.reading import load_scenario, parse_scenario
 
@@ -201,7 +201,7 @@ def test_a_stored_twin_goes_on_to_the_last_bit(knowledge: Knowledge, seen: np.nd
     for row in seen[20:]:
         assert same_turn(twin.turn(row), other.turn(row))
     assert other.save_state() == twin.save_state()
-    for damaged in (b"", twin.save_state()[:-7], packed_arrays({"a": np.zeros(2)})):
+    for damaged in (b"", twin.save_state()[:-7], arrays_to_bytes({"a": np.zeros(2)})):
         with pytest.raises(InvalidModelError):
             other.restore_state(damaged)
 

@@ -1,0 +1,173 @@
+"""Rival hypotheses about the gauges beside the model as it is, each with a belief over draws and states.
+
+A pair of a draw and a state is a place, of which there are N. Beliefs are weighed where they are not
+negligible.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Shown", "mix_onset", "weigh_gauges", "weigh_model", "weigh_none"]
+
+Float = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+NEGLIGIBLE = 1e-30
+"""Places of the model below this probability are left out of its evidence."""
+NEGLIGIBLE_RIVAL = 1e-7
+"""The same of a rival: what is left out makes its evidence smaller, and an alarm later."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One observation beside what is predicted at each place, in units of the assumed noise.
+
+    Attributes
+    ----------
+    there : (G,)
+        Whether a gauge reports; the others have a residual and a size of zero.
+    residual, size : (N, G)
+        What a gauge shows beyond its prediction, and the prediction.
+    power : (G,)
+        Of the predictive densities, which are Student's.
+    degrees : float
+        How sure the assumed noise is.
+    """
+
+    there: NDArray[np.bool_]
+    residual: Float
+    size: Float
+    power: Float
+    degrees: float
+
+
+def mix_onset(
+    model: Float, belief: Single, log_weight: Float, log_inflow: float, turn: float, onset: Float
+) -> Float:
+    """Let R rivals begin in this turn: those of before and the model's belief are mixed by their weights.
+
+    belief (R, E, S), log_weight and onset, the expected first turn, (R,) are brought up to date; returned is
+    the share of those that began before (R,).
+    """
+    total = np.logaddexp(log_weight, log_inflow)
+    keep = np.exp(log_weight - total)
+    log_weight[:] = total
+    onset[:] = keep * onset + (1.0 - keep) * turn
+    old = keep[:, None, None].astype(np.float32)
+    belief[:] = old * belief + (1.0 - old) * model.astype(np.float32)
+    return np.asarray(keep)
+
+
+def weigh_model(shown: Shown, squares: Float, belief: Float, log_likelihood: Float) -> tuple[float, Float]:
+    """Assimilate one observation under the model.
+
+    squares (G,), the expected sums of squares of the residuals, belief (N,) and log_likelihood (N,), to which
+    the sum over the gauges is added, are brought up to date.
+
+    Returns
+    -------
+    tuple of float, (N, G)
+        The log evidence, up to a constant of the turn, and 1 + x² / (degrees + squares).
+    """
+    known = 1.0 + shown.residual**2 / (shown.degrees + squares)
+    log_likelihood -= np.log(known) @ shown.power
+    held = belief >= NEGLIGIBLE
+    best = log_likelihood[held].max()
+    belief *= np.where(held, np.exp(np.minimum(log_likelihood - best, 0.0)), 0.0)
+    mass = belief.sum()
+    belief /= mass
+    squares += belief @ shown.residual**2
+    return float(best + np.log(mass)), known
+
+
+def weigh_gauges(
+    shown: Shown,
+    gains: Float,
+    reach: Float,
+    squares_of_model: Float,
+    known: Float,
+    log_likelihood: Float,
+    belief: Single,
+    squares: Float,
+    sums: Float,
+) -> Float:
+    """Assimilate one observation under the rivals "gauge g shows 1 + gains[k] times what is there".
+
+    The gain is learnt within gains[k] ± reach[k], its prior standard deviation, by the sums c² and cx of a
+    regression, sums (G, K, 2). squares_of_model (G,) are those before the observation; known and
+    log_likelihood are of the model. belief (G K, N), squares (G, K) and sums are brought up to date;
+    returned is the log evidence (G, K).
+    """
+    belief[belief < NEGLIGIBLE_RIVAL] = 0.0
+    rival, place = np.nonzero(belief)
+    g, k = np.divmod(rival, len(gains))
+    left, unknown = shown.degrees + squares, 1.0 / (1.0 + sums[..., 0])
+    fitted = np.clip(unknown * sums[..., 1], -1.0, 1.0)
+    constant = 0.5 * np.log((shown.degrees + squares_of_model)[:, None] / left) * shown.there[:, None]
+    size = shown.size[place, g]
+    c = reach[k] * size
+    x = shown.residual[place, g] - gains[k] * size
+    innovation, wide = x - c * fitted[g, k], 1.0 + c**2 * unknown[g, k]
+    density = np.log(known[place, g] / (1.0 + innovation**2 / (left[g, k] * wide)))
+    log_value = log_likelihood[place] + constant[g, k] + shown.power[g] * density - 0.5 * np.log(wide)
+    best, first = np.full(len(belief), -np.inf), np.flatnonzero(np.diff(rival, prepend=-1))
+    best[rival[first]] = np.maximum.reduceat(log_value, first) if first.size else -np.inf
+    weight = belief[rival, place] * np.exp(log_value - best[rival])
+
+    def total(values: Float) -> Float:
+        return np.bincount(rival, values, len(belief)).astype(np.float64).reshape(squares.shape)
+
+    mass = total(weight)
+    weight /= mass[g, k]
+    belief[rival, place] = weight
+    squares += total(weight * innovation**2 / wide)
+    sums += np.stack([total(weight * c**2), total(weight * c * x)], axis=-1)
+    return np.asarray(best.reshape(squares.shape) + np.log(mass))
+
+
+def weigh_none(
+    shown: Shown,
+    gain: float,
+    squares_of_model: Float,
+    known: Float,
+    log_likelihood: Float,
+    belief: Single,
+    statistics: Float,
+) -> float:
+    """Assimilate one observation under the rival that some gauges have gains of their own; return its log.
+
+    Which ones is not known: the predictive density of each gauge is a mixture of that without a gain and that
+    with a free one. belief (N,) and statistics (G, 5) are brought up to date: probability that the gain is
+    free, sum of squares without, sums c² and cx of the regression, and sum of squares of its innovations over
+    their spread (West and Harrison 1997, section 4.6).
+    """
+    belief[belief < NEGLIGIBLE_RIVAL] = 0.0
+    place = np.flatnonzero(belief)
+    if not place.size:
+        return -np.inf
+    free, plain, cc, cx, squares = statistics.T.copy()
+    x, c, known = shown.residual[place], gain * shown.size[place], known[place]
+    unknown = 1.0 / (1.0 + cc)
+    innovation, wide = x - c * unknown * cx, 1.0 + c**2 * unknown
+
+    def log_ratio(squared: Float, left: Float) -> Float:
+        constant = 0.5 * np.log((shown.degrees + squares_of_model) / left) * shown.there
+        return np.asarray(constant + shown.power * np.log(known / (1.0 + squared / left)))
+
+    free = free.clip(0.0, 1.0)  # rounding takes it above one
+    with_gain = np.log(free) + log_ratio(innovation**2 / wide, shown.degrees + squares) - 0.5 * np.log(wide)
+    both = np.logaddexp(with_gain, np.log1p(-free) + log_ratio(x**2, shown.degrees + plain))
+    log_value = log_likelihood[place] + both.sum(axis=1)
+    best = log_value.max()
+    weight = belief[place] * np.exp(log_value - best)
+    mass = weight.sum()
+    weight /= mass
+    belief[place] = weight
+    added = (x**2, c**2, c * x, innovation**2 / wide)
+    free = np.where(shown.there, weight @ np.exp(with_gain - both), statistics[:, 0])
+    statistics[:] = np.column_stack(
+        [free, *(old + weight @ new for old, new in zip((plain, cc, cx, squares), added, strict=True))]
+    )
+    return float(best + np.log(mass))
