@@ -104,13 +104,17 @@ def _show(result: "Calibration") -> None:
     from calibration.result import text
     from uav_twin.console_table import console_table
 
-    console = terminal.console()
+    console, headings = terminal.console(), text.WORDS.headings
     console.print(text.headline(result), soft_wrap=True)
-    console.print(console_table(text.HEADINGS, text.parameter_rows(result), console.width))
+    console.print(
+        console_table(headings("parameters"), text.parameter_rows(result), console.width)
+    )
     for line in text.correlation_lines(result):
         console.print(line, soft_wrap=True)
     if result.readings:
-        console.print(console_table(text.READING_HEADINGS, text.reading_rows(result), console.width))
-    console.print(console_table(text.CHANNEL_HEADINGS, text.channel_rows(result), console.width))
+        console.print(
+            console_table(headings("readings"), text.reading_rows(result), console.width)
+        )
+    console.print(console_table(headings("channels"), text.channel_rows(result), console.width))
     for sentence in result.findings:
         console.print(f"- {sentence}", soft_wrap=True)

@@ -7,18 +7,16 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
-from bokeh.util.paths import bokehjs_path
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import PeriodicCallback
 from tornado.netutil import bind_sockets
-from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
+from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from reporting.errors import ReportingError
 from twin_master.errors import TwinMasterError, ViewError
 from twin_master.viewer.flight import Flight
-from twin_master.viewer.messages import Request, Teller, parse_request, scene_record
-from twin_master.viewer.page import TALLEST_BAR, page_html
+from twin_master.viewer.messages import Request, Teller, page_html, parse_request
 from twin_master.viewer.scene import scene_of
 
 ADDRESS = "127.0.0.1"
@@ -132,14 +130,17 @@ class _Picture(_Text):
 
 
 def _application(flight: Flight, viewers: _Viewers) -> Application:
-    scene = scene_of(flight.folder, flight.knowledge)
-    page = page_html(scene, scene_record(scene) | {"tallest_bar": TALLEST_BAR})
+    page = page_html(scene_of(flight.folder, flight.knowledge))
     package = resources.files(__package__)
     texts = [
         ("/", page, "text/html"),
         *(
             (f"/{name}", package.joinpath(name).read_text(encoding="utf-8"), kind)
-            for name, kind in (("view.js", "text/javascript"), ("view.css", "text/css"))
+            for name, kind in (
+                ("plots.js", "text/javascript"),
+                ("view.js", "text/javascript"),
+                ("view.css", "text/css"),
+            )
         ),
     ]
     application = Application(websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20)
@@ -149,7 +150,6 @@ def _application(flight: Flight, viewers: _Viewers) -> Application:
             *((path, _Text, {"text": text, "kind": kind}) for path, text, kind in texts),
             ("/turns", _Turns, {"viewers": viewers}),
             ("/missing_force.svg", _Picture, {"flight": flight}),
-            ("/bokeh/(bokeh.min.js)", StaticFileHandler, {"path": str(Path(bokehjs_path()) / "js")}),
         ],
     )
     return application
