@@ -140,7 +140,7 @@ def panels(
 
 def band(axes: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str) -> None:
     """Draw the band between two lines (n,)."""
-    axes.fill_between(x, low, high, color=color, alpha=BAND_OPACITY, linewidth=0)  # type: ignore[arg-type]
+    axes.fill_between(x, low, high, color=color, alpha=BAND_OPACITY, linewidth=0)
 
 
 def color_bar(figure: Figure, drawn: Any, label: str, **place: Any) -> None:

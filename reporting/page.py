@@ -45,11 +45,6 @@ class Column:
     numeric: bool = False
 
 
-def columns(*heads: Column | str) -> tuple[Column, ...]:
-    """Return columns; a plain heading is one of text."""
-    return tuple(Column(head) if isinstance(head, str) else head for head in heads)
-
-
 def numbers(name: str, unit: str = "") -> Column:
     """Return a column of numbers."""
     return Column(name, unit, numeric=True)
@@ -234,7 +229,9 @@ def filled(template: str, /, **values: Any) -> str:
 
 @cache
 def _environment(plain: bool = False) -> Environment:
-    made = Environment(autoescape=not plain, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made = Environment(
+        autoescape=not plain, undefined=StrictUndefined, trim_blocks=not plain, lstrip_blocks=not plain
+    )
     made.filters["spaced"] = lambda text: Markup(_UNIT_SPACE.sub("\u00a0", str(escape(text))))
     shared: tuple[Callable[..., str], ...] = (words.listing, words.counted, words.number, words.capital)
     made.filters |= {function.__name__: function for function in shared}

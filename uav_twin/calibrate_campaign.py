@@ -104,17 +104,17 @@ def _show(result: "Calibration") -> None:
     from calibration.result import text
     from uav_twin.console_table import console_table
 
-    console, headings = terminal.console(), text.WORDS.headings
+    console = terminal.console()
+
+    def table(name: str, rows: "list[tuple[str, ...]]") -> None:
+        console.print(console_table(text.WORDS.headings(name), rows, console.width))
+
     console.print(text.headline(result), soft_wrap=True)
-    console.print(
-        console_table(headings("parameters"), text.parameter_rows(result), console.width)
-    )
+    table("parameters", text.parameter_rows(result))
     for line in text.correlation_lines(result):
         console.print(line, soft_wrap=True)
     if result.readings:
-        console.print(
-            console_table(headings("readings"), text.reading_rows(result), console.width)
-        )
-    console.print(console_table(headings("channels"), text.channel_rows(result), console.width))
+        table("readings", text.reading_rows(result))
+    table("channels", text.channel_rows(result))
     for sentence in result.findings:
         console.print(f"- {sentence}", soft_wrap=True)

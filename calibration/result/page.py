@@ -50,8 +50,8 @@ def report_figures(result: Calibration) -> dict[str, Figure]:
 
 def begun_page(result: Calibration, drawings: Mapping[str, bytes]) -> Page:
     """Return a page with all that a calibration says; `drawings` are its figures as SVG."""
-    page = Page(*(WORDS.say(name, result=result) for name in ("title", "subtitle")),
-                footer=(WORDS.say("footer", result=result),))  # fmt: skip
+    title, subtitle, footer = (WORDS.say(name, result=result) for name in ("title", "subtitle", "footer"))
+    page = Page(title, subtitle, (footer,))
     page.add_section("Result")
     page.add_highlights(
         [

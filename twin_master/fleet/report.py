@@ -95,7 +95,7 @@ def fleet_page(folder: Path, most: int) -> str:
     if config is None:
         raise FleetError(f"{folder} holds no fleet.")
     watched, fleet = config["kind"] == WATCHED_KIND, config["fleet"]
-    members = sum(len(group["members"]) for group in fleet["groups"])
+    members = sum(len(group.get("members", ())) for group in fleet["groups"])  # of a watch they are not known
     groups = len(fleet["groups"])
     page = Page(
         fleet["title"] or fleet["name"],
@@ -123,22 +123,22 @@ def _add_flown(page: Page, folder: Path, records: list[dict[str, Any]], most: in
     _add_lessons(page, folder)
     for record in records:
         group, scenario = groups[record["name"]], Scenario.model_validate(record["scenarios"][0])
-        rows, last = has_flown(group["status"].values), last_turns(group)
-        at = (rows, last[rows])
+        flown, last = has_flown(group["status"].values), last_turns(group)
+        at = (flown, last[flown])
         page.add_section(f"Group {record['name']}")
         try:
-            chance = leaving(folder, record, group)[rows]
+            chance = leaving(folder, record, group)[flown]
         except TwinMasterError as error:
             page.add_paragraph(WORDS.say("unknown", error=error))
-            chance = np.full(len(rows), np.nan)
+            chance = np.full(len(flown), np.nan)
         standing = Standing(
-            scenario, [record["members"][row][0] for row in rows], last[rows], group["mean"].values[at],
+            scenario, [record["members"][row][0] for row in flown], last[flown], group["mean"].values[at],
             group["standard_deviation"].values[at],
             [scenario.control_names[u] for u in group["control_index"].values[at]],
-            noticed(group, "alarm")[rows], chance,
+            noticed(group, "alarm")[flown], chance,
         )  # fmt: skip
         failed = int(np.sum(group["status"].values == FAILED))
-        courses = group["mean"].values[rows], group["state"].values[rows]
+        courses = group["mean"].values[flown], group["state"].values[flown]
         _add_group(page, standing, most, failed, courses)
 
 
@@ -299,7 +299,7 @@ def map_figure(scenario: Scenario, last: Float, failed: int) -> Figure:
     high = -(-count // wide)
     order = np.argsort(-last.sum(axis=1), kind="stable")
     figure, rows = style.panels(
-        len(factors), 1, 0.4 + 1.9 * len(factors), 0.3, 0.1, left=0.02, right=0.99, hspace=0.25
+        len(factors), 1, 0.4 + 1.9 * len(factors), 0.3, 0.1, left=0.07, right=0.99, hspace=0.25
     )
     for number, (factor, (axes,)) in enumerate(zip(factors, rows, strict=True)):
         cells = np.full(high * wide, np.nan)

@@ -6,19 +6,17 @@ bands of all, and the fifty that are worst.
 
 import asyncio
 from collections.abc import Callable
-from importlib import resources
 from pathlib import Path
 
-from tornado.web import Application, RequestHandler
+from tornado.web import Application
 
 from reporting.errors import ReportingError
-from reporting.page import script_source
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.report import fleet_page, fleet_record
 from twin_master.fleet.standing import STATE_NAME
 from twin_master.fleet.store import DONE_NAME
-from twin_master.viewer.server import HEADERS, OWN_NAMES, serve_application
+from twin_master.viewer.server import OWN_NAMES, handlers_of, serve_application, text_of
 
 __all__ = ["fleet_view", "is_fleet", "serve_fleet"]
 
@@ -63,42 +61,23 @@ class _Fleet:
                 continue  # it was just being written, or another fleet takes its place
 
 
-class _Answer(RequestHandler):
-    """What the page asks for."""
-
-    def initialize(self, answer: Callable[[], str], kind: str) -> None:
-        self._answer, self._kind = answer, kind
-
-    def set_default_headers(self) -> None:
-        for name, value in HEADERS.items():
-            self.set_header(name, value.replace("script-src 'self'", f"script-src 'self' {script_source()}"))
-
-    def get(self) -> None:
-        self.set_header("Content-Type", f"{self._kind}; charset=utf-8")
-        self.write(self._answer())
-
-
 def serve_fleet(
     folder: Path, port: int, ready: Callable[[str], None], wanted: Callable[[], bool] = lambda: True
 ) -> None:
     """Show a fleet to browsers of this machine, as `viewer.server.serve` shows a flight."""
     fleet = _Fleet(folder)
-    script = resources.files(__package__).joinpath("view.js").read_text(encoding="utf-8")
 
     def page() -> str:
         tag = f'<script src="/view.js" data-version="{fleet.version}"></script></body>'
         return fleet.html.replace("</body>", tag)
 
-    handlers = [
-        (path, _Answer, {"answer": answer, "kind": kind})
-        for path, answer, kind in (
-            ("/", page, "text/html"),
-            ("/version", lambda: str(fleet.version), "text/plain"),
-            ("/view.js", lambda: script, "text/javascript"),
-        )
-    ]
+    texts = {
+        "/": (page, "text/html"),
+        "/version": (lambda: str(fleet.version), "text/plain"),
+        "/view.js": (text_of("twin_master.fleet", "view.js"), "text/javascript"),
+    }
     application = Application()
-    application.add_handlers(OWN_NAMES, handlers)
+    application.add_handlers(OWN_NAMES, handlers_of(texts))
 
     async def follow_and_serve() -> None:
         following = asyncio.create_task(fleet.follow())

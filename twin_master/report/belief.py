@@ -15,7 +15,7 @@ from reporting.words import capital
 from twin_master.report.reading import Run
 from twin_master.report.view import short_number
 
-Float = NDArray[np.floating[Any]]
+Float = NDArray[np.float64]
 
 _PROBABILITY_COLORS = LinearSegmentedColormap.from_list(
     "probability", ["#ffffff", "#d3ece4", "#7fcbb2", style.PRESENT, "#003d2d"]
@@ -159,11 +159,12 @@ def _margin_map(figure: Figure, axes: Axes, run: Run) -> None:
     """Draw by how much one of two controls is worth more, or the best of several beyond the next best."""
     worth = run["policy/action_value"]
     if worth.shape[1] == 2:
-        margin, label = worth[:, 1] - worth[:, 0], f"Q({run.controls[1]}) − Q({run.controls[0]})"
+        label = f"Q({run.controls[1]}) − Q({run.controls[0]})"
     else:
-        margin, label = np.diff(np.sort(worth, axis=1)[:, -2:])[:, 0], "value beyond the next best"
+        worth, label = np.sort(worth, axis=1)[:, -2:], "value beyond the next best"
+    margin = worth[:, 1] - worth[:, 0]
     largest = float(np.abs(margin).max()) or 1.0
-    lowest, colors = (-largest, "PuOr") if worth.shape[1] == 2 else (0.0, "Purples")
+    lowest, colors = (-largest, "PuOr") if len(run.controls) == 2 else (0.0, "Purples")
     image = _map(axes, run, margin, cmap=colors, vmin=lowest, vmax=largest)
     for (x, y), value in zip(run.scales * run.coordinates, margin, strict=True):
         strong = abs(value) > 0.62 * largest

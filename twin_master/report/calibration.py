@@ -1,7 +1,6 @@
 """What the twin was told about the uncertain parameter of its model before it flew."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +12,7 @@ from reporting import figures as style
 from reporting.words import number, parameter_title
 from twin_master.report.reading import Run
 
-Float = NDArray[np.floating[Any]]
+Float = NDArray[np.float64]
 
 
 def true_value(run: Run) -> float | None:

@@ -1,6 +1,7 @@
 """The posterior predictive check: whether the observations look as the twin expects them to look."""
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,13 +15,14 @@ from reporting import figures as style
 from twin_master.report.reading import Run
 from twin_master.report.view import NORMAL_95
 
-Float = NDArray[np.floating[Any]]
+Float = NDArray[np.float64]
 
 _PIT_BINS = 10
 _MOST_CELLS = 6000  # as vectors; more would make the page too large
 
 
-class PredictiveCheck(NamedTuple):
+@dataclass(frozen=True)
+class PredictiveCheck:
     """Observations against the posterior predictive distribution of the same turn.
 
     Attributes
@@ -115,7 +117,8 @@ def _coverage_panel(axes: Axes, run: Run, check: PredictiveCheck) -> None:
 def _transform_panel(axes: Axes, check: PredictiveCheck) -> None:
     total = max(len(check.transform), 1)
     count, edges = np.histogram(check.transform, bins=_PIT_BINS, range=(0.0, 1.0))
-    _expected(axes, *(binom.ppf([0.025, 0.975], total, 1 / _PIT_BINS) * _PIT_BINS / total), 1.0)
+    low, high = binom.ppf([0.025, 0.975], total, 1 / _PIT_BINS) * _PIT_BINS / total
+    _expected(axes, low, high, 1.0)
     axes.bar(
         edges[:-1], count * _PIT_BINS / total, width=0.92 / _PIT_BINS, align="edge", color=style.PAST,
         alpha=0.75, linewidth=0,

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from reporting import figures as style
 from reporting.words import between, number, rounded
-from twin_master.report.reading import Learnt, Run
+from twin_master.report.reading import Run
+from twin_master.store.learnt import LearntQuantity
 
-Float = NDArray[np.floating[Any]]
+Float = NDArray[np.float64]
 
 _ROW_HEIGHT = 1.55
 
@@ -35,11 +36,11 @@ def learnt_figure(run: Run) -> Figure:
     places = [axes for row in grid for axes in row]
     for axes, learnt in zip(places, whole, strict=False):
         _course(axes, run, learnt.course, learnt.prior, learnt.truth)
-        style.panel_label(axes, next(labels), learnt.label)
+        style.panel_label(axes, next(labels), label_of(learnt))
     if len(whole) % 2:
         places[len(whole)].remove()
         places[len(whole) - 1].set_subplotspec(
-            places[len(whole) - 1].get_gridspec()[len(whole) // 2, :]  # type: ignore[index, union-attr]
+            places[len(whole) - 1].get_gridspec()[len(whole) // 2, :]  # type: ignore[index]
         )
     for (axes, beside), learnt in zip(grid[rows - len(of_sensors) :], of_sensors, strict=True):
         last = learnt.course[-1]
@@ -48,7 +49,7 @@ def learnt_figure(run: Run) -> Figure:
         axes.plot(_steps(run), others, color=style.REFERENCE, linewidth=0.5, alpha=0.8)
         truth = None if learnt.truth is None else learnt.truth[chosen]
         _course(axes, run, learnt.course[:, chosen], learnt.prior[chosen], truth)
-        style.panel_label(axes, next(labels), learnt.label)
+        style.panel_label(axes, next(labels), label_of(learnt))
         axes.text(
             0.99, 0.97, run.sensors.titles[chosen], transform=axes.transAxes, ha="right", va="top",
             color=style.PRESENT,
@@ -58,6 +59,11 @@ def learnt_figure(run: Run) -> Figure:
         style.panel_label(beside, next(labels), f"After the last {run.step}")
     _legend(figure, run)
     return figure
+
+
+def label_of(learnt: LearntQuantity) -> str:
+    """Return title and unit of a learnt quantity."""
+    return f"{learnt.title} ({learnt.unit})" if learnt.unit else learnt.title
 
 
 def _steps(run: Run) -> Float:
@@ -96,7 +102,7 @@ def _bar(axes: Axes, place: float, figures: Float, **look: Any) -> None:
     axes.errorbar([place], [mean], yerr=[[mean - low], [high - mean]], linestyle="none", **look)
 
 
-def _last_panel(axes: Axes, run: Run, learnt: Learnt, chosen: int) -> None:
+def _last_panel(axes: Axes, run: Run, learnt: LearntQuantity, chosen: int) -> None:
     place = np.arange(1.0, len(learnt.prior) + 1.0)
     axes.bar(
         place, learnt.prior[:, 3] - learnt.prior[:, 2], bottom=learnt.prior[:, 2], width=1.0,
@@ -133,7 +139,7 @@ def asset_rows(run: Run) -> list[tuple[str, ...]]:
     truth = any(learnt.truth is not None for learnt in whole)
     return [
         (
-            learnt.label,
+            label_of(learnt),
             *(number(float(value)) for value in (*learnt.prior[:2], *learnt.course[-1, :2])),
             between(*learnt.course[-1, 2:].tolist()),
             *([number(None if learnt.truth is None else float(learnt.truth))] if truth else []),

@@ -16,7 +16,7 @@ from twin_master.report.reading import Run
 from twin_master.report.view import NORMAL_95, short_number
 from twin_master.scenario.schema import REWARD_NAMES
 
-Float = NDArray[np.floating[Any]]
+Float = NDArray[np.float64]
 
 _ROW_HEIGHT = 1.22
 _NARROW = 0.19
@@ -86,7 +86,9 @@ def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> 
         Indices of the sensors to show, from 0; by default `choose_sensors`.
     """
     left: list[tuple[Any, int]] = [(_state_panel, k) for k in range(len(run.factors))] + [(_control_panel, 0)]
-    right = [(_sensor_panel, sensor) for sensor in (choose_sensors(run) if sensors is None else sensors)]
+    right: list[tuple[Any, int]] = [
+        (_sensor_panel, sensor) for sensor in (choose_sensors(run) if sensors is None else sensors)
+    ]
     for reward in range(len(REWARD_NAMES)):
         (left if len(left) <= len(right) else right).append((_reward_panel, reward))
     rows = max(len(left), len(right))
@@ -138,10 +140,10 @@ def _draw(axes: Axes, past: Band, predicted: Band, truth: Float | None, now: int
             step, center, lower, upper = (values[known] for values in shown)
             style.band(axes, step, lower, upper, color)
             axes.plot(step, center, color=color, label=label, **look)  # type: ignore[arg-type]
-    _, center, lower, upper = (float(values[-1]) for values in past)
-    if np.isfinite(center):
+    _, mean, least, most = (float(values[-1]) for values in past)
+    if np.isfinite(mean):
         axes.errorbar(
-            [now], [center], yerr=[[max(center - lower, 0.0)], [max(upper - center, 0.0)]],
+            [now], [mean], yerr=[[max(mean - least, 0.0)], [max(most - mean, 0.0)]],
             color=style.PRESENT, marker="D", markersize=4.2, capsize=2.0, elinewidth=1.2, linestyle="none",
             zorder=4, label="present",
         )  # fmt: skip

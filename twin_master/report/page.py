@@ -18,7 +18,7 @@ from twin_master.errors import RunFolderError
 from twin_master.report.belief import belief_figure, policy_figure
 from twin_master.report.calibration import believed, calibrated_rows, calibration_figure, measured, true_value
 from twin_master.report.check import PredictiveCheck, check_figure, predictive_check
-from twin_master.report.learnt import asset_rows, learnt_figure, sensor_rows, with_interval
+from twin_master.report.learnt import asset_rows, label_of, learnt_figure, sensor_rows, with_interval
 from twin_master.report.mission import choose_sensors, default_now, mission_figure
 from twin_master.report.opening import WORDS, opening_sentences
 from twin_master.report.reading import Run, read_run
@@ -212,7 +212,12 @@ def add_learnt(page: Page, run: Run) -> None:
         f"{learnt.title.lower()} {with_interval(np.nanmedian(learnt.prior, axis=0))}" for learnt in own
     )
     WORDS.add_table(
-        page, "learnt_sensors", sensor_rows(run), run=run, prior=prior, more=[learnt.label for learnt in own]
+        page,
+        "learnt_sensors",
+        sensor_rows(run),
+        run=run,
+        prior=prior,
+        more=[label_of(learnt) for learnt in own],
     )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,14 @@ from twin_master.report.view import PrintedFactor, PrintedSensors, printed_facto
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.learnt import MOMENTS, printed_learnt
+from twin_master.store.learnt import MOMENTS, LearntQuantity, printed_learnt
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME
 from twin_master.store.writing import read_run as read_tree
 
 if TYPE_CHECKING:
     import xarray as xr
 
-Float = NDArray[np.floating[Any]]
+Float = NDArray[np.float64]
 
 _OF_A_BELIEF = {
     "probability": "state", "mean": "region", "standard_deviation": "region", "quantity_mean": "sensor",
@@ -42,38 +42,6 @@ _TITLES = {
     "transition_factor": "Factor on the transitions",
 }
 _ROUNDING = 1e-6
-
-
-class Learnt(NamedTuple):
-    """A quantity that was learnt, of the whole asset or of each sensor, in printed units.
-
-    Attributes
-    ----------
-    name, title, unit : str
-        As stored, and as printed.
-    course : (T, 4) or (T, G, 4)
-        Mean, standard deviation and bounds of the 90 % interval after each step.
-    prior : (4,) or (G, 4)
-        Before the first step.
-    truth : () or (G,), or None
-    """
-
-    name: str
-    title: str
-    unit: str
-    course: Float
-    prior: Float
-    truth: Float | None
-
-    @property
-    def of_sensors(self) -> bool:
-        """Whether each sensor has its own."""
-        return self.course.ndim == 3
-
-    @property
-    def label(self) -> str:
-        """Title and unit."""
-        return f"{self.title} ({self.unit})" if self.unit else self.title
 
 
 @dataclass(frozen=True)
@@ -173,8 +141,8 @@ class Run:
         return np.stack([self[f"policy/{name}"] for name in self.scenario.state_names], axis=-1)
 
     @cached_property
-    def learnt(self) -> tuple[Learnt, ...]:
-        """What was learnt, in the order in which it is stored; empty where nothing is."""
+    def learnt(self) -> tuple[LearntQuantity, ...]:
+        """What was learnt, in printed units, in the order in which it is stored; empty where nothing is."""
         if "learnt" not in self.tree.children:
             return ()
         found = []
@@ -190,7 +158,9 @@ class Run:
             truth = self.get(f"truth/{name}")
             title = _TITLES.get(name, capital(parameter_title(name)))
             unit = "µε" if unit == "microstrain" else unit
-            found.append(Learnt(name, title, unit, course, prior, None if truth is None else scale * truth))
+            found.append(
+                LearntQuantity(name, title, unit, course, prior, None if truth is None else scale * truth)
+            )
         return tuple(found)
 
     def smoothed_until(self, now: int) -> Float:

@@ -84,7 +84,7 @@ def design_of(folder: Path) -> WingDesign | None:
 def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
     """Draw a wing after its last turn: regions by belief, gauges by reading and by residual (G,)."""
     measured = run.sensors.scale * run.observed[-1]
-    shown = (
+    shown: tuple[tuple[str, str, Float, str, dict[str, Any]], ...] = (
         (
             "a",
             f"Measured {run.sensors.quantity}",
@@ -95,7 +95,7 @@ def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
         ("b", "Measured less expected", residual, "standard deviations", _RESIDUALS),
     )
     with style.publication_style():
-        figure, rows = style.panels(2, 1, 4.0, 0.3, 0.1, left=0.06, right=0.93, hspace=0.25)
+        figure, rows = style.panels(2, 1, 4.0, 0.3, 0.1, left=0.1, right=0.92, hspace=0.25)
         for (axes,), (label, title, values, unit, look) in zip(rows, shown, strict=True):
             axes.fill(*planform.outline.T, facecolor="#f2f4f6", edgecolor=style.REFERENCE)
             regions = PolyCollection(
@@ -118,8 +118,9 @@ def _draw_gauges(figure: Figure, axes: Axes, places: Float, values: Float, unit:
     """Draw gauges (G, 2) by their values (G,), and a cross where one was lost."""
     known = np.isfinite(values)
     look = {"cmap": style.LEVELS, **look}
-    dots = axes.scatter(*places[known].T, c=values[known], s=36.0, edgecolors="black", linewidths=0.5, **look)
-    axes.scatter(*places[~known].T, marker="x", s=30.0, color=style.TRUTH, label="lost")
+    (x, y), (left, low) = places[known].T, places[~known].T
+    dots = axes.scatter(x, y, c=values[known], s=36.0, edgecolors="black", linewidths=0.5, **look)
+    axes.scatter(left, low, marker="x", s=30.0, color=style.TRUTH, label="lost")
     style.color_bar(figure, dots, unit, ax=axes, **_BAR)
 
 
@@ -150,7 +151,7 @@ def mesh_figure(run: Run, folder: Path, residual: Float) -> StructurePicture:
     view = np.column_stack((across, np.cross(towards, across)))
     order = np.argsort([(points[nodes] @ towards).mean() for nodes in corners])
     with style.publication_style():
-        figure, ((axes,),) = style.panels(1, 1, 0.55 * style.FULL_WIDTH, 0.05, 0.05, left=0.06, right=0.93)
+        figure, ((axes,),) = style.panels(1, 1, 0.55 * style.FULL_WIDTH, 0.05, 0.05, left=0.1, right=0.9)
         patches = PolyCollection(
             [points[corners[number]] @ view for number in order], array=100.0 * loss[cells][order], cmap=LOSS,
             edgecolors=["black" if region[cells[number]] > 0 else "0.6" for number in order], linewidths=0.4,

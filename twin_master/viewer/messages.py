@@ -5,7 +5,7 @@ One that was away, or is slow, asks for more at once, and nothing is kept for it
 """
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import resources
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from jinja2 import Template
 from markupsafe import Markup
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from twin_master.report.view import NORMAL_95
 from twin_master.viewer.flight import BegunAnewError, Belief, Flight
@@ -28,8 +29,7 @@ LATEST = -1
 """Asked for in the place of a turn: the last one, whichever it is."""
 
 
-@dataclass(frozen=True)
-class Request:
+class Request(BaseModel, frozen=True, extra="forbid", strict=True):
     """What a page asks for.
 
     Attributes
@@ -63,16 +63,7 @@ def parse_request(text: str | bytes) -> Request:
     ValueError
         It is no such request.
     """
-    try:
-        content = json.loads(text)
-    except RecursionError:
-        raise ValueError("a request is not nested") from None
-    names = Request.__dataclass_fields__
-    if not isinstance(content, dict) or set(content) != set(names):
-        raise ValueError(f"a request is an object with {', '.join(names)}")
-    if not all(type(value) is int for value in content.values()):
-        raise ValueError("a request holds whole numbers only")
-    return Request(**content)
+    return Request.model_validate_json(text)
 
 
 class Teller:

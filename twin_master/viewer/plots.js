@@ -10,6 +10,7 @@ const SCALES = {
   magnitude: ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#e1cc55", "#fee838"],
   damage: ["#ffffff", "#d55e00"],
 };
+const LEAST_WIDTH = 120;
 const MARGIN = { left: 52, right: 12, top: 8, bottom: 22 };
 
 function escaped(text) {
@@ -68,6 +69,7 @@ class Plot {
   paint() {
     if (this.marks === undefined) return;
     this.width = this.place.clientWidth;
+    if (this.width < LEAST_WIDTH) return; // not laid out yet
     const { height, unit, names } = this.options, right = this.width - MARGIN.right, floor = height - MARGIN.bottom;
     const known = this.values.filter(Number.isFinite);
     let [low, high] = this.options.range ?? [Math.min(...known), Math.max(...known)];
@@ -76,7 +78,7 @@ class Plot {
     const [first, last] = this.range;
     this.x = (value) => MARGIN.left + ((value - first) / (last - first)) * (right - MARGIN.left);
     this.y = (value) => floor - ((value - low) / (high - low)) * (floor - MARGIN.top);
-    const grid = (names ?? ticksOf(low, high, height / 45)).map((name, row) => {
+    const grid = (names ?? ticksOf(low, high, height / 32)).map((name, row) => {
       const at = names ? row + 0.4 : name, line = names ? this.y(row) : this.y(at);
       return `<path class="grid" d="M${MARGIN.left} ${line}H${right}"/>` +
         `<text x="${MARGIN.left - 6}" y="${this.y(at) + 4}" text-anchor="end">${escaped(names ? name : shortNumber(name))}</text>`;
@@ -162,6 +164,7 @@ class Wing {
   paint() {
     if (this.loss === undefined) return;
     const { planform, sensors, factors } = this, width = this.place.clientWidth, height = 230;
+    if (width < LEAST_WIDTH) return;
     const spans = planform.outline.map((point) => point[0]), chords = planform.outline.map((point) => point[1]);
     const x = (value) => 10 + ((value - Math.min(...spans)) / (Math.max(...spans) - Math.min(...spans))) * (width - 20);
     const y = (value) => 170 - ((value - Math.min(...chords)) / (Math.max(...chords) - Math.min(...chords))) * 145;

@@ -10,7 +10,8 @@ from tests.twin_master.report.synthetic_run import altered
 from twin_master.report.check import predictive_check
 from twin_master.report.opening import opening_sentences
 from twin_master.report.page import render_page
-from twin_master.report.reading import Learnt, Run
+from twin_master.report.reading import Run
+from twin_master.store.learnt import LearntQuantity
 
 REGION = "the stiffness loss of region 1"
 KEPT = "The twin kept 3g at every turn"
@@ -107,7 +108,9 @@ def test_the_last_sentence_judges_the_scatter(run: Run) -> None:
 
 def test_what_was_learnt_is_said(run: Run) -> None:
     course = np.tile([1.02, 0.004, 1.01, 1.03], (50, 1))
-    learnt = Learnt("young_modulus_factor", "Young modulus factor", "", course, course[0], np.array(1.025))
+    learnt = LearntQuantity(
+        "young_modulus_factor", "Young modulus factor", "", course, course[0], np.array(1.025)
+    )
     changed = replace(run)
     vars(changed)["learnt"] = (learnt,)
     said = opening_sentences(changed)[1]
