@@ -6,27 +6,17 @@ One that was away, or is slow, asks for more at once, and nothing is kept for it
 
 import json
 from dataclasses import asdict
-from importlib import resources
 from typing import Any
 
 import numpy as np
-from jinja2 import Template
-from markupsafe import Markup
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from twin_master.report.view import NORMAL_95
 from twin_master.viewer.flight import BegunAnewError, Belief, Flight
-from twin_master.viewer.scene import Scene
+from twin_master.viewer.scene import LATEST, WINDOW, Scene
 
 Float = NDArray[np.float64]
-
-WINDOW = 240
-"""Turns that a page shows at once."""
-TALLEST_BAR = 0.82
-"""Height of a probability of one, where a control has a row of height one."""
-LATEST = -1
-"""Asked for in the place of a turn: the last one, whichever it is."""
 
 
 class Request(BaseModel, frozen=True, extra="forbid", strict=True):
@@ -155,7 +145,7 @@ class Teller:
         mean, reach = scales * belief.state_mean, 2.0 * scales * belief.state_deviation
         reward, reward_reach = belief.reward_mean, NORMAL_95 * belief.reward_deviation
         center, spread = belief.sensor_mean, belief.sensor_deviation
-        if scene.sensors.standardised:
+        if scene.standardised:
             observed = None if observed is None else (observed - center) / spread
             center, spread = np.zeros_like(center), np.ones_like(spread)
         scale, sensor_reach = scene.sensors.scale, NORMAL_95 * spread
@@ -175,25 +165,6 @@ class Teller:
         if observed is not None:
             record["observed"] = scale * observed
         return {name: _plain(values) for name, values in record.items()}
-
-
-def page_html(scene: Scene) -> str:
-    """Return the page; its script draws the figures from what it is told."""
-    record = asdict(scene) | {
-        "window": WINDOW,
-        "latest": LATEST,
-        "tallest_bar": TALLEST_BAR,
-        "planform": None,
-    }
-    if scene.planform is not None:
-        outline, regions, gauges = scene.planform
-        parts = {"outline": outline.tolist(), "gauges": gauges.tolist()}
-        record["planform"] = parts | {"regions": [region.tolist() for region in regions]}
-    # Inside a script element only the beginning of a tag could end it.
-    content = json.dumps(record, allow_nan=False).replace("<", "\\u003c")
-    template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
-    page: str = Template(template, autoescape=True).render(scene=scene, content=Markup(content))
-    return page
 
 
 def _plain(values: Float) -> list[Any]:

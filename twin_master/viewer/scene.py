@@ -1,43 +1,30 @@
 """What stays the same during a flight: names, printed units, limits of the axes, and the asset from above."""
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass, replace
+from importlib import resources
 from pathlib import Path
+
+from jinja2 import Template
+from markupsafe import Markup
 
 from twin_master.mission.preparation import Knowledge
 from twin_master.report.structure import Planform, design_of, planform_of
-from twin_master.report.view import NORMAL_95, PrintedFactor, printed_factors, printed_sensors
-from twin_master.scenario.schema import REWARD_NAMES
+from twin_master.report.view import (
+    NORMAL_95,
+    PrintedFactor,
+    PrintedSensors,
+    printed_factors,
+    printed_sensors,
+)
+from twin_master.scenario.schema import REWARD_NAMES, Scenario
 
-
-@dataclass(frozen=True)
-class Sensors:
-    """The sensors, as printed.
-
-    Attributes
-    ----------
-    word : str
-        What one is called.
-    titles : tuple of str
-        Of each.
-    quantity, unit : str
-        What they show. Sensors of several units are shown as deviations from what is expected, in standard
-        deviations of that.
-    scale : float
-        From the stored unit to the printed one.
-    standardised : bool
-        Whether they have several units.
-    lowest, highest : float
-        What they can show without noise, printed.
-    """
-
-    word: str
-    titles: tuple[str, ...]
-    quantity: str
-    unit: str
-    scale: float
-    standardised: bool
-    lowest: float
-    highest: float
+WINDOW = 240
+"""Turns that a page shows at once."""
+LATEST = -1
+"""Asked for in the place of a turn: the last one, whichever it is."""
+TALLEST_BAR = 0.82
+"""Height of a probability of one, where a control has a row of height one."""
 
 
 @dataclass(frozen=True)
@@ -46,52 +33,58 @@ class Scene:
 
     Attributes
     ----------
-    title, step_name : str
-        Of the mission, and what a step of it is called.
-    steps : int
-        Of the mission.
-    horizon : int
-        Steps that are predicted.
+    scenario : Scenario
+        What is flown.
     factors : tuple of PrintedFactor
-    controls, rewards : tuple of str
-    sensors : Sensors
+        Of the state.
+    sensors : PrintedSensors
+        Where they have several units, as deviations from what is expected, in standard deviations of that.
+    standardised : bool
+        Whether they are.
+    ends : (lowest, highest)
+        What they can show without noise, printed.
     planform : Planform or None
         None for an asset that is no wing of this project.
     """
 
-    title: str
-    step_name: str
-    steps: int
-    horizon: int
+    scenario: Scenario
     factors: tuple[PrintedFactor, ...]
-    controls: tuple[str, ...]
-    rewards: tuple[str, ...]
-    sensors: Sensors
+    sensors: PrintedSensors
+    standardised: bool
+    ends: tuple[float, float]
     planform: Planform | None
 
 
 def scene_of(folder: Path, knowledge: Knowledge) -> Scene:
     """Return what stays the same during the flight in a run folder."""
-    scenario = knowledge.scenario
-    mission = scenario.mission
-    return Scene(
-        title=mission.title or mission.name,
-        step_name=mission.step_name,
-        steps=mission.steps,
-        horizon=mission.prediction_steps,
-        factors=printed_factors(scenario),
-        controls=tuple(scenario.control_names),
-        rewards=REWARD_NAMES,
-        sensors=_sensors(knowledge),
-        planform=planform_of(design_of(folder), scenario),
-    )
+    scenario, sensors = knowledge.scenario, printed_sensors(knowledge.scenario)
+    shown, several = sensors.scale * knowledge.sensor_model.mean, not sensors.unit
+    ends = (-NORMAL_95, NORMAL_95) if several else (float(shown.min()), float(shown.max()))
+    if several:
+        units = ("standard deviations",) * len(sensors.titles)
+        sensors = replace(sensors, quantity="deviation", units=units, scale=1.0)
+    planform = planform_of(design_of(folder), scenario)
+    return Scene(scenario, printed_factors(scenario), sensors, several, ends, planform)
 
 
-def _sensors(knowledge: Knowledge) -> Sensors:
-    printed = printed_sensors(knowledge.scenario)
-    told = (printed.word, printed.titles)
-    if not printed.unit:
-        return Sensors(*told, "deviation", "standard deviations", 1.0, True, -NORMAL_95, NORMAL_95)
-    shown = printed.scale * knowledge.sensor_model.mean
-    ends = float(shown.min()), float(shown.max())
-    return Sensors(*told, printed.quantity, printed.unit, printed.scale, False, *ends)
+def page_html(scene: Scene) -> str:
+    """Return the page; its script draws the figures from what it is told."""
+    mission, planform = scene.scenario.mission, None
+    if scene.planform is not None:
+        outline, regions, gauges = scene.planform
+        planform = {"outline": outline.tolist(), "gauges": gauges.tolist()}
+        planform["regions"] = [region.tolist() for region in regions]
+    lowest, highest = scene.ends
+    sensors = {"unit": scene.sensors.unit, "lowest": lowest, "highest": highest}
+    record = {
+        "title": mission.title or mission.name, "step_name": mission.step_name,
+        "horizon": mission.prediction_steps, "factors": [asdict(factor) for factor in scene.factors],
+        "controls": scene.scenario.control_names, "rewards": REWARD_NAMES,
+        "sensors": asdict(scene.sensors) | sensors, "planform": planform,
+        "window": WINDOW, "latest": LATEST, "tallest_bar": TALLEST_BAR,
+    }  # fmt: skip
+    # Inside a script element only the beginning of a tag could end it.
+    content = json.dumps(record, allow_nan=False).replace("<", "\\u003c")
+    template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
+    page: str = Template(template, autoescape=True).render(scene=record, content=Markup(content))
+    return page

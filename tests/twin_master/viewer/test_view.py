@@ -34,8 +34,8 @@ from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME
 from twin_master.report.reading import open_run
 from twin_master.scenario.reading import load_scenario
 from twin_master.viewer.flight import Flight
-from twin_master.viewer.messages import LATEST, Request, Teller, parse_request
-from twin_master.viewer.scene import scene_of
+from twin_master.viewer.messages import Request, Teller, parse_request
+from twin_master.viewer.scene import LATEST, scene_of
 from twin_master.workflow import new_run
 
 TURNS = 50
