@@ -22,12 +22,12 @@ function shortNumber(value) {
 }
 
 // About so many round numbers between two ends.
-function ticksOf(low, high, count) {
-  const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
+function ticksOf(low, high, most) {
+  const rough = (high - low) / most, power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map((part) => part * power).find((value) => value >= rough) ?? rough;
   const found = [];
-  for (let value = Math.ceil(low / step) * step; value <= high + 1e-9 * step; value += step) {
-    found.push(Number(value.toPrecision(12)));
+  for (let count = Math.ceil(low / step); count * step <= high + 1e-9 * step; count++) {
+    found.push(Number((count * step).toPrecision(12)));
   }
   return found;
 }

@@ -149,7 +149,10 @@ def _application(flight: Flight, viewers: _Viewers) -> Application:
         "/view.js": (text_of("twin_master.viewer", "view.js"), "text/javascript"),
         "/view.css": (text_of("twin_master.viewer", "view.css"), "text/css"),
     }
-    own = [("/turns", _Turns, {"viewers": viewers}), ("/missing_force.svg", _Picture, {"flight": flight})]
+    own: list[Any] = [
+        ("/turns", _Turns, {"viewers": viewers}),
+        ("/missing_force.svg", _Picture, {"flight": flight}),
+    ]
     application = Application(websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20)
     application.add_handlers(OWN_NAMES, [*handlers_of(texts), *own])
     return application
