@@ -3,10 +3,12 @@
 Text is drawn as it is written, whatever signs a user's title holds; a text with mathematics between dollar
 signs is given ``parse_math=True``.
 
-Figures are made with `new_figure` inside ``with publication_style():`` and never through pyplot, so that
-nothing global is left behind. Equal data give equal bytes: ids are salted, dates and program names left out.
+Figures are made with `new_figure` or `panels` inside ``with publication_style():``, or in a function under
+``@publication_style()``, and never through pyplot, so that nothing global is left behind. Equal data give
+equal bytes: ids are salted, dates and program names left out.
 """
 
+import html
 import io
 import re
 from collections.abc import Iterator
@@ -18,6 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
+from numpy.typing import ArrayLike
 
 from reporting.errors import InvalidFigureError
 from reporting.hover import annotated
@@ -41,6 +44,8 @@ LEVELS: Final = "cividis"
 """Colour map of magnitudes: perceptually even and safe for colour-blind readers."""
 
 BAND_OPACITY: Final = 0.22
+TRUTH_LINE: Final[dict[str, Any]] = {"color": TRUTH, "linewidth": 1.0, "linestyle": (0, (4, 1.5, 1, 1.5))}
+"""How a truth is drawn."""
 FULL_WIDTH: Final = 7.2
 """Width of a figure over two columns of a journal, in inches."""
 PNG_RESOLUTION: Final = 200.0
@@ -111,6 +116,38 @@ def new_figure(height: float, width: float = FULL_WIDTH) -> Figure:
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     return figure
+
+
+def panels(
+    rows: int, columns: int, height: float, top: float, bottom: float, **grid: Any
+) -> tuple[Figure, list[list[Axes]]]:
+    """Return a figure of a height [in] and its panels, row by row.
+
+    Parameters
+    ----------
+    rows, columns, height
+        How many panels, and the height of the figure [in].
+    top, bottom
+        Room above and below the panels [in].
+    **grid
+        What `Figure.add_gridspec` takes, in shares of the figure.
+    """
+    figure = new_figure(height)
+    room = {"top": 1.0 - top / height, "bottom": bottom / height, "left": 0.085, "right": 0.985}
+    cells = figure.add_gridspec(rows, columns, **{**room, **grid})
+    return figure, [[figure.add_subplot(cells[row, n]) for n in range(columns)] for row in range(rows)]
+
+
+def band(axes: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str) -> None:
+    """Draw the band between two lines (n,)."""
+    axes.fill_between(x, low, high, color=color, alpha=BAND_OPACITY, linewidth=0)
+
+
+def color_bar(figure: Figure, drawn: Any, label: str, **place: Any) -> None:
+    """Draw the scale of colours of what was drawn; `place` is `ax`, beside a panel, or `cax`, in one."""
+    bar = figure.colorbar(drawn, **place)
+    bar.set_label(label)
+    bar.outline.set_linewidth(0.5)
 
 
 def panel_label(axes: Axes, label: str, title: str = "", *, offset: float = 0.0) -> None:
@@ -200,7 +237,4 @@ def inline_svg(svg: bytes, prefix: str, description: str) -> str:
     body = _REFERENCE.sub(rf"\1{prefix}-\2", body)
     # Inside HTML the parser knows the namespaces; `href` without the xlink prefix is the current standard.
     body = body.replace("xlink:href=", "href=")
-    escaped = (
-        description.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&quot;")
-    )
-    return f'<svg viewBox="{view_box.group(1)}" role="img" aria-label="{escaped}"{body}'
+    return f'<svg viewBox="{view_box.group(1)}" role="img" aria-label="{html.escape(description)}"{body}'

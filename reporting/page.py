@@ -1,20 +1,27 @@
 """A self-contained HTML page: sections, numbered figures and tables, one style sheet, nothing from outside.
 
 No request to any server; light, and fit to be printed. One short script shows the values under the
-pointer in figures; the page is whole without it. All text is escaped.
+pointer in figures; the page is whole without it. All text is escaped. `page.html` is its form; the words of a
+page stand in a TOML file of its own, see `Words`.
 """
 
-import html
 import re
+import tomllib
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib import resources
+from typing import Any, NamedTuple
 
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup, escape
+from matplotlib.figure import Figure
+
+from reporting import words
 from reporting.errors import InvalidFigureError
-from reporting.figures import inline_svg
+from reporting.figures import inline_svg, to_svg
 
 _UNIT_SPACE = re.compile(r"(?<=\d) (?=(%|µε|s|ms|µs|Hz|mm|m|kg|N)(?!\w))")
 
@@ -36,11 +43,6 @@ class Column:
     name: str
     unit: str = ""
     numeric: bool = False
-
-
-def columns(*heads: Column | str) -> tuple[Column, ...]:
-    """Return columns; a plain heading is one of text."""
-    return tuple(Column(head) if isinstance(head, str) else head for head in heads)
 
 
 def numbers(name: str, unit: str = "") -> Column:
@@ -76,6 +78,72 @@ class Table:
                 )
 
 
+class ReportFigure(NamedTuple):
+    """A figure with its words.
+
+    Attributes
+    ----------
+    name
+        Name of its file, without ending.
+    figure
+        The drawing.
+    title, caption
+        Below it.
+    """
+
+    name: str
+    figure: Figure
+    title: str
+    caption: str
+
+
+class Words:
+    """The words of a page, from a TOML file; each is a Jinja2 template that is filled with values.
+
+    Parameters
+    ----------
+    package
+        Where the file is, such as ``twin_master.report``.
+    name
+        Of the file: ``[said]`` holds sentences by name, ``[figures]`` titles and captions, and ``[tables]``
+        titles, captions and columns, each a heading, or ``{ number = heading, unit = unit }``.
+    """
+
+    def __init__(self, package: str, name: str = "words.toml") -> None:
+        self.content = tomllib.loads(resources.files(package).joinpath(name).read_text(encoding="utf-8"))
+
+    def say(self, name: str, /, **values: Any) -> str:
+        """Return a sentence of the table ``[said]``."""
+        return filled(self.content["said"][name], **values)
+
+    def headings(self, name: str) -> tuple[str, ...]:
+        """Return the headings of a table, for a terminal."""
+        columns = self.content["tables"][name]["columns"]
+        return tuple(head if isinstance(head, str) else head["number"] for head in columns)
+
+    def words(self, kind: str, name: str, /, **values: Any) -> dict[str, str]:
+        """Return title and caption of one of the `figures` or `tables`."""
+        told = self.content[kind][name]
+        return {part: filled(told[part], **values) for part in ("title", "caption")}
+
+    def figure(self, name: str, figure: Any, /, **values: Any) -> ReportFigure:
+        """Return a figure with its words."""
+        return ReportFigure(name, figure, **self.words("figures", name, **values))
+
+    def add_table(self, page: "Page", name: str, rows: Sequence[Sequence[str]], /, **values: Any) -> None:
+        """Add a table with its words to a page, if it has rows; `more` are further columns."""
+        if not rows:
+            return
+        heads = [
+            Column(filled(head, **values))
+            if isinstance(head, str)
+            else numbers(filled(head["number"], **values), head.get("unit", ""))
+            for head in self.content["tables"][name]["columns"]
+        ]
+        heads += [head if isinstance(head, Column) else numbers(head) for head in values.get("more", ())]
+        page.add_table(Table(heads[: len(rows[0])], rows), **self.words("tables", name, **values))
+
+
 class Page:
     """Builds one page from top to bottom.
 
@@ -90,37 +158,31 @@ class Page:
     """
 
     def __init__(self, title: str, subtitle: str = "", footer: Sequence[str] = ()) -> None:
-        self._title = title
-        self._subtitle = subtitle
-        self._footer = tuple(footer)
-        self._body: list[str] = []
-        self._sections: list[str] = []
-        self._figure_count = 0
-        self._table_count = 0
+        self._head = {"title": title, "subtitle": subtitle, "footer": footer}
+        self._blocks: list[tuple[str, dict[str, Any]]] = []
+
+    def _add(self, kind: str, **content: Any) -> int:
+        self._blocks.append((kind, content))
+        return self._count(kind)
+
+    def _count(self, kind: str) -> int:
+        return sum(other == kind for other, _ in self._blocks)
 
     def add_section(self, title: str) -> None:
         """Begin a section; it appears in the contents."""
-        if self._sections:
-            self._body.append("</section>")
-        self._sections.append(title)
-        number = len(self._sections)
-        self._body.append(f'<section id="section-{number}"><h2>{_text(title)}</h2>')
+        self._add("section", title=title, number=self._count("section") + 1)
 
     def add_paragraph(self, text: str) -> None:
         """Add a paragraph of plain text."""
-        self._body.append(f"<p>{_text(text)}</p>")
+        self._add("paragraph", text=text)
 
     def add_notice(self, text: str) -> None:
         """Add a paragraph that the reader must not overlook."""
-        self._body.append(f'<p class="notice">{_text(text)}</p>')
+        self._add("notice", text=text)
 
     def add_highlights(self, items: Sequence[tuple[str, str]]) -> None:
         """Add a row of few figures in large print: (value with unit, what it is)."""
-        cells = "".join(
-            f"<div><strong>{_text(value)}</strong><span>{_text(meaning)}</span></div>"
-            for value, meaning in items
-        )
-        self._body.append(f'<div class="highlights">{cells}</div>')
+        self._add("highlights", items=items)
 
     def add_figure(self, svg: bytes, caption: str, *, title: str) -> int:
         """Add a numbered figure; return its number.
@@ -139,68 +201,41 @@ class Page:
         InvalidFigureError
             `svg` is not an SVG that can be scaled.
         """
-        self._figure_count += 1
-        number = self._figure_count
-        drawing = inline_svg(svg, prefix=f"f{number}", description=title)
-        self._body.append(
-            f'<figure id="figure-{number}">{drawing}<figcaption><b>Figure {number}. '
-            f"{_text(title)}.</b> {_text(caption)}</figcaption></figure>"
-        )
-        return number
+        number = self._count("figure") + 1
+        drawing = Markup(inline_svg(svg, prefix=f"f{number}", description=title))
+        return self._add("figure", number=number, drawing=drawing, title=title, caption=caption)
+
+    def add_report_figure(self, figure: ReportFigure) -> int:
+        """Add a figure that has its words; return its number."""
+        return self.add_figure(to_svg(figure.figure), figure.caption, title=figure.title)
 
     def add_table(self, table: Table, caption: str, *, title: str) -> int:
         """Add a numbered table; return its number."""
-        self._table_count += 1
-        number = self._table_count
-        heads = "".join(
-            f"<th{_alignment(column)}>{_text(column.name)}"
-            + (f"<small>{_text(column.unit)}</small>" if column.unit else "")
-            + "</th>"
-            for column in table.columns
-        )
-        rows = "".join(
-            "<tr>"
-            + "".join(
-                f"<td{_alignment(column)}>{_text(cell)}</td>"
-                for column, cell in zip(table.columns, row, strict=True)
-            )
-            + "</tr>"
-            for row in table.rows
-        )
-        self._body.append(
-            f'<div class="table" id="table-{number}"><p class="caption"><b>Table {number}. '
-            f"{_text(title)}.</b> {_text(caption)}</p>"
-            f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
-        )
-        return number
+        return self._add("table", number=self._count("table") + 1, table=table, title=title, caption=caption)
 
     def render(self) -> str:
         """Return the page as one string of HTML."""
-        contents = "".join(
-            f'<li><a href="#section-{number}">{_text(title)}</a></li>'
-            for number, title in enumerate(self._sections, start=1)
-        )
-        navigation = f"<nav><ol>{contents}</ol></nav>" if len(self._sections) > 1 else ""
-        subtitle = f'<p class="subtitle">{_text(self._subtitle)}</p>' if self._subtitle else ""
-        footer = "".join(f"<p>{_text(line)}</p>" for line in self._footer)
-        body = "\n".join(self._body) + ("</section>" if self._sections else "")
-        script = f"<script>{_own('hover.js')}</script>\n" if " data-axes=" in body else ""
-        return (
-            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            f"<title>{_text(self._title)}</title>\n<style>\n{_own('page.css')}</style>\n</head>\n<body>\n<main>\n"
-            f"<header><h1>{_text(self._title)}</h1>{subtitle}</header>\n{navigation}\n{body}\n"
-            f"<footer>{footer}</footer>\n</main>\n{script}</body>\n</html>\n"
-        )
+        drawn = any(" data-axes=" in content["drawing"] for kind, content in self._blocks if kind == "figure")
+        return _environment().from_string(_own("page.html")).render(
+            **self._head, blocks=self._blocks, style=Markup(_own("page.css")),
+            script=Markup(_own("hover.js")) if drawn else "",
+        )  # fmt: skip
 
 
-def _text(text: str) -> str:
-    """Escape text for HTML and keep a figure and its unit on one line."""
-    return html.escape(_UNIT_SPACE.sub("\u00a0", text))
+def filled(template: str, /, **values: Any) -> str:
+    """Return a text whose Jinja2 expressions are filled with values, in one line."""
+    return " ".join(_environment(plain=True).from_string(template).render(**values).split())
 
 
-def _alignment(column: Column) -> str:
-    return ' class="number"' if column.numeric else ""
+@cache
+def _environment(plain: bool = False) -> Environment:
+    made = Environment(
+        autoescape=not plain, undefined=StrictUndefined, trim_blocks=not plain, lstrip_blocks=not plain
+    )
+    made.filters["spaced"] = lambda text: Markup(_UNIT_SPACE.sub("\u00a0", str(escape(text))))
+    shared: tuple[Callable[..., str], ...] = (words.listing, words.counted, words.number, words.capital)
+    made.filters |= {function.__name__: function for function in shared}
+    return made
 
 
 @cache

@@ -1,7 +1,9 @@
-"""Numbers beside their nouns, names of parameters, and reasons, for sentences."""
+"""Numbers beside their nouns and their uncertainties, names of parameters, and reasons, for sentences."""
 
 import re
 from collections.abc import Iterable
+from math import floor, isfinite, log10
+from typing import Any
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:
@@ -40,3 +42,46 @@ def one_line(reason: object) -> str:
 def parameter_title(name: str) -> str:
     """Return the name of a parameter in words, "young_modulus_factor" as "Young modulus factor"."""
     return re.sub(r"\byoung\b", "Young", name.replace("_", " "))
+
+
+def number(value: Any) -> str:
+    """Return a figure as printed: text as it is, five significant digits, a dash for none."""
+    if value is None:
+        return "—"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.5g}".replace("-", "−") if isinstance(value, float) else str(value)
+
+
+def rounded(value: float, deviation: float) -> str:
+    """Return a value with as many decimals as two digits of its deviation need."""
+    if not isfinite(value):
+        return "—"
+    if not (deviation > 0.0 and isfinite(deviation)):
+        return f"{value:.6g}".replace("-", "−")
+    decimals = 1 - floor(log10(deviation))
+    if abs(value) >= 1e6 or deviation < 1e-6:
+        digits = max(2, floor(log10(max(abs(value), deviation))) + decimals + 1)
+        return f"{value:.{min(digits, 12) - 1}e}"
+    return f"{value:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def plus_minus(value: float, deviation: float) -> str:
+    """Return mean ± standard deviation."""
+    return f"{rounded(value, deviation)} ± {rounded(deviation, deviation)}"
+
+
+def between(low: float, high: float, deviation: float | None = None) -> str:
+    """Return an interval with as many decimals as its width or another deviation needs."""
+    spread = high - low if deviation is None else deviation
+    return f"{rounded(low, spread)} to {rounded(high, spread)}"
+
+
+def capital(text: str) -> str:
+    """Return the text with its first letter capital."""
+    return text[:1].upper() + text[1:]
+
+
+def small(text: str) -> str:
+    """Return the text with its first letter small, to stand in a sentence."""
+    return text[:1].lower() + text[1:]

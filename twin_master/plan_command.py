@@ -287,7 +287,7 @@ def _places(scenario: "Scenario") -> "tuple[Float | None, list[Float]]":
     from fe.wing.design import load_design
     from twin_master.assets.design_source import DESIGN_COPY
     from twin_master.assets.structure_source import MODEL_COPY
-    from twin_master.viewer.scene import planform_of
+    from twin_master.report.structure import planform_of
 
     files = scenario.belief.all_files()
     structure = load_structure(files[MODEL_COPY]) if MODEL_COPY in files else None

@@ -103,12 +103,15 @@ def _record(result: "Calibration") -> dict[str, Any]:
 def _show(result: "Calibration") -> None:
     from calibration.result import text
 
+    def table(name: str, rows: "list[tuple[str, ...]]") -> None:
+        terminal.print_table(text.WORDS.headings(name), rows)
+
     terminal.say(text.headline(result))
-    terminal.print_table(text.HEADINGS, text.parameter_rows(result))
+    table("parameters", text.parameter_rows(result))
     for line in text.correlation_lines(result):
         terminal.say(line)
     if result.readings:
-        terminal.print_table(text.READING_HEADINGS, text.reading_rows(result))
-    terminal.print_table(text.CHANNEL_HEADINGS, text.channel_rows(result))
+        table("readings", text.reading_rows(result))
+    table("channels", text.channel_rows(result))
     for sentence in result.findings:
         terminal.say(f"- {sentence}")

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.stats import gaussian_kde
@@ -17,7 +18,8 @@ from reporting.figures import (
     PAST,
     PRESENT,
     REFERENCE,
-    new_figure,
+    band,
+    panels,
     publication_style,
 )
 
@@ -31,6 +33,7 @@ _COLUMNS = 3
 _MOST_READINGS = 12
 
 
+@publication_style()
 def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> Figure:
     """Draw samples pair by pair, with their correlations, and others beside.
 
@@ -42,54 +45,50 @@ def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> F
         Name and samples, in the units of the titles, of up to three distributions; correlations are those of
         the first, and the histograms of the others have scales of their own.
     """
-    samples = sets[0][1]
-    correlation: Float = np.atleast_2d(np.corrcoef(samples, rowvar=False))
+    correlation: Float = np.atleast_2d(np.corrcoef(sets[0][1], rowvar=False))
     size = len(titles)
-    with publication_style():
-        figure = new_figure(height=min(6.6, 2.2 + 1.1 * (size - 1)) if size < 5 else 6.6)
-        grid = figure.add_gridspec(
-            size, size, wspace=0.10, hspace=0.10, left=0.085, right=0.985,
-            bottom=0.075 if size > 3 else 0.16, top=0.985,
-        )  # fmt: skip
-        limits = [_limits([values[:, index] for _, values in sets]) for index in range(size)]
-        for row in range(size):
-            for column in range(size):
-                axes = figure.add_subplot(grid[row, column])
-                if column > row:
-                    _draw_correlation(axes, float(correlation[row, column]))
-                    continue
-                if column == row:
-                    _draw_marginal(axes, [values[:, row] for _, values in sets], limits[row])
-                else:
-                    for colour, (_, values) in zip(_COLOURS, sets, strict=False):
-                        axes.plot(
-                            values[:, column], values[:, row], ".", color=colour, ms=1.6, alpha=0.35, mew=0.0,
-                            rasterized=True,
-                        )  # fmt: skip
-                    axes.set_ylim(limits[row])
-                axes.set_xlim(limits[column])
-                _outer_labels(axes, titles, row, column)
-        handles = [
-            Axes.plot(axes, [], [], "s", color=colour, ms=4.0, label=text)[0]
-            for colour, (text, _) in zip(_COLOURS, sets, strict=False)
-        ]
-        figure.legend(handles=handles, loc="upper right", bbox_to_anchor=(0.985, 0.99))
+    height = min(6.6, 2.2 + 1.1 * (size - 1)) if size < 5 else 6.6
+    bottom = height * (0.075 if size > 3 else 0.16)
+    figure, grid = panels(size, size, height, 0.015 * height, bottom, left=0.105, wspace=0.10, hspace=0.10)
+    limits = [_limits([values[:, index] for _, values in sets]) for index in range(size)]
+    for (row, column), axes in np.ndenumerate(np.array(grid)):
+        if column > row:
+            _draw_correlation(axes, float(correlation[row, column]))
+            continue
+        if column == row:
+            _draw_marginal(axes, [values[:, row] for _, values in sets], limits[row])
+        else:
+            for colour, (_, values) in zip(_COLOURS, sets, strict=False):
+                axes.plot(
+                    values[:, column], values[:, row], ".", color=colour, ms=1.6, alpha=0.35, mew=0.0,
+                    rasterized=True,
+                )  # fmt: skip
+            axes.set_ylim(limits[row])
+        axes.set_xlim(limits[column])
+        _outer_labels(axes, titles, row, column)
+    handles = [
+        Line2D([], [], linestyle="none", marker="s", color=colour, ms=4.0, label=text)
+        for colour, (text, _) in zip(_COLOURS, sets, strict=False)
+    ]
+    figure.legend(handles=handles, loc="upper right", bbox_to_anchor=(0.985, 0.99))
     return figure
 
 
+@publication_style()
 def readings_figure(result: Calibration) -> Figure:
     """Draw figures before and after, with what was measured of them."""
     readings = result.readings[:_MOST_READINGS]
     rows = -(-len(readings) // _COLUMNS)
-    with publication_style():
-        figure = new_figure(height=0.5 + 1.55 * rows)
-        grid = figure.add_gridspec(
-            rows, _COLUMNS, wspace=0.14, hspace=0.75, left=0.02, right=0.985, bottom=0.28 / rows, top=0.9
-        )
-        for index, reading in enumerate(readings):
-            axes = figure.add_subplot(grid[index // _COLUMNS, index % _COLUMNS])
-            _draw_reading(axes, result, reading)
-        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="upper left", ncols=3)
+    height = 0.5 + 1.55 * rows
+    figure, grid = panels(
+        rows, _COLUMNS, height, 0.1 * height, 0.28 / rows * height, left=0.02, wspace=0.14, hspace=0.75
+    )
+    places = [axes for row in grid for axes in row]
+    for axes, reading in zip(places, readings, strict=False):
+        _draw_reading(axes, result, reading)
+    for spare in places[len(readings) :]:
+        spare.remove()
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="upper left", ncols=3)
     return figure
 
 
@@ -110,7 +109,7 @@ def _draw_reading(axes: Axes, result: Calibration, reading: Reading) -> None:
     if posterior.std() > 1e-9 * abs(mean):
         after = gaussian_kde(posterior)(grid)
         top = float(after.max())
-        axes.fill_between(grid, after, color=PAST, alpha=BAND_OPACITY, lw=0.0)
+        band(axes, grid, np.zeros_like(grid), after, PAST)
         axes.plot(grid, after, color=PAST, lw=1.3, label="after the calibration")
     else:
         axes.axvline(mean, color=PAST, lw=1.3, label="after the calibration")

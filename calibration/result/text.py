@@ -1,14 +1,14 @@
 """The figures of a calibration in words, for console and page."""
 
-from math import floor, isfinite, log10
+from math import isfinite
 
 import numpy as np
 
 from calibration.result.record import Calibration
+from reporting.page import Words
+from reporting.words import between, plus_minus
 
-HEADINGS = ("parameter", "unit", "prior", "posterior", "90 % interval", "prior left")
-READING_HEADINGS = ("experiment", "figure", "unit", "measured", "before", "after", "in deviations")
-CHANNEL_HEADINGS = ("channel", "trials", "readings", "rms before", "rms after")
+WORDS = Words("calibration.result")
 NOTED_CORRELATION = 0.3
 PROCEDURES = {
     "quadrature": "by quadrature",
@@ -18,73 +18,47 @@ PROCEDURES = {
     "paper": "by the paper's procedure, step after step",
 }
 
-
-def figures(value: float, deviation: float) -> str:
-    """Return a value with as many decimals as two digits of its deviation need."""
-    if not (deviation > 0.0 and isfinite(deviation)):
-        return f"{value:.6g}"
-    decimals = 1 - floor(log10(deviation))
-    if abs(value) >= 1e6 or deviation < 1e-6:
-        digits = max(2, floor(log10(max(abs(value), deviation))) + decimals + 1)
-        return f"{value:.{min(digits, 12) - 1}e}"
-    return f"{value:.{max(decimals, 0)}f}"
+Rows = list[tuple[str, ...]]
 
 
-def with_deviation(value: float, deviation: float) -> str:
-    """Return mean ± standard deviation."""
-    return f"{figures(value, deviation)} ± {figures(deviation, deviation)}"
-
-
-def parameter_rows(result: Calibration) -> list[tuple[str, ...]]:
-    """Return a row of `HEADINGS` for each parameter."""
-    rows: list[tuple[str, ...]] = []
+def parameter_rows(result: Calibration) -> Rows:
+    """Return a row for each parameter."""
+    rows: Rows = []
     for prior in result.priors:
-        deviation = result.standard_deviation(prior.name)
-        low, high = result.interval(prior.name)
+        deviation, kept = result.standard_deviation(prior.name), 100.0 * result.kept_share(prior.name)
         rows.append(
             (
-                prior.name,
-                "" if prior.unit == "1" else prior.unit,
-                with_deviation(*result.prior_moments(prior.name)),
-                with_deviation(result.mean(prior.name), deviation),
-                f"{figures(low, deviation)} to {figures(high, deviation)}",
-                _percent(result.kept_share(prior.name)),
+                prior.name, "" if prior.unit == "1" else prior.unit,
+                plus_minus(*result.prior_moments(prior.name)), plus_minus(result.mean(prior.name), deviation),
+                between(*result.interval(prior.name), deviation), f"{kept:.{0 if kept > 9.5 else 1}f} %",
             )
-        )
+        )  # fmt: skip
     return rows
 
 
-def reading_rows(result: Calibration) -> list[tuple[str, ...]]:
-    """Return a row of `READING_HEADINGS` for each reading."""
+def reading_rows(result: Calibration) -> Rows:
+    """Return a row for each reading."""
     units = {figure.name: "" if figure.unit == "1" else figure.unit for figure in result.figures}
     return [
         (
-            item.experiment,
-            item.name,
-            units[item.name],
-            with_deviation(item.value, item.deviation),
-            with_deviation(*result.prior_moments(item.name)),
-            with_deviation(result.mean(item.name), result.standard_deviation(item.name)),
+            item.experiment, item.name, units[item.name], plus_minus(item.value, item.deviation),
+            plus_minus(*result.prior_moments(item.name)),
+            plus_minus(result.mean(item.name), result.standard_deviation(item.name)),
             f"{result.score(item):+.1f}",
         )
         for item in result.readings
-    ]
+    ]  # fmt: skip
 
 
-def channel_rows(result: Calibration) -> list[tuple[str, ...]]:
-    """Return a row of `CHANNEL_HEADINGS` for each channel."""
+def channel_rows(result: Calibration) -> Rows:
+    """Return a row for each channel."""
     return [
-        (item.name, item.trials, str(item.readings), *(_size(value) for value in (item.before, item.after)))
+        (
+            item.name, item.trials, str(item.readings),
+            *(f"{size:.2f}" if isfinite(size) else "noise unknown" for size in (item.before, item.after)),
+        )
         for item in result.channels
-    ]
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.0f} %" if share > 0.095 else f"{100.0 * share:.1f} %"
-
-
-def _size(value: float) -> str:
-    return f"{value:.2f}" if isfinite(value) else "noise unknown"
+    ]  # fmt: skip
 
 
 def correlation_lines(result: Calibration) -> list[str]:
@@ -101,10 +75,4 @@ def correlation_lines(result: Calibration) -> list[str]:
 
 def headline(result: Calibration) -> str:
     """Return what was calibrated, and how."""
-    named = "" if result.asset == result.source else f"{result.asset}: "
-    told = f", {gained:.1f} nat gained" if (gained := result.information) is not None else ""
-    where = f", campaign {result.source}" if result.design is None else ""
-    return (
-        f"{named}{result.model}{where}; posterior {PROCEDURES[result.procedure]}, "
-        f"{len(result.samples)} samples{told}"
-    )
+    return WORDS.say("headline", result=result, procedure=PROCEDURES[result.procedure])

@@ -6,9 +6,9 @@ import numpy as np
 
 from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, AmplitudePoint, amplitude_dependence
 from calibration.result.record import Calibration
-from calibration.result.text import with_deviation
 from calibration.static.experiments import published_measurements
 from calibration.static.quality import FitQuality
+from reporting.words import plus_minus
 
 from .lab_data import LabData
 
@@ -34,10 +34,10 @@ def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> lis
         if not far and abs(result.score(reading)) <= NOTICEABLE:
             continue
         unit = "" if figure.unit == "1" else f" {figure.unit}"
-        model = with_deviation(result.mean(name), result.standard_deviation(name))
+        model = plus_minus(result.mean(name), result.standard_deviation(name))
         found.append(
             f"{figure.title[0].upper()}{figure.title[1:]}: measured "
-            f"{with_deviation(reading.value, reading.deviation)}{unit}, calibrated model {model}{unit}, "
+            f"{plus_minus(reading.value, reading.deviation)}{unit}, calibrated model {model}{unit}, "
             f"{_percent(relative)} off ({abs(result.score(reading)):.1f} standard deviations)."
         )
         if name == "frequency_2" and the_papers:

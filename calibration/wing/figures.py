@@ -1,6 +1,7 @@
 """Mode shapes of a calibrated wing."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,13 +11,14 @@ from numpy.typing import NDArray
 
 from fe.reduction.fields import WingFields
 from fe.runtime.reduced import Modes
-from reporting.figures import LEVELS, new_figure, publication_style
+from reporting.figures import LEVELS, panels, publication_style
 
 Float = NDArray[np.float64]
 
 _FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 
 
+@publication_style()
 def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Figure:
     """Draw the mode shapes of the upper skin in oblique view, coloured by their displacement.
 
@@ -34,21 +36,19 @@ def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Fig
     span = float(np.ptp(points[:, 1]))
     shapes = fields.basis.modal_displacement @ modes.shape
     rows = (len(titles) + 1) // 2
-    with publication_style():
-        figure = new_figure(height=1.5 * rows)
-        grid = figure.add_gridspec(
-            rows, 2, wspace=0.06, hspace=0.04, left=0.01, right=0.99, bottom=0.0, top=0.99
-        )
-        for index, title in enumerate(titles):
-            axes = figure.add_subplot(grid[index // 2, index % 2])
-            shape = shapes[:, :, index]
-            length = np.linalg.norm(shape, axis=1)
-            moved = points + shape * (0.14 * span / float(length.max()))
-            _draw_skin(axes, points, faces, None)
-            _draw_skin(axes, moved, faces, length / float(length.max()))
-            axes.set_xlim(-0.09 * span, 1.10 * span)
-            axes.set_ylim(-0.24 * span, 0.27 * span)
-            axes.text(0.0, 0.97, title, transform=axes.transAxes, va="top", fontsize=8.0, fontweight="bold")
+    figure, grid = panels(
+        rows, 2, 1.5 * rows, 0.015 * rows, 0.0, wspace=0.06, hspace=0.04, left=0.01, right=0.99
+    )
+    for axes, shape, title in zip(np.array(grid).flat, np.moveaxis(shapes, -1, 0), titles, strict=False):
+        length = np.linalg.norm(shape, axis=1)
+        moved = points + shape * (0.14 * span / float(length.max()))
+        _draw_skin(axes, points, faces, None)
+        _draw_skin(axes, moved, faces, length / float(length.max()))
+        axes.set_xlim(-0.09 * span, 1.10 * span)
+        axes.set_ylim(-0.24 * span, 0.27 * span)
+        axes.text(0.0, 0.97, title, transform=axes.transAxes, va="top", fontsize=8.0, fontweight="bold")
+    for spare in np.array(grid).flat[len(titles) :]:
+        spare.remove()
     return figure
 
 
@@ -74,16 +74,11 @@ def _draw_skin(axes: Axes, points: Float, faces: NDArray[np.int64], value: Float
     flat = np.column_stack([y + 0.45 * -x, 0.40 * -x + z])
     order = np.argsort(x[faces].mean(axis=1))  # the leading edge is at the back
     polygons = flat[faces[order]]
-    if value is None:
-        drawn = PolyCollection(
-            list(polygons), facecolors="#eeeeee", edgecolors="#dddddd", linewidths=0.2, rasterized=True
-        )
-    else:
-        drawn = PolyCollection(
-            list(polygons), array=value[faces[order]].mean(axis=1), cmap=LEVELS, edgecolors="face",
-            linewidths=0.15, rasterized=True,
-        )  # fmt: skip
-        drawn.set_clim(0.0, 1.0)
+    look: dict[str, Any] = {"facecolors": "#eeeeee", "edgecolors": "#dddddd", "linewidths": 0.2}
+    if value is not None:
+        shade = value[faces[order]].mean(axis=1)
+        look = {"array": shade, "cmap": LEVELS, "edgecolors": "face", "linewidths": 0.15, "clim": (0.0, 1.0)}
+    drawn = PolyCollection(list(polygons), rasterized=True, **look)
     axes.add_collection(drawn)
     axes.set_aspect("equal")
     axes.set_axis_off()

@@ -11,20 +11,16 @@ from calibration.paper.table_1 import HEADINGS, write_table_1
 from calibration.result.figures import corner_figure
 from calibration.result.folder import drawing_names, write_calibration_folder
 from calibration.result.page import drawn_parameters
-from calibration.result.text import with_deviation
 from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
 from fe.reduction.model_cache import wing_fields
-from reporting.page import Column, Page, Table
+from reporting.page import Column, Page, Words
 from reporting.progress import Progress
+from reporting.words import plus_minus
 
 from .calibrate import WingCalibration
 from .figures import modes_figure
 
-SOURCE = (
-    "M. G. Kapteyn, J. V. R. Pretorius, K. E. Willcox: A probabilistic graphical model foundation for "
-    "enabling predictive digital twins at scale. Nature Computational Science 1 (2021) 337-347. "
-    "doi:10.1038/s43588-021-00069-0"
-)
+WORDS = Words("calibration.wing")
 FIGURE_NAMES = ("load_test", "residuals", "procedure", "modes", "ring_down")
 """All that a wing's page has beyond that of any calibration, the last where there are records."""
 
@@ -98,71 +94,18 @@ def _figures(calibration: WingCalibration, fields: WingFields) -> Mapping[str, F
 
 
 def _add_sections(page: Page, calibration: WingCalibration, drawings: Mapping[str, bytes]) -> None:
+    def show(name: str, **values: object) -> None:
+        page.add_figure(drawings[name], **WORDS.words("figures", name, **values))
+
+    measured = any(origin.read for origin in calibration.lab.origins)
     for origin in calibration.lab.origins:
-        text = f"Step {origin.step}: {origin.text}."
-        if any(other.read for other in calibration.lab.origins) and not origin.read:
-            page.add_notice(text)
-        else:
-            page.add_paragraph(text)
+        add = page.add_notice if measured and not origin.read else page.add_paragraph
+        add(WORDS.say("origin", origin=origin))
     page.add_section("Beside the paper")
-    _add_table_1(page, calibration)
-    _add_load_test(page, calibration, drawings)
-    page.add_figure(
-        drawings["procedure"],
-        "Samples of the joint posterior and of the paper's procedure (its histograms have scales of their "
-        "own): the masses that meet the measured frequencies best under the weighed total, eqs. (19) and "
-        "(20), and the Rayleigh coefficients of eq. (25), for each sample of e"
-        + ("; grey are the authors' published samples." if calibration.lab.authors else "."),
-        title="Masses and damping by the paper's procedure",
-    )
-    page.add_section("Ring-down")
-    if "ring_down" in drawings:
-        page.add_figure(
-            drawings["ring_down"],
-            "(a) The first trial with the fitted sum of two damped cosines and its envelopes. (b) Spectra "
-            "of all trials. (c), (d) Frequency and damping of the first mode in windows of 0.8 s over its "
-            "amplitude; a linear wing would show one value.",
-            title="Ring-down records, fits and spectra",
-        )
-    else:
-        page.add_paragraph(
-            "No ring-down record was read: step 3 aims at the published frequencies and damping ratios."
-        )
-    page.add_section("The calibrated wing")
-    page.add_figure(
-        drawings["modes"],
-        "Mode shapes of the upper skin at the posterior mean, healthy; the colour is the length of the "
-        "displacement, from none (dark) to the largest (light); grey is the wing at rest. The leading "
-        "edge is at the back. modes.vtu has them for ParaView, wing.vtu the wing in a 3g turn. The design is "
-        "tailored to the measured planform, rounded to 0.1 mm, and meshed anew.",
-        title="Mode shapes",
-    )
-
-
-def _add_table_1(page: Page, calibration: WingCalibration) -> None:
-    page.add_table(
-        Table(
-            tuple(Column(name, numeric=at > 0) for at, name in enumerate(HEADINGS)),
-            [row.cells for row in calibration.table_1],
-        ),
-        "Mean ± standard deviation. The paper's procedure: e by its particle filter on its stiffness line, "
-        "then masses by eqs. (19), (20) and damping by eq. (25) on the tailored model for each sample of e; "
-        "its standard deviations hold the uncertainty of e alone. In the paper: planform and e are printed "
-        "in its Table 1; masses are the means of the authors' published samples of step 3, alpha and beta "
-        "follow from their frequencies by eq. (25). Difference: this wing less the paper's, which is of its "
-        f"own wing. table_1.csv has all figures in SI. {SOURCE}",
-        title="This calibration beside Table 1 of the paper",
-    )
-
-
-def _add_load_test(page: Page, calibration: WingCalibration, drawings: Mapping[str, bytes]) -> None:
-    page.add_figure(
-        drawings["load_test"],
-        "(a) Measured pairs with 95 % intervals; 95 % bands of f = k(e) x before (grey) and after (blue) "
-        "the calibration. (b) Prior, the kernel likelihood of each pair, and the posterior by quadrature "
-        "and by the particle filter. (c) The tip stiffness, before and after. After Fig. 5 of the paper.",
-        title="Load test, posterior of e and of the tip stiffness",
-    )
+    heads = [Column(name, numeric=at > 0) for at, name in enumerate(HEADINGS)]
+    cells = [row.cells for row in calibration.table_1]
+    WORDS.add_table(page, "table_1", cells, more=heads, source=WORDS.say("source"))
+    show("load_test")
     rows = []
     for title, found in (
         ("tailored model", calibration.static),
@@ -172,25 +115,14 @@ def _add_load_test(page: Page, calibration: WingCalibration, drawings: Mapping[s
             ("exact", found.exact, found.tip_stiffness_exact),
             ("particle filter", found.particle, found.tip_stiffness_particle),
         ):
-            told = (with_deviation(item.mean, item.standard_deviation) for item in (e, k))
-            rows.append((title, way, *told))
-    page.add_table(
-        Table(
-            (
-                Column("stiffness k(e)"),
-                Column("posterior"),
-                Column("e", numeric=True),
-                Column("k", "N/m", numeric=True),
-            ),
-            rows,
-        ),
-        "e is the factor on the Young's modulus of the model that gives k(e): two models need two factors to "
-        "have the measured stiffness.",
-        title="e on the tailored model and on the published line, by the load test alone",
-    )
-    page.add_figure(
-        drawings["residuals"],
-        "(a) Displacement less load over calibrated stiffness, with 95 % intervals of the readings; the "
-        "broken lines are the means of the runs. (b) Mean and 95 % interval of e under other assumptions.",
-        title="Residuals of the load test",
-    )
+            rows.append((title, way, *(plus_minus(item.mean, item.standard_deviation) for item in (e, k))))
+    WORDS.add_table(page, "two_models", rows)
+    show("residuals")
+    show("procedure", authors=calibration.lab.authors is not None)
+    page.add_section("Ring-down")
+    if "ring_down" in drawings:
+        show("ring_down")
+    else:
+        page.add_paragraph(WORDS.say("no_record"))
+    page.add_section("The calibrated wing")
+    show("modes")

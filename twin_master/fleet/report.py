@@ -6,6 +6,7 @@ number of assets: a cell of a map for each, and tables of the few that matter.
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,32 +18,31 @@ from numpy.typing import NDArray
 
 from reporting import figures as style
 from reporting.files import atomic_write_text
-from reporting.page import Column, Page, Table
-from reporting.words import counted
-from twin_master.errors import TwinMasterError
-from twin_master.fleet.flight import RESULT_NAME, fleet_config
+from reporting.json_file import read_json
+from reporting.page import Column, Page, Words, numbers
+from twin_master.errors import FleetError, TwinMasterError
+from twin_master.fleet.flight import KIND as FLOWN_KIND
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.outcome import FAILED, has_flown
+from twin_master.fleet.outcome import ENDED, FAILED, has_flown
 from twin_master.fleet.reading import WITHIN, group_figures, last_turns, leaving, noticed, shown
-from twin_master.fleet.store import open_group
+from twin_master.fleet.standing import STATE_NAME, FleetRecord
+from twin_master.fleet.store import DONE_NAME, open_group
+from twin_master.fleet.watching import KIND as WATCHED_KIND
+from twin_master.report.view import printed_factors
+from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["REPORT_NAME", "write_fleet_report"]
+__all__ = ["REPORT_NAME", "fleet_page", "fleet_record", "write_fleet_report"]
 
 Float = NDArray[np.float64]
 
+WORDS = Words("twin_master.fleet")
 REPORT_NAME = "report.html"
 NEXT, FAILURES = 15, 10
 """Rows of the tables of who needs attention next, and of failures."""
-LOST = "{} of {} assets failed in flight; their twins end there."
-SHORT = "{} of {} assets ended their simulation before the mission was over; what they have flown counts."
-BANDS = (
-    "Bands hold 90 and 50 % of the assets; the line is the median of the filtered means, "
-    "the dash-dotted one that of the true states, where they are known."
-)
 
 
 @dataclass(frozen=True)
@@ -67,260 +67,273 @@ def write_fleet_report(folder: Path | str) -> Path:
 
     Raises
     ------
-    RunFolderExistsError, FleetError
+    FleetError
         The folder holds no fleet.
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    folder = Path(folder)
-    fleet = fleet_config(folder)["fleet"]
-    result = json.loads((folder / RESULT_NAME).read_text())
-    failures, ended = result["failures"], result.get("ended", {})
-    groups = {record["name"]: open_group(folder, record["name"]) for record in fleet["groups"]}
-    twins = sum(group.sizes["twin"] for group in groups.values())
+    return atomic_write_text(Path(folder) / REPORT_NAME, fleet_page(Path(folder), NEXT))
+
+
+def fleet_record(folder: Path) -> dict[str, Any] | None:
+    """Return the configuration of a fleet, flown or watched; None where a folder holds none."""
+    path = folder / CONFIG_NAME
+    found = read_json(path, FleetError) if path.is_file() else None
+    whole = isinstance(found, dict) and found.get("kind") in (FLOWN_KIND, WATCHED_KIND)
+    return found if whole else None
+
+
+def fleet_page(folder: Path, most: int) -> str:
+    """Return the page of a fleet as it stands, with so many assets in the table of who needs attention next.
+
+    Raises
+    ------
+    FleetError
+        The folder holds no fleet, or nothing was begun there.
+    """
+    config = fleet_record(folder)
+    if config is None:
+        raise FleetError(f"{folder} holds no fleet.")
+    watched, fleet = config["kind"] == WATCHED_KIND, config["fleet"]
+    members = sum(len(group.get("members", ())) for group in fleet["groups"])  # of a watch they are not known
+    groups = len(fleet["groups"])
     page = Page(
         fleet["title"] or fleet["name"],
-        f"{counted(twins, 'asset')} in {counted(len(groups), 'group')}, seed {fleet['seed']}",
+        WORDS.say("subtitle", assets=members, groups=groups, seed=fleet["seed"], watched=watched),
     )
     page.add_section("The fleet")
-    page.add_paragraph(" ".join(_opening(fleet["groups"], groups)))
-    _figures(page, groups)
+    (_add_watched if watched else _add_flown)(page, folder, fleet["groups"], most)
+    return page.render()
+
+
+def _add_flown(page: Page, folder: Path, records: list[dict[str, Any]], most: int) -> None:
+    groups = {record["name"]: open_group(folder, record["name"]) for record in records}
+    page.add_paragraph(_opening(records, groups))
+    found = {name: group_figures(group) for name, group in groups.items()}
+    titles = dict.fromkeys(title for figures in found.values() for title in figures)
+    rows = [[title, *(shown(figures.get(title)) for figures in found.values())] for title in titles]
+    WORDS.add_table(page, "fared", rows, more=list(found))
+    status = np.concatenate([group["status"].values for group in groups.values()])
+    failures = _failures(folder)
     if failures:
-        add_failures(
-            page, failures, LOST.format(len(failures), twins), f"All of them stand in {RESULT_NAME}."
-        )
-    if ended:
-        page.add_notice(SHORT.format(len(ended), twins))
-    lessons = folder / LESSONS_NAME
-    if lessons.is_file():
-        page.add_section("Learnt across the fleet")
-        add_lessons(page, json.loads(lessons.read_text()))
-    for record in fleet["groups"]:
-        add_flown_group(page, folder, record, groups[record["name"]], NEXT)
-    atomic_write_text(folder / REPORT_NAME, page.render())
-    return folder / REPORT_NAME
+        _add_failures(page, failures, "They stand in fleet.json once the fleet has flown.",
+                      WORDS.say("lost", failed=len(failures), assets=len(status)))  # fmt: skip
+    if ended := int(np.sum(status == ENDED)):
+        page.add_notice(WORDS.say("short", ended=ended, assets=len(status)))
+    _add_lessons(page, folder)
+    for record in records:
+        group, scenario = groups[record["name"]], Scenario.model_validate(record["scenarios"][0])
+        flown, last = has_flown(group["status"].values), last_turns(group)
+        at = (flown, last[flown])
+        page.add_section(f"Group {record['name']}")
+        try:
+            chance = leaving(folder, record, group)[flown]
+        except TwinMasterError as error:
+            page.add_paragraph(WORDS.say("unknown", error=error))
+            chance = np.full(len(flown), np.nan)
+        standing = Standing(
+            scenario, [record["members"][row][0] for row in flown], last[flown], group["mean"].values[at],
+            group["standard_deviation"].values[at],
+            [scenario.control_names[u] for u in group["control_index"].values[at]],
+            noticed(group, "alarm")[flown], chance,
+        )  # fmt: skip
+        failed = int(np.sum(group["status"].values == FAILED))
+        courses = group["mean"].values[flown], group["state"].values[flown]
+        _add_group(page, standing, most, failed, courses)
 
 
-def _opening(records: list[dict[str, Any]], groups: "dict[str, xr.Dataset]") -> list[str]:
+def _opening(records: list[dict[str, Any]], groups: "dict[str, xr.Dataset]") -> str:
     """Return what a reader wants to know first: how many flew, how the control went, who is worst off."""
-    twins = sum(group.sizes["twin"] for group in groups.values())
     flown = {name: has_flown(group["status"].values) for name, group in groups.items()}
-    sentences = [f"{sum(map(len, flown.values()))} of {counted(twins, 'asset')} have flown."]
     alarmed = {name: np.flatnonzero(noticed(group, "alarm")) for name, group in groups.items()}
-    first = [
-        groups[name]["first_notice"].values[rows, 0].min() for name, rows in alarmed.items() if len(rows)
-    ]
-    if first:
-        count, step = sum(map(len, alarmed.values())), next(iter(groups.values())).attrs["step_name"]
-        sentences.append(f"{counted(count, 'asset')} raised an alarm, first in {step} {min(first)}.")
+    turns = [groups[name]["first_notice"].values[rows, 0] for name, rows in alarmed.items() if len(rows)]
     delay = np.concatenate([group["delay"].values[flown[name]] for name, group in groups.items()])
     called = delay[~np.isnan(delay)]
-    if len(called):
-        share = 100.0 * float(np.mean(called <= WITHIN))
-        step = next(iter(groups.values())).attrs["step_name"]
-        sentences.append(
-            f"In {counted(len(called), 'asset')} the damage called for another control; the fallback came "
-            f"within {WITHIN} {step}s of it in {share:.0f} %."
-        )
-    worst = []
+    worst: tuple[float, str] = (-1.0, "")
     for record in records:
         group, rows = groups[record["name"]], flown[record["name"]]
         if len(rows):
             last = group["mean"].values[rows, last_turns(group)[rows]]
             row = int(np.argmax(last.sum(axis=1)))
-            worst.append((float(last[row].sum()), record, rows[row], last[row]))
-    if worst:
-        _, record, row, state = max(worst, key=lambda entry: entry[0])
-        scenario = Scenario.model_validate(record["scenarios"][0])
-        scale, unit = scale_of(scenario)
-        believed = [
-            f"{factor.title or factor.name} {scale * value:.3g} {unit}"
-            for factor, value in zip(scenario.state, state.tolist(), strict=True)
-        ]
-        sentences.append(
-            f"The worst off is {record['members'][row][0]} of {record['name']}: {', '.join(believed)}."
+            factors = printed_factors(Scenario.model_validate(record["scenarios"][0]))
+            states = ", ".join(
+                f"{factor.title} {factor.scale * value:.3g} {factor.unit}".rstrip()
+                for factor, value in zip(factors, last[row].tolist(), strict=True)
+            )
+            told = f"{record['members'][rows[row]][0]} of {record['name']}: {states}"
+            worst = max(worst, (float(last[row].sum()), told))
+    return WORDS.say(
+        "opening", flown=sum(map(len, flown.values())), assets=sum(g.sizes["twin"] for g in groups.values()),
+        alarmed=sum(map(len, alarmed.values())), first=min((own.min() for own in turns), default=0),
+        called=len(called), share=float(np.mean(called <= WITHIN)) if len(called) else 0.0, within=WITHIN,
+        step=next(iter(groups.values())).attrs["step_name"], worst=worst[1],
+    )  # fmt: skip
+
+
+def _failures(folder: Path) -> dict[str, str]:
+    """Return the failures of the shards that are done; the last line may still be written."""
+    found: dict[str, str] = {}
+    path = folder / DONE_NAME
+    for line in path.read_bytes().splitlines(keepends=True) if path.is_file() else []:
+        if line.endswith(b"\n"):
+            found |= json.loads(line)["failures"]
+    return found
+
+
+def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: int) -> None:
+    record = FleetRecord.read(folder)
+    known, failures = record.assets, record.failures
+    silent = sorted(name for name, told in known.items() if told.last is None and name not in failures)
+    turns = sum(told.last.turn + 1 for told in known.values() if told.last is not None)
+    alarms, refused = (sum(getattr(told, name) for told in known.values()) for name in ("alarms", "refused"))
+    counts = [len(known), turns, alarms, refused, len(failures)]
+    titles = ("assets", "turns", "alarms", "messages refused", "not watched")
+    page.add_highlights([(str(count), title) for count, title in zip(counts, titles, strict=True)])
+    if failures:
+        notice = WORDS.say("not_watched", failed=len(failures), assets=len(known | failures))
+        _add_failures(page, failures, f"They stand in {STATE_NAME}.", notice)
+    if silent:
+        page.add_notice(WORDS.say("silent", names=silent, most=most))
+    _add_lessons(page, folder)
+    for group in groups:
+        scenario, prefix = Scenario.model_validate(group["scenarios"][0]), f"{group['name']}/"
+        own = [(name.removeprefix(prefix), told) for name, told in known.items() if name.startswith(prefix)]
+        own = [(name, told) for name, told in own if told.last is not None]
+        last = [told.last for _, told in own if told.last is not None]
+        if any(set(scenario.state_names) - told.health.keys() for told in last):
+            raise FleetError(
+                f"{folder / STATE_NAME}: the health of an asset of {group['name']} is that of "
+                f"{', '.join(scenario.state_names)}, and one of them is missing."
+            )
+        mean, deviation = (
+            np.array([[getattr(told.health[n], m) for n in scenario.state_names] for told in last])
+            for m in ("mean", "standard_deviation")
         )
-    return sentences
+        standing = Standing(
+            scenario, [name for name, _ in own], np.array([told.turn for told in last], dtype=np.int64), mean,
+            deviation, [told.control for told in last],
+            np.array([told.alarms for _, told in own], dtype=np.int64),
+            np.array([told.leaving for _, told in own], dtype=np.float64),
+        )  # fmt: skip
+        page.add_section(f"Group {group['name']}")
+        _add_group(page, standing, most)
 
 
-def _figures(page: Page, groups: "dict[str, xr.Dataset]") -> None:
-    found = {name: group_figures(group) for name, group in groups.items()}
-    titles = dict.fromkeys(title for figures in found.values() for title in figures)
-    rows = [[title, *(shown(figures.get(title)) for figures in found.values())] for title in titles]
-    columns = [Column("figure"), *(Column(name, numeric=True) for name in found)]
-    caption = "Means over the twins that flew to their end, with their standard errors; states in SI."
-    page.add_table(Table(columns, rows), caption, title="How the twins fared")
-
-
-def add_failures(page: Page, failures: dict[str, str], notice: str, caption: str) -> None:
+def _add_failures(page: Page, failures: Mapping[str, str], where: str, notice: str) -> None:
     """Add what ended flights or watches, by cause."""
     page.add_notice(notice)
-    kinds = Counter(failures.values()).most_common(FAILURES)
     rows = []
-    for sentence, count in kinds:
+    for sentence, count in Counter(failures.values()).most_common(FAILURES):
         names = [name for name, text in failures.items() if text == sentence]
         rows.append([sentence, str(count), ", ".join(names[:3]) + (", ..." if count > 3 else "")])
-    columns = [Column("cause"), Column("assets", numeric=True), Column("such as")]
-    page.add_table(Table(columns, rows), caption, title="Failures")
+    WORDS.add_table(page, "failures", rows, where=where)
 
 
-def add_lessons(page: Page, record: dict[str, Any]) -> None:
-    """Add what was learnt beside what was assumed."""
+def _add_lessons(page: Page, folder: Path) -> None:
+    """Add what was learnt across the fleet beside what was assumed, where it has been learnt."""
+    path = folder / LESSONS_NAME
+    if not path.is_file():
+        return
     rows = []
-    for name, group in record["groups"].items():
+    for name, group in json.loads(path.read_text())["groups"].items():
         for control, rate in group["probability"].items():
-            interval = f"{rate['lower_95']:.4f} to {rate['upper_95']:.4f}"
-            if not rate["flown"]:
-                rows.append(
-                    [name, f"probability to worsen, {control}", f"{rate['assumed']:.4f}", "", "not flown"]
-                )
-                continue
-            off = not rate["lower_95"] <= rate["assumed"] <= rate["upper_95"]
-            assumed = f"{rate['assumed']:.4f}{' (outside)' if off else ''}"
-            rows.append([name, f"probability to worsen, {control}", assumed, f"{rate['mean']:.4f}", interval])
+            low, high, assumed = rate["lower_95"], rate["upper_95"], rate["assumed"]
+            told = ["", "not flown"]
+            if rate["flown"]:
+                told = [f"{rate['mean']:.4f}", f"{low:.4f} to {high:.4f}"]
+            off = " (outside)" if rate["flown"] and not low <= assumed <= high else ""
+            rows.append([name, f"probability to worsen, {control}", f"{assumed:.4f}{off}", *told])
         if group["alarmed"]:
             rows.append([name, "twins with an alarm among them", "", str(group["alarmed"]), ""])
         lines = [("noise over the assumed", "1", group["noise_factor"])]
-        if "population" in group:
-            told = group["population"]
-            lines += [(f"{told['parameter']}, {moment}", "", told[moment]) for moment in ("mean", "spread")]
-        for title, assumed, line in lines:
+        if told_population := group.get("population"):
+            parameter = told_population["parameter"]
+            lines += [
+                (f"{parameter}, {moment}", "", told_population[moment]) for moment in ("mean", "spread")
+            ]
+        for title, given, line in lines:
             interval = f"{line['lower_95']:.4g} to {line['upper_95']:.4g}"
-            rows.append([name, title, assumed, f"{line['mean']:.4g}", interval])
-    heads = ("group", "learnt", "assumed", "mean", "95 % interval")
-    columns = [Column(head, numeric=head in heads[2:]) for head in heads]
-    caption = "Exact posteriors of all twins together; several groups share a distribution of their rates."
-    page.add_table(Table(columns, rows), caption, title="What was learnt beside what was assumed")
+            rows.append([name, title, given, f"{line['mean']:.4g}", interval])
+    page.add_section("Learnt across the fleet")
+    WORDS.add_table(page, "lessons", rows)
 
 
-def add_flown_group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset", most: int) -> None:
-    """Add a group of the store, see `add_group`."""
-    scenario, known = Scenario.model_validate(record["scenarios"][0]), group["status"].values
-    rows, last = has_flown(known), last_turns(group)
-    mean, at = group["mean"].values[rows], (np.arange(len(rows)), last[rows])
-    try:
-        chance = leaving(folder, record, group)[rows]
-    except TwinMasterError as error:
-        page.add_paragraph(f"Who leaves its control soon is not known: {error}")
-        chance = np.full(len(rows), np.nan)
-    control = group["control_index"].values[rows][at]
-    standing = Standing(
-        scenario, [record["members"][row][0] for row in rows], last[rows], mean[at],
-        group["standard_deviation"].values[rows][at], [scenario.control_names[u] for u in control],
-        noticed(group, "alarm")[rows], chance,
-    )  # fmt: skip
-    failed = int(np.sum(known == FAILED))
-    add_group(page, record["name"], standing, most, failed, group["state"].values[rows], mean)
-
-
-def add_group(
-    page: Page, name: str, standing: Standing, most: int, failed: int = 0, state: Float | None = None,
-    mean: Float | None = None,
-) -> None:  # fmt: skip
+def _add_group(
+    page: Page, standing: Standing, most: int, failed: int = 0, courses: tuple[Float, Float] | None = None
+) -> None:
     """Add a map of a group, bands where all turns are at hand, and so many assets that need attention."""
-    page.add_section(f"Group {name}")
     count, scenario = len(standing.names), standing.scenario
     if not count:
-        page.add_paragraph("Nothing is known of its assets yet.")
+        page.add_paragraph(WORDS.say("nothing"))
         return
-    scale, unit = scale_of(scenario)
-    with style.publication_style():
-        drawn = map_figure(scenario, scale * standing.mean, failed, unit)
-    caption = f"Filtered means, one cell for each asset, the worst first.{grey(failed)}"
-    page.add_figure(style.to_svg(drawn), caption, title="The assets by health")
-    if state is not None and mean is not None:
-        with style.publication_style():
-            drawn = course_figure(scenario, scale * mean, scale * state, unit)
-        page.add_figure(style.to_svg(drawn), BANDS, title="Health over time")
-    soon = np.nan_to_num(standing.leaving)
-    order = np.lexsort((-standing.mean.sum(axis=1), -soon, -standing.alarms))[:most]
+    page.add_report_figure(WORDS.figure("map", map_figure(scenario, standing.mean, failed), failed=failed))
+    if courses is not None:
+        page.add_report_figure(WORDS.figure("course", course_figure(scenario, *courses)))
+    factors, soon = printed_factors(scenario), np.rint(100.0 * np.nan_to_num(standing.leaving))
+    order = np.lexsort((-standing.mean.sum(axis=1), -soon, -standing.alarms))[:most].tolist()
     rows, told = [], bool(standing.alarms.any())
-    for row in order.tolist():
-        pairs = zip(scale * standing.mean[row], scale * standing.deviation[row], strict=True)
+    for row in order:
         states = [
-            f"{mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{deviation:.1f}" for mean, deviation in pairs
+            f"{factor.scale * mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{factor.scale * deviation:.1f}"
+            for factor, mean, deviation in zip(
+                factors, standing.mean[row], standing.deviation[row], strict=True
+            )
         ]
+        change = "" if np.isnan(standing.leaving[row]) else f"{soon[row]:.0f}"
         alarms = [str(standing.alarms[row] or "")] * told
-        change = "" if np.isnan(standing.leaving[row]) else f"{100.0 * soon[row]:.0f}"
         rows.append(
             [standing.names[row], str(standing.turn[row]), *states, standing.control[row], change, *alarms]
         )
-    columns = [Column("asset"), Column(scenario.mission.step_name, numeric=True)]
-    columns += [Column(factor.name, unit, numeric=True) for factor in scenario.state]
-    columns += [Column("control"), Column("change", "%", numeric=True)]
-    columns += [*[Column("alarms", numeric=True)] * told]
-    caption = (
-        f"{len(rows)} of {counted(count, 'asset')}, by {'alarms, then by ' * told}the probability that the "
-        f"policy leaves the control within {scenario.mission.prediction_steps} {scenario.mission.step_name}s "
-        "(change; of assets with calibrations of their own by one policy), then by the sum of their states."
+    more = [numbers(state.name, factor.unit) for state, factor in zip(scenario.state, factors, strict=True)]
+    more += [Column("control"), numbers("change", "%"), *[numbers("alarms")] * told]
+    WORDS.add_table(
+        page, "next", rows, more=more, shown=len(rows), assets=count, alarms=told, mission=scenario.mission
     )
-    page.add_table(Table(columns, rows), caption, title="Who needs attention next")
 
 
-def scale_of(scenario: Scenario) -> tuple[float, str]:
-    """Return what states are multiplied by for people, and their unit then."""
-    units = {factor.unit for factor in scenario.state}
-    if units == {"1"}:
-        return 100.0, "%"
-    return 1.0, units.pop() if len(units) == 1 else "SI"
-
-
-def grey(failed: int) -> str:
-    """Return what the grey cells of a map are, where it has some."""
-    return f" Grey: {failed} that failed in flight." if failed else ""
-
-
-def map_figure(scenario: Scenario, last: Float, failed: int, unit: str) -> Figure:
-    """Return a map of the assets: (B, F), a panel for each factor."""
-    count = len(last) + failed
+@style.publication_style()
+def map_figure(scenario: Scenario, last: Float, failed: int) -> Figure:
+    """Return a map of the assets, the last means (B, F) of which are given: a panel for each factor."""
+    factors, count = printed_factors(scenario), len(last) + failed
     wide = max(1, int(np.ceil(np.sqrt(2.0 * count))))
     high = -(-count // wide)
     order = np.argsort(-last.sum(axis=1), kind="stable")
-    cells = np.full((last.shape[1], high * wide), np.nan)
-    cells[:, : len(last)] = last[order].T
-    figure = style.new_figure(0.4 + 1.9 * last.shape[1])
-    norm = Normalize(0.0, float(max(factor.levels[-1] for factor in scenario.state)) * scale_of(scenario)[0])
-    for number, factor in enumerate(scenario.state):
-        axes = figure.add_subplot(last.shape[1], 1, number + 1)
-        image = axes.imshow(
-            np.ma.masked_invalid(cells[number].reshape(high, wide)),
-            cmap=style.LEVELS, norm=norm, aspect="auto", interpolation="nearest",
+    figure, rows = style.panels(
+        len(factors), 1, 0.4 + 1.9 * len(factors), 0.3, 0.1, left=0.07, right=0.99, hspace=0.25
+    )
+    for number, (factor, (axes,)) in enumerate(zip(factors, rows, strict=True)):
+        cells = np.full(high * wide, np.nan)
+        cells[: len(last)] = factor.scale * last[order, number]
+        axes.imshow(
+            np.where(np.arange(high * wide) < count, 1.0, np.nan).reshape(high, wide), cmap="Greys",
+            vmin=0.0, vmax=2.0, aspect="auto", interpolation="nearest",
         )  # fmt: skip
-        if failed:
-            rest = np.full(high * wide, np.nan)
-            rest[len(last) : count] = 1.0
-            axes.imshow(
-                np.ma.masked_invalid(rest.reshape(high, wide)), cmap="Greys", vmin=0.0, vmax=2.0,
-                aspect="auto", interpolation="nearest",
-            )  # fmt: skip
+        image = axes.imshow(
+            np.ma.masked_invalid(cells.reshape(high, wide)), cmap=style.LEVELS, aspect="auto",
+            norm=Normalize(factor.levels[0], factor.levels[-1]), interpolation="nearest",
+        )  # fmt: skip
         axes.set_xticks([])
         axes.set_yticks([])
-        style.panel_label(axes, "abcdefgh"[number % 8], factor.title or factor.name)
-        figure.colorbar(image, ax=axes, label=unit)
-    figure.tight_layout()
+        style.panel_label(axes, "abcdefgh"[number % 8], factor.title)
+        # On the left, where a narrow screen shows it.
+        style.color_bar(figure, image, factor.unit, ax=axes, location="left", pad=0.02, fraction=0.03)
     return figure
 
 
-def course_figure(scenario: Scenario, mean: Float, state: Float, unit: str) -> Figure:
+@style.publication_style()
+def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
     """Return bands of the states of B assets over the turns: (B, T, F), true ones NaN where not known."""
-    figure = style.new_figure(2.4)
-    seen = ~np.isnan(mean).all(axis=(0, 2))
-    mean, state, steps = mean[:, seen], state[:, seen], np.flatnonzero(seen)
-    for number, factor in enumerate(scenario.state):
-        axes = figure.add_subplot(1, len(scenario.state), number + 1)
-        low, quarter, middle, three, top = np.nanquantile(
-            mean[:, :, number], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0
-        )
-        for below, above in ((low, top), (quarter, three)):
-            axes.fill_between(steps, below, above, color=style.PRESENT, alpha=style.BAND_OPACITY, linewidth=0)
+    factors = printed_factors(scenario)
+    figure, (row,) = style.panels(1, len(factors), 2.4, 0.3, 0.45, wspace=0.25)
+    steps = np.flatnonzero(~np.isnan(mean).all(axis=(0, 2)))
+    for number, (factor, axes) in enumerate(zip(factors, row, strict=True)):
+        own, true = (factor.scale * values[:, steps, number] for values in (mean, state))
+        low, quarter, middle, three, top = np.nanquantile(own, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
+        style.band(axes, steps, low, top, style.PRESENT)
+        style.band(axes, steps, quarter, three, style.PRESENT)
         axes.plot(steps, middle, color=style.PRESENT, label="median of the filtered means")
-        true = np.median(state[:, :, number], axis=0)
-        axes.plot(
-            steps, true, color=style.TRUTH, linewidth=1.0, linestyle=(0, (4, 1.5, 1, 1.5)),
-            label="median of the true states",
-        )  # fmt: skip
+        axes.plot(steps, np.median(true, axis=0), **style.TRUTH_LINE, label="median of the true states")
         axes.set_xlabel(scenario.mission.step_name)
-        axes.set_ylabel(f"{factor.title or factor.name} ({unit})")
+        axes.set_ylabel(f"{factor.title} ({factor.unit})")
         style.panel_label(axes, "abcdefgh"[number % 8])
-    figure.tight_layout()
     return figure

@@ -1,7 +1,7 @@
 """The course of a mission as seen at one turn: past, present and prediction (Kapteyn et al. 2021, Fig. 6)."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,93 +11,108 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from reporting import figures as style
-from twin_master.report.data import RunRecord
-from twin_master.report.view import (
-    Band,
-    Course,
-    capital,
-    choose_sensors,
-    observation_scale,
-    reward_course,
-    sensor_course,
-    sensor_title,
-    short_number,
-    state_course,
-    state_label,
-    state_scale,
-)
+from reporting.words import capital
+from twin_master.report.reading import Run
+from twin_master.report.view import NORMAL_95, short_number
+from twin_master.scenario.schema import REWARD_NAMES
 
-Float = NDArray[np.floating[Any]]
+Float = NDArray[np.float64]
 
 _ROW_HEIGHT = 1.22
 _NARROW = 0.19
 _MANY_TURNS = 120  # more have no room for gaps between bars
 _MANY_DOTS = 1000
+_LEAST_PAST = 3  # turns that a figure must have behind its present to show a course
 _DASHES = (0, (3, 1.2))
-_TRUTH: dict[str, Any] = {
-    "color": style.TRUTH,
-    "linewidth": 1.0,
-    "linestyle": (0, (4, 1.5, 1, 1.5)),
-    "label": "truth",
-}
 _DOT: dict[str, Any] = {
-    "color": style.OBSERVED,
-    "linestyle": "none",
-    "marker": "o",
-    "markersize": 2.3,
-    "markeredgewidth": 0.6,
-}
+    "color": style.OBSERVED, "linestyle": "none", "marker": "o", "markersize": 2.3, "markeredgewidth": 0.6,
+}  # fmt: skip
 
 
-def mission_figure(record: RunRecord, now: int, sensors: Sequence[int] | None = None) -> Figure:
+class Band(NamedTuple):
+    """A line over steps with its band: (n,) each."""
+
+    step: Float
+    center: Float
+    lower: Float
+    upper: Float
+
+
+def default_now(run: Run) -> int:
+    """Return the turn that shows most: a few turns before the flown control first changes.
+
+    Two thirds into the mission, where it does not change, or at once.
+    """
+    last, changes = run.steps - 1, np.flatnonzero(np.diff(run.control_index)) + 1
+    if len(changes) and changes[0] >= 3 + _LEAST_PAST:
+        return int(changes[0] - 3)
+    return round(2 * last / 3)
+
+
+def choose_sensors(run: Run, count: int = 4) -> list[int]:
+    """Return indices of sensors worth a panel: the one strained most, the first, and one for each factor.
+
+    The sensor of a factor is the one whose expected value answers most to it: the largest coefficient of a
+    least-squares fit of its logarithm to the means of the factors, apart for each control.
+    """
+    if not run.sensors.unit:  # what has different units cannot be compared: the first ones
+        return list(range(min(count, len(run.sensors.titles))))
+    quantity = run["filtered/quantity_mean"]
+    chosen = [int(np.argmax(np.abs(quantity).max(axis=0)))]
+    if 0 not in chosen:
+        chosen.append(0)
+    if np.all(quantity > 0.0):
+        columns = [run["filtered/mean"], np.eye(len(run.controls))[run.control_index]]
+        coefficient = np.linalg.lstsq(np.concatenate(columns, axis=1), np.log(quantity), rcond=None)[0]
+        for factor in range(len(run.factors)):
+            order = np.argsort(-coefficient[factor], kind="stable")
+            fresh = [int(sensor) for sensor in order if int(sensor) not in chosen]
+            if fresh and coefficient[factor, fresh[0]] > 1e-3:
+                chosen.append(fresh[0])
+    return chosen[:count]
+
+
+@style.publication_style()
+def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> Figure:
     """Draw the mission as the twin sees it at turn `now`.
 
     Parameters
     ----------
-    record
+    run
         The run.
     now
         The present turn, 0..T-1.
     sensors
         Indices of the sensors to show, from 0; by default `choose_sensors`.
-
-    Raises
-    ------
-    IndexError
-        `now` is no turn of the run.
     """
-    if not 0 <= now < record.step_count:
-        raise IndexError(f"The present turn must lie in 0..{record.step_count - 1}, not at {now}.")
-    chosen = choose_sensors(record) if sensors is None else list(sensors)
-    left: list[tuple[str, int]] = [("state", k) for k in range(len(record.state_names))] + [("control", 0)]
-    right: list[tuple[str, int]] = [("sensor", sensor) for sensor in chosen]
-    if record.filtered.reward is not None:
-        for reward in range(len(record.rewards)):
-            (left if len(left) <= len(right) else right).append(("reward", reward))
+    left: list[tuple[Any, int]] = [(_state_panel, k) for k in range(len(run.factors))] + [(_control_panel, 0)]
+    right: list[tuple[Any, int]] = [
+        (_sensor_panel, sensor) for sensor in (choose_sensors(run) if sensors is None else sensors)
+    ]
+    for reward in range(len(REWARD_NAMES)):
+        (left if len(left) <= len(right) else right).append((_reward_panel, reward))
     rows = max(len(left), len(right))
-    with style.publication_style():
-        figure = style.new_figure(1.22 + _ROW_HEIGHT * rows)
-        grid = figure.add_gridspec(
-            rows, 2, left=0.088, right=0.985, hspace=0.42, wspace=0.28,
-            top=1.0 - 0.86 / figure.get_figheight(), bottom=0.42 / figure.get_figheight(),
-        )  # fmt: skip
-        labels = iter("abcdefghijklmnopqrstuvwxyz")
-        for column, panels in enumerate((left, right)):
-            for row, (kind, index) in enumerate(panels):
-                axes = figure.add_subplot(grid[row, column])
-                _zones(axes, record, now, named=row == 0)
-                title = _PANELS[kind](axes, record, index, now)
-                style.panel_label(axes, next(labels), title)
-                if row == len(panels) - 1:
-                    axes.set_xlabel(record.step_word)
-                else:
-                    axes.tick_params(labelbottom=False)
-        _legend(figure, record, now)
+    figure, grid = style.panels(
+        rows, 2, 1.22 + _ROW_HEIGHT * rows, 0.86, 0.42, left=0.088, hspace=0.42, wspace=0.28
+    )
+    labels = iter("abcdefghijklmnopqrstuvwxyz")
+    for column, shown in enumerate((left, right)):
+        for row, (panel, index) in enumerate(shown):
+            axes = grid[row][column]
+            _zones(axes, run, now, named=row == 0)
+            style.panel_label(axes, next(labels), panel(axes, run, index, now))
+            if row == len(shown) - 1:
+                axes.set_xlabel(run.step)
+            else:
+                axes.tick_params(labelbottom=False)
+        for row in range(len(shown), rows):
+            grid[row][column].remove()
+    _legend(figure, run, now)
     return figure
 
 
-def _zones(axes: Axes, record: RunRecord, now: int, *, named: bool) -> None:
-    end = now + max(record.horizon, 1)
+def _zones(axes: Axes, run: Run, now: int, *, named: bool) -> None:
+    end = now + run.horizon
     axes.set_xlim(-0.8, end + 0.8)
     axes.axvspan(now + 0.5, end + 0.8, color=style.PREDICTION, alpha=0.06, linewidth=0)
     axes.axvline(now, color=style.PRESENT, linewidth=0.8, zorder=0.5)
@@ -110,128 +125,148 @@ def _zones(axes: Axes, record: RunRecord, now: int, *, named: bool) -> None:
         axes.text(now, height, f"now: {now}", transform=where, ha="right", color=style.PRESENT)
         if now > 0.35 * end:
             axes.text(-0.8, height, "past", transform=where, ha="left", color=style.PAST)
-        if record.horizon > _NARROW * end:
+        if run.horizon > _NARROW * end:
             axes.text(now + 0.5, height, "prediction", transform=where, ha="left", color=style.PREDICTION)
 
 
-def _draw(axes: Axes, band: Band, color: str, *, prediction: bool = False, label: str = "") -> None:
-    axes.fill_between(band.step, band.lower, band.upper, color=color, alpha=style.BAND_OPACITY, linewidth=0)
-    line = axes.plot(band.step, band.center, color=color, label=label)[0]
-    if prediction:
-        line.set(linestyle=_DASHES, marker=".", markersize=3.5)
+def _draw(axes: Axes, past: Band, predicted: Band, truth: Float | None, now: int) -> None:
+    """Draw a course: past, present, prediction, and the truth from the first step on."""
+    for shown, color, label, look in (
+        (past, style.PAST, "past", {}),
+        (predicted, style.PREDICTION, "prediction", {"linestyle": _DASHES, "marker": ".", "markersize": 3.5}),
+    ):
+        known = np.isfinite(shown.center)
+        if known.any():
+            step, center, lower, upper = (values[known] for values in shown)
+            style.band(axes, step, lower, upper, color)
+            axes.plot(step, center, color=color, label=label, **look)  # type: ignore[arg-type]
+    _, mean, least, most = (float(values[-1]) for values in past)
+    if np.isfinite(mean):
+        axes.errorbar(
+            [now], [mean], yerr=[[max(mean - least, 0.0)], [max(most - mean, 0.0)]],
+            color=style.PRESENT, marker="D", markersize=4.2, capsize=2.0, elinewidth=1.2, linestyle="none",
+            zorder=4, label="present",
+        )  # fmt: skip
+    if truth is not None:
+        seen = truth[: now + 1 + len(predicted.step)]
+        axes.plot(np.arange(len(seen)), seen, **style.TRUTH_LINE, label="truth")
 
 
-def _draw_present(axes: Axes, now: int, center: float, lower: float, upper: float) -> None:
-    axes.errorbar(
-        [now], [center], yerr=[[max(center - lower, 0.0)], [max(upper - center, 0.0)]], color=style.PRESENT,
-        marker="D", markersize=4.2, capsize=2.0, elinewidth=1.2, linestyle="none", zorder=4, label="present",
-    )  # fmt: skip
+def _bands(run: Run, name: str, index: int, now: int, scale: float) -> tuple[Band, Band]:
+    """Return past and prediction of `quantity` or `reward` in printed units, with 95 % intervals.
 
-
-def _draw_course(axes: Axes, course: Course, now: int) -> None:
-    if course.past is not None:
-        _draw(axes, course.past, style.PAST, label="past")
-    if course.predicted is not None:
-        _draw(axes, course.predicted, style.PREDICTION, prediction=True, label="prediction")
-    if course.past is not None and course.past.step[-1] == now:
-        past = course.past
-        _draw_present(axes, now, past.center[-1], past.lower[-1], past.upper[-1])
-    if course.truth is not None:
-        axes.plot(np.arange(len(course.truth)), course.truth, **_TRUTH)
-
-
-def _state_panel(axes: Axes, record: RunRecord, factor: int, now: int) -> str:
-    scale, _ = state_scale(record, factor)
-    at_the_time = scale * record.filtered.mean[: now + 1, factor]
-    axes.plot(np.arange(now + 1), at_the_time, color=style.PRESENT, linewidth=0.9, label="at the time")
-    _draw_course(axes, state_course(record, factor, now), now)
-    levels = scale * record.levels[factor]
-    margin = 0.075 * (levels[-1] - levels[0]) or 6.0
-    axes.set_ylim(levels[0] - margin, levels[-1] + margin)
-    axes.set_yticks(levels, [short_number(level) for level in levels.tolist()])
-    axes.set_ylabel(state_label(record, factor))
-    return capital(record.state_titles[factor])
-
-
-def _sensor_panel(axes: Axes, record: RunRecord, sensor: int, now: int) -> str:
-    scale, unit = observation_scale(record, sensor)
-    if record.observation is not None:
-        observation = scale * record.observation[: now + 1 + record.horizon, sensor]
-        turn = np.arange(len(observation))
-        seen, later = turn <= now, turn > now
-        many = len(turn) > _MANY_DOTS  # as outlines they would make the page too large
-        axes.plot(turn[seen], observation[seen], **_DOT, label="observed", rasterized=many)
-        axes.plot(turn[later], observation[later], **_DOT, markerfacecolor="none", label="observed later")
-        lost = turn[seen & np.isnan(observation)]
-        if len(lost):
-            where = axes.get_xaxis_transform()
-            axes.plot(
-                lost, np.full(len(lost), 0.04), **{**_DOT, "marker": "x"}, transform=where, label="lost"
+    The past is seen in hindsight at the last turn, and as seen at the time before that.
+    """
+    found = []
+    past = "smoothed" if now == run.steps - 1 else "filtered"
+    for group, part, first in ((past, slice(0, now + 1), 0), ("predicted", now, now + 1)):
+        mean = scale * run[f"{group}/{name}_mean"][part][..., index]
+        if name == "reward":
+            half = NORMAL_95 * run[f"{group}/reward_standard_deviation"][part][..., index]
+            lower, upper = mean - half, mean + half
+        else:
+            lower, upper = (
+                scale * run[f"{group}/{name}_{end}"][part][..., index] for end in ("lower", "upper")
             )
-    _draw_course(axes, sensor_course(record, sensor, now), now)
+        found.append(Band(np.arange(float(first), first + len(mean)), mean, lower, upper))
+    return found[0], found[1]
+
+
+def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
+    """Draw mean and two standard deviations within the levels: p(D_t | o_0..o_now), p(D_{now+h} | ...)."""
+    factor = run.factors[index]
+    at_the_time = factor.scale * run["filtered/mean"][: now + 1, index]
+    axes.plot(np.arange(now + 1), at_the_time, color=style.PRESENT, linewidth=0.9, label="at the time")
+    if now == run.steps - 1:
+        mean, deviation = run["smoothed/mean"], run["smoothed/standard_deviation"]
+    else:
+        mean, deviation = run.moments(run.smoothed_until(now))
+    coming = run["predicted/mean"][now], run["predicted/standard_deviation"][now]
+    found = []
+    for first, (center, spread) in ((0, (mean, deviation)), (now + 1, coming)):
+        middle, half = factor.scale * center[:, index], 2.0 * factor.scale * spread[:, index]
+        ends = (np.clip(middle + sign * half, factor.levels[0], factor.levels[-1]) for sign in (-1.0, 1.0))
+        found.append(Band(np.arange(float(first), first + len(middle)), middle, *ends))
+    _draw(axes, found[0], found[1], None if run.truth is None else factor.scale * run.truth[:, index], now)
+    margin = 0.075 * (factor.levels[-1] - factor.levels[0]) or 6.0
+    axes.set_ylim(factor.levels[0] - margin, factor.levels[-1] + margin)
+    axes.set_yticks(factor.levels, [short_number(level) for level in factor.levels])
+    axes.set_ylabel(factor.label)
+    return capital(factor.title)
+
+
+def _sensor_panel(axes: Axes, run: Run, sensor: int, now: int) -> str:
+    sensors = run.sensors
+    observation = sensors.scale * run.observed[: now + 1 + run.horizon, sensor]
+    turn = np.arange(len(observation))
+    seen, later = turn <= now, turn > now
+    many = len(turn) > _MANY_DOTS  # as outlines they would make the page too large
+    axes.plot(turn[seen], observation[seen], **_DOT, label="observed", rasterized=many)
+    axes.plot(turn[later], observation[later], **_DOT, markerfacecolor="none", label="observed later")
+    lost = turn[seen & np.isnan(observation)]
+    if len(lost):
+        where = axes.get_xaxis_transform()
+        axes.plot(lost, np.full(len(lost), 0.04), **{**_DOT, "marker": "x"}, transform=where, label="lost")
+    truth = run.get(f"truth/{sensors.quantity}")
+    _draw(
+        axes, *_bands(run, "quantity", sensor, now, sensors.scale),
+        None if truth is None else sensors.scale * truth[:, sensor], now,
+    )  # fmt: skip
     axes.margins(y=0.12)
-    axes.set_ylabel(unit if record.sensor_titles else f"{record.observation_name} ({unit})")
-    return capital(sensor_title(record, sensor))
+    unit = sensors.units[sensor]
+    axes.set_ylabel(unit if sensors.named else f"{sensors.quantity} ({unit})")
+    return capital(sensors.titles[sensor])
 
 
-def _control_panel(axes: Axes, record: RunRecord, _index: int, now: int) -> str:
-    tallest, width = 0.82, 0.8 if now + record.horizon < _MANY_TURNS else 1.0
-    for control in range(len(record.controls)):
-        past = np.flatnonzero(record.control_index[:now] == control)
+def _control_panel(axes: Axes, run: Run, _index: int, now: int) -> str:
+    tallest, width = 0.82, 0.8 if now + run.horizon < _MANY_TURNS else 1.0
+    for control in range(len(run.controls)):
+        past = np.flatnonzero(run.control_index[:now] == control)
         parts = np.split(past, np.flatnonzero(np.diff(past) > 1) + 1) if width == 1.0 else past[:, None]
         bars = [(part[0] - width / 2, part[-1] - part[0] + width) for part in parts if len(part)]
         axes.broken_barh(bars, (control, tallest), facecolors=style.PAST, linewidth=0)
-        if record.control_index[now] == control:
+        if run.control_index[now] == control:
             axes.broken_barh(
                 [(now - width / 2, width)], (control, tallest), facecolors=style.PRESENT, linewidth=0
             )
-        if record.control_probability is not None and record.horizon:
-            axes.bar(
-                now + 1.0 + np.arange(record.horizon), tallest * record.control_probability[now, :, control],
-                width=width, bottom=control, color=style.PREDICTION, linewidth=0,
-                label=f"predicted {control}",
-            )  # fmt: skip
+        axes.bar(
+            now + 1.0 + np.arange(run.horizon),
+            tallest * run["predicted/control_probability"][now, :, control],
+            width=width, bottom=control, color=style.PREDICTION, linewidth=0, label=f"predicted {control}",
+        )  # fmt: skip
         axes.axhline(control, color=style.REFERENCE, linewidth=0.6)
-    later = np.arange(now + 1, min(now + 1 + record.horizon, record.step_count))
+    later = np.arange(now + 1, min(now + 1 + run.horizon, run.steps))
     if len(later):
         axes.plot(
-            later, record.control_index[later] + tallest + 0.06, linestyle="none", marker="v", markersize=3.0,
+            later, run.control_index[later] + tallest + 0.06, linestyle="none", marker="v", markersize=3.0,
             color=style.TRUTH, markeredgewidth=0, label="flown later",
         )  # fmt: skip
     axes.grid(visible=False)
-    axes.set_ylim(-0.02, len(record.controls) + 0.06)
-    axes.set_yticks(np.arange(len(record.controls)) + tallest / 2, record.controls)
+    axes.set_ylim(-0.02, len(run.controls) + 0.06)
+    axes.set_yticks(np.arange(len(run.controls)) + tallest / 2, run.controls)
     axes.tick_params(axis="y", length=0)
     return "Control: flown | predicted probability"
 
 
-def _reward_panel(axes: Axes, record: RunRecord, reward: int, now: int) -> str:
-    _draw_course(axes, reward_course(record, reward, now), now)
+def _reward_panel(axes: Axes, run: Run, reward: int, now: int) -> str:
+    _draw(axes, *_bands(run, "reward", reward, now, 1.0), None, now)
     axes.margins(y=0.15)
     axes.set_ylabel("reward")
-    return f"{capital(record.rewards[reward])} reward"
+    return f"{capital(REWARD_NAMES[reward])} reward"
 
 
-_PANELS = {"state": _state_panel, "sensor": _sensor_panel, "control": _control_panel, "reward": _reward_panel}
-
-
-def _legend(figure: Figure, record: RunRecord, now: int) -> None:
-    handles = [
-        Line2D([], [], color=style.PAST, label="past"),
-        Line2D([], [], color=style.PRESENT, linewidth=0.9, label="state as seen at the time"),
-        Line2D([], [], color=style.PRESENT, marker="D", linestyle="none", label="present"),
-    ]
-    if record.horizon:
-        handles.append(
-            Line2D([], [], color=style.PREDICTION, linestyle=_DASHES, marker=".", label="prediction")
-        )
-    if record.truth_state is not None or record.truth_observation is not None:
-        handles.append(Line2D([], [], **_TRUTH))
-    if record.observation is not None:
-        handles.append(Line2D([], [], **_DOT, label="observed"))
-        if now < record.step_count - 1:
-            handles.append(Line2D([], [], **_DOT, markerfacecolor="none", label="observed later"))
-        if np.isnan(record.observation[: now + 1]).any():
-            handles.append(Line2D([], [], **{**_DOT, "marker": "x"}, label="observation lost"))
-    columns = (len(handles) + 1) // 2
-    figure.legend(handles=handles, loc="upper center", ncols=columns, bbox_to_anchor=(0.53, 1.0))
+def _legend(figure: Figure, run: Run, now: int) -> None:
+    looks: dict[str, dict[str, Any] | bool] = {
+        "past": {"color": style.PAST},
+        "state as seen at the time": {"color": style.PRESENT, "linewidth": 0.9},
+        "present": {"color": style.PRESENT, "marker": "D", "linestyle": "none"},
+        "prediction": {"color": style.PREDICTION, "linestyle": _DASHES, "marker": "."},
+        "truth": run.truth is not None and style.TRUTH_LINE,
+        "observed": _DOT,
+        "observed later": now < run.steps - 1 and {**_DOT, "markerfacecolor": "none"},
+        "observation lost": bool(np.isnan(run.observed[: now + 1]).any()) and {**_DOT, "marker": "x"},
+    }
+    handles = [Line2D([], [], label=label, **look) for label, look in looks.items() if isinstance(look, dict)]
+    figure.legend(
+        handles=handles, loc="upper center", ncols=(len(handles) + 1) // 2, bbox_to_anchor=(0.53, 1.0)
+    )

@@ -3,12 +3,14 @@
 import numpy as np
 from scipy.stats import binom
 
-from reporting.words import listing, parameter_title
+from reporting.page import Words
+from reporting.words import counted, listing, parameter_title
 from twin_master.network.graphical_model import Factor, StateSpace
 from twin_master.report.check import PredictiveCheck, predictive_check
-from twin_master.report.data import RunRecord
-from twin_master.report.view import sensor_title, state_scale
+from twin_master.report.reading import Run
 from twin_master.store.summary import Fallback, control_changes, find_fallback
+
+WORDS = Words("twin_master.report")
 
 _STATES_SAID = 4
 _SPREAD_DIFFERS = 0.05
@@ -17,138 +19,98 @@ _SURE = 1e-3
 """Probability of a false word about the spread, or about any sensor."""
 
 
-def opening_sentences(record: RunRecord) -> tuple[str, ...]:
-    """Return at most three sentences on a run; what the record does not hold is not spoken of."""
-    check = predictive_check(record)
-    agreement = "" if check is None else _agreement(record, check)
-    decision = f"{_decision(record).removesuffix('.')}{_not_followed(record)}."
-    return tuple(sentence for sentence in (decision, _belief(record), agreement) if sentence)
+def opening_sentences(run: Run) -> tuple[str, ...]:
+    """Return at most three sentences on a run; what the run does not hold is not spoken of."""
+    sentences = (_decision(run), _belief(run), _agreement(run, predictive_check(run)))
+    return tuple(sentence for sentence in sentences if sentence)
 
 
-def _decision(record: RunRecord) -> str:
+def _decision(run: Run) -> str:
     """Return how the control went, and by how much it followed the damage that calls for another."""
-    subject = "asset" if record.config.get("watched") else "twin"
-    first, controls, step = int(record.control_index[0]), record.controls, record.step_word
-    if len(controls) == 1:
-        return f"There was one control, {controls[0]}, and nothing to decide."
-    fallback = _fallback(record)
-    if np.all(record.control_index == first):
-        said = f"The {subject} kept {controls[first]} at every {step}"
-    else:
-        said = f"The {subject} {control_changes(controls, record.control_index, step, record.first_step)}"
-    if fallback is None or fallback.switch_state is None or fallback.switch_level is None:
-        return f"{said}."
-    factor = record.state_names.index(fallback.switch_state)
-    scale, unit = state_scale(record, factor)
-    level = f"{scale * fallback.switch_level:.4g} {unit}".rstrip()
-    what, called = _named(record.state_titles[factor]), fallback.called_for_step
-    if called is None:
-        return f"{said}; {what} never reached the {level} from which the policy leaves {controls[first]}."
-    reached = record.first_step + called
-    if fallback.early_step is not None or fallback.fallback_step is None:
-        return (
-            f"{said}; {what} reached the {level} from which the policy leaves {controls[first]} at "
-            f"{step} {reached}."
-        )
-    changes = int(np.count_nonzero(np.diff(record.control_index)))
-    if changes == 1:
-        now = controls[int(record.control_index[fallback.fallback_step])]
-        turn = record.first_step + fallback.fallback_step
-        said = f"The {subject} fell back from {controls[first]} to {now} at {step} {turn}"
-    when = f"{_count(fallback.delay, step)} after" if fallback.delay else "when"
-    return f"{said}{',' if changes == 1 else '; the first change came'} {when} {what} had reached {level}."
+    first, controls, index = int(run.control_index[0]), run.controls, run.control_index
+    changes, fallback = int(np.count_nonzero(np.diff(index))), _fallback(run)
+    fell = None if fallback is None or fallback.early_step is not None else fallback.fallback_step
+    switch: dict[str, object] = {"what": "", "level": "", "everywhere": False}
+    if fallback is not None and fallback.switch_state is not None and fallback.switch_level is not None:
+        factor = run.factors[run.scenario.state_names.index(fallback.switch_state)]
+        level = factor.scale * fallback.switch_level
+        switch = {
+            "what": _named(factor.title), "level": f"{level:.4g} {factor.unit}".rstrip(),
+            "everywhere": level <= factor.levels[0],
+        }  # fmt: skip
+    missed = 0
+    if run.watched:  # a real asset may be under another control than the one that its twin asked for
+        asked = np.argmax(run["filtered/decision_probability"][:-1], axis=1)
+        missed = int(np.count_nonzero(asked != index[1:]))
+    return WORDS.say(
+        "decision", run=run, first=controls[first], **switch, missed=missed and _count(missed, run.step),
+        asset="asset" if run.watched else "twin", changes=changes,
+        changed=control_changes(controls, index, run.step, run.first_step),
+        called=None if fallback is None or fallback.called_for_step is None
+        else run.first_step + fallback.called_for_step,
+        fell=None if fell is None else run.first_step + fell,
+        now=controls[int(index[fell or 0])],
+        delay=fallback and fallback.delay and _count(fallback.delay, run.step),
+    )  # fmt: skip
 
 
-def _fallback(record: RunRecord) -> Fallback | None:
-    """Return how the control fell back; None where truth or policy are unknown."""
-    if record.truth_state is None or record.policy is None:
+def _fallback(run: Run) -> Fallback | None:
+    """Return how the control fell back; None where the truth is unknown."""
+    if run.truth is None:
         return None
-    levels = zip(record.state_names, record.levels, strict=True)
-    states = StateSpace(tuple(Factor(name, tuple(values.tolist())) for name, values in levels))
-    if states.size != len(record.coordinates):
-        return None
-    return find_fallback(
-        states,
-        record.policy.control_index,
-        int(record.control_index[0]),
-        record.control_index,
-        np.asarray(record.truth_state, dtype=np.float64),
-    )
+    states = StateSpace(tuple(Factor(factor.name, factor.levels) for factor in run.scenario.state))
+    policy = run["policy/control_index"].astype(np.int64)
+    return find_fallback(states, policy, int(run.control_index[0]), run.control_index, run.truth)
 
 
-def _not_followed(record: RunRecord) -> str:
-    """Return how often a real asset was under another control than the one that its twin had asked for."""
-    if not record.config.get("watched") or record.decision_probability is None:
-        return ""
-    asked = np.argmax(record.decision_probability[:-1], axis=1)
-    missed = int(np.count_nonzero(asked != record.control_index[1:]))
-    return f"; at {_count(missed, record.step_word)} the twin had asked for another control" if missed else ""
-
-
-def _belief(record: RunRecord) -> str:
+def _belief(run: Run) -> str:
     """Return the last estimate of the state, and of the parameter where it is learnt."""
-    parts = [_state(record, factor) for factor in range(min(len(record.state_names), _STATES_SAID))]
-    rest = len(record.state_names) - len(parts)
+    parts = [_state(run, index) for index in range(min(len(run.factors), _STATES_SAID))]
+    rest = len(run.factors) - len(parts)
     if rest:
-        parts.append(f"{_count(rest, 'other state')} as the figures below show")
-    said = f"At the end the twin puts {listing(parts)}; in brackets two standard deviations either side"
-    figures = record.summary.get("figures", ())
-    decided = next((figure["value"] for figure in figures if figure["key"] == "decided_by"), "model")
-    said += "" if decided == "model" else f"; what decides its control is: {decided}"
-    for learnt in record.learnt:
-        if learnt.name == record.parameter_name:
-            mean, deviation = learnt.course[-1, :2]
-            truth = "" if learnt.truth is None else f", truth {float(learnt.truth):.4g}"
-            said += (
-                f"; it learnt {_named(parameter_title(learnt.name))}: "
-                f"{mean:.3f} ({mean - 2 * deviation:.3f} to {mean + 2 * deviation:.3f}{truth})"
-            )
-    return f"{said}."
+        parts.append(f"{counted(rest, 'other state')} as the figures below show")
+    figures = {figure["key"]: figure["value"] for figure in run.summary.get("figures", ())}
+    learnt = next((one for one in run.learnt if one.name == run.scenario.calibration.parameter), None)
+    told = None
+    if learnt is not None:
+        mean, deviation = learnt.course[-1, :2]
+        told = {
+            "name": _named(parameter_title(learnt.name)), "mean": mean, "low": mean - 2 * deviation,
+            "high": mean + 2 * deviation, "truth": None if learnt.truth is None else float(learnt.truth),
+        }  # fmt: skip
+    decided = figures.get("decided_by") or "model"
+    return WORDS.say("belief", states=listing(parts), decided=decided, learnt=told)
 
 
-def _state(record: RunRecord, factor: int) -> str:
-    scale, unit = state_scale(record, factor)
-    mean, deviation = record.filtered.mean[-1, factor], record.filtered.standard_deviation[-1, factor]
-    ends = np.clip(mean + np.array([-2.0, 2.0]) * deviation, *record.levels[factor][[0, -1]])
-    form, true = (".1f", ".0f") if unit == "%" else (".3g", ".3g")
-    low, high = (f"{scale * end:{form}}" for end in ends)
+def _state(run: Run, index: int) -> str:
+    factor = run.factors[index]
+    mean, deviation = (
+        factor.scale * run[f"filtered/{moment}"][-1, index] for moment in ("mean", "standard_deviation")
+    )
+    ends = np.clip(mean + np.array([-2.0, 2.0]) * deviation, factor.levels[0], factor.levels[-1])
+    form, true = (".1f", ".0f") if factor.unit == "%" else (".3g", ".3g")
+    low, high = (f"{end:{form}}" for end in ends)
     interval = f"{low} to {high}" if low != high else "no other level is believed"
-    if record.truth_state is not None:
-        interval += f", truth {scale * record.truth_state[-1, factor]:{true}}"
-    printed = f"{scale * mean:{form}} {unit}".rstrip()
-    return f"{_named(record.state_titles[factor])} at {printed} ({interval})"
+    if run.truth is not None:
+        interval += f", truth {factor.scale * run.truth[-1, index]:{true}}"
+    return f"{_named(factor.title)} at {f'{mean:{form}} {factor.unit}'.rstrip()} ({interval})"
 
 
-def _agreement(record: RunRecord, check: PredictiveCheck) -> str:
+def _agreement(run: Run, check: PredictiveCheck) -> str:
     """Return whether the observations scatter about the model as the twin assumes."""
-    spread, inside = check.standard_deviation, 100.0 * check.overall_coverage
-    count = int(check.count.sum())
-    if count == 0 or not np.isfinite(spread):
+    count, spread = int(check.count.sum()), check.standard_deviation
+    if count == 0:
         return ""
-    scatter = "The observations scatter about the twin's model"
-    share = f"{inside:.0f} % of them lie within their 95 % intervals"
-    sure = 3.3 / np.sqrt(2.0 * count)  # standard deviations of the spread that chance exceeds once in 1,000
-    if spread > 1.0 + max(_SPREAD_DIFFERS, sure):
-        return (
-            f"{scatter} {spread:.3g} times as far as it assumes: {share}; "
-            "the noise is larger, or the model is off."
-        )
-    if spread < 1.0 - max(_SPREAD_DIFFERS, sure):
-        return (
-            f"{scatter} {spread:.2g} times as far as it assumes: {share}; "
-            "its intervals are wider than they need be."
-        )
+    # standard deviations of the spread that chance exceeds once in 1,000
+    differs = max(_SPREAD_DIFFERS, 3.3 / np.sqrt(2.0 * count))
     hits = np.rint(np.nan_to_num(check.coverage, nan=1.0) * check.count)
     chance = np.where(check.count > 0, binom.cdf(hits, np.maximum(check.count, 1), 0.95), 1.0)
     worst = int(np.argmin(chance))
-    if chance[worst] < _SURE / len(chance):
-        title = sensor_title(record, worst)
-        return (
-            f"Of all observations {inside:.0f} % lie within their 95 % intervals, but "
-            f"{100.0 * check.coverage[worst]:.0f} % of those of "
-            f"{title[:1].lower()}{title[1:]}."
-        )
-    return f"The twin's model explains the observations within the noise that it assumes: {share}."
+    return WORDS.say(
+        "agreement", spread=spread, wide=spread > 1.0 + differs, narrow=spread < 1.0 - differs,
+        inside=100.0 * check.overall_coverage, off=chance[worst] < _SURE / len(chance),
+        worst=run.sensors.titles[worst], share=100.0 * check.coverage[worst],
+    )  # fmt: skip
 
 
 def _named(title: str) -> str:
@@ -156,4 +118,4 @@ def _named(title: str) -> str:
 
 
 def _count(count: int, word: str) -> str:
-    return f"one {word}" if count == 1 else f"{count} {word}s"
+    return f"one {word}" if count == 1 else counted(count, word)

@@ -1,88 +1,34 @@
 """The report of a run: one self-contained page and its figures, from nothing but the run folder."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import chain
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
-from reporting.page import Column, Page, Table
+from reporting.page import Page, ReportFigure
+from reporting.words import listing, number, parameter_title, small
 from twin_master.assets.asset_source import calibrated_with
+from twin_master.assets.structure_source import FIELD_NAME
 from twin_master.errors import RunFolderError
 from twin_master.report.belief import belief_figure, policy_figure
-from twin_master.report.calibration import (
-    CalibrationView,
-    calibration_caption,
-    calibration_figure,
-    calibration_view,
-)
-from twin_master.report.check import check_figure, predictive_check
-from twin_master.report.data import RunRecord
-from twin_master.report.learnt import learnt_caption, learnt_figure, learnt_tables
-from twin_master.report.mission import mission_figure
-from twin_master.report.network import network_figure
-from twin_master.report.opening import opening_sentences
-from twin_master.report.reading import read_run
-from twin_master.report.structure import structure_figure
-from twin_master.report.text import (
-    belief_caption,
-    check_caption,
-    lost_ranges,
-    mission_caption,
-    network_caption,
-    number,
-    policy_caption,
-    turn_ranges,
-)
-from twin_master.report.view import choose_sensors, default_now, sensor_title, sensor_word, state_scale
+from twin_master.report.calibration import believed, calibrated_rows, calibration_figure, measured, true_value
+from twin_master.report.check import PredictiveCheck, check_figure, predictive_check
+from twin_master.report.learnt import asset_rows, label_of, learnt_figure, sensor_rows, with_interval
+from twin_master.report.mission import choose_sensors, default_now, mission_figure
+from twin_master.report.opening import WORDS, opening_sentences
+from twin_master.report.reading import Run, read_run
+from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
 from twin_master.store.outcome import REPORT_NAME
 from twin_master.store.summary import another_truth
 
 FIGURE_FOLDER = "figures"
-MAIN_FIGURE = "mission_now"
-"""The figure that is also written as PNG."""
-
-_SOURCES = (
-    "M. G. Kapteyn, J. V. R. Pretorius, K. E. Willcox: A probabilistic graphical model foundation for "
-    "enabling predictive digital twins at scale. Nature Computational Science 1 (2021) 337-347, "
-    "arXiv:2012.05841. Equation numbers in the captions are those of this paper.",
-    "Colours: M. Okabe, K. Ito, Color Universal Design (2008).",
-)
-
-
-@dataclass(frozen=True)
-class ReportFigure:
-    """A figure ready for the page.
-
-    Attributes
-    ----------
-    name
-        Name of its file, without ending.
-    figure
-        The drawing.
-    title, caption
-        Below it.
-    """
-
-    name: str
-    figure: Figure
-    title: str
-    caption: str
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A figure as it stands in the page; the attributes are those of `ReportFigure`."""
-
-    name: str
-    svg: bytes
-    title: str
-    caption: str
+MAIN_FIGURE, NETWORK = "mission_now", "network"
+"""The figure that is also written as PNG, and the one that is the same for all runs."""
 
 
 def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
@@ -93,7 +39,7 @@ def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
     Parameters
     ----------
     run_folder
-        Holds ``run.nc`` and, where they exist, ``config.json``, ``summary.json`` and ``calibration.json``.
+        Holds ``run.nc`` and ``config.json`` and, where they exist, ``summary.json`` and ``calibration.json``.
     now
         The present turn of the first figure; by default shortly before the control first changes.
 
@@ -104,26 +50,29 @@ def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    record = read_run(Path(run_folder))
-    folder = Path(run_folder) / FIGURE_FOLDER
-    drawings = []
-    for figure in chain(report_figures(record, now), _structure_picture(Path(run_folder), record.step_word)):
-        drawing = to_svg(figure.figure)
-        drawings.append(Drawing(figure.name, drawing, figure.title, figure.caption))
-        atomic_write_bytes(folder / f"{figure.name}.svg", drawing)
-        if figure.name == MAIN_FIGURE:
-            atomic_write_bytes(folder / f"{MAIN_FIGURE}.png", to_png(figure.figure))
-    return atomic_write_text(Path(run_folder) / REPORT_NAME, render_page(record, drawings))
+    folder = Path(run_folder)
+    run = read_run(folder)
+    drawings, words = {}, {}
+    for drawn in _figures(run, now, folder):  # one after the other: those of a long mission are large
+        words[drawn.name], drawings[drawn.name] = (drawn.title, drawn.caption), to_svg(drawn.figure)
+        if drawn.name == MAIN_FIGURE:
+            atomic_write_bytes(folder / FIGURE_FOLDER / f"{MAIN_FIGURE}.png", to_png(drawn.figure))
+    told = WORDS.figure(NETWORK, None, run=run)
+    words[NETWORK] = told.title, told.caption
+    drawings[NETWORK] = resources.files(__package__).joinpath("network.svg").read_bytes()
+    for name, drawing in drawings.items():
+        atomic_write_bytes(folder / FIGURE_FOLDER / f"{name}.svg", drawing)
+    return atomic_write_text(folder / REPORT_NAME, render_page(run, drawings, words))
 
 
-def report_figures(run: RunRecord | Path | str, now: int | None = None) -> Iterator[ReportFigure]:
-    """Draw every figure for which a run has data, one after the other: those of a long mission are large.
+def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[ReportFigure]:
+    """Draw every figure of a run, one after the other: those of a long mission are large.
 
     Parameters
     ----------
-    run : RunRecord or path
-        The run, or its folder.
-    now : int, optional
+    run_folder
+        The folder of the run.
+    now
         The present turn of the first figure; by default shortly before the control first changes.
 
     Raises
@@ -131,278 +80,240 @@ def report_figures(run: RunRecord | Path | str, now: int | None = None) -> Itera
     RunFolderError
         There is no run, it is damaged or of another layout, or `now` is no turn of it.
     """
-    record = run if isinstance(run, RunRecord) else read_run(Path(run))
-    now = default_now(record) if now is None else now
-    sensors = choose_sensors(record)
-    last = record.step_count - 1
+    yield from _figures(read_run(Path(run_folder)), now, Path(run_folder))
+
+
+def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
+    now, last = default_now(run) if now is None else now, run.steps - 1
     if not 0 <= now <= last:
         raise RunFolderError(f"The present turn of the report must lie in 0..{last}, and {now} came.")
-    step = record.step_word
-    drawing = mission_figure(record, now, sensors)
-    title = f"The mission as the twin sees it at {step} {now}"
-    yield ReportFigure(MAIN_FIGURE, drawing, title, mission_caption(record, now))
-    if now != last:
-        drawing = mission_figure(record, last, sensors)
-        title = f"The whole mission, seen from its last {step}"
-        yield ReportFigure("mission_whole", drawing, title, mission_caption(record, last))
-    yield ReportFigure("belief", belief_figure(record), "The belief about the state", belief_caption(record))
-    learnt = learnt_figure(record)
-    if learnt is not None:
-        yield ReportFigure("learnt", learnt, "What the twin learnt", learnt_caption(record))
-    policy = policy_figure(record)
-    if policy is not None:
-        yield ReportFigure("policy", policy, "The policy", policy_caption(record))
-    check = predictive_check(record)
-    if check is not None:
-        drawing = check_figure(record, check)
-        yield ReportFigure("check", drawing, "Posterior predictive check", check_caption(record, check))
-    view = calibration_view(record)
-    if view is not None:
-        drawing = calibration_figure(view)
-        yield ReportFigure(
-            "calibration",
-            drawing,
-            "What the model was tailored with" + (" before the flight" if record.learnt else ""),
-            calibration_caption(view),
+    units = ", ".join(
+        dict.fromkeys("percent" if factor.unit == "%" else factor.unit for factor in run.factors)
+    )
+    for name, turn in ((MAIN_FIGURE, now), *([("mission_whole", last)] if now != last else [])):
+        asked = run["filtered/decision_probability"][turn]
+        chosen = int(np.argmax(asked))
+        decided = WORDS.say(
+            "decided", run=run, now=turn, chosen=run.controls[chosen], probability=asked[chosen]
         )
-    title = f"The dynamic decision network for a few {step}s"
-    yield ReportFigure("network", network_figure(), title, network_caption(record))
+        past = "in hindsight" if turn == last else "as seen at the time"
+        yield WORDS.figure(
+            "mission", mission_figure(run, turn, choose_sensors(run)), run=run, now=turn, units=units,
+            whole=name != MAIN_FIGURE, last=turn == last, past=past, decided=decided,
+        )._replace(name=name)  # fmt: skip
+    yield WORDS.figure("belief", belief_figure(run), run=run, units=units)
+    if run.learnt:
+        yield WORDS.figure("learnt", learnt_figure(run), run=run)
+    if len(run.factors) == 2:
+        yield WORDS.figure("policy", policy_figure(run), run=run)
+    check = predictive_check(run)
+    yield WORDS.figure("check", check_figure(run, check), run=run, check=check, **_check_words(run, check))
+    unit = str(run.tree["calibration/draw_value"].attrs.get("units", "1"))
+    yield WORDS.figure(
+        "calibration", calibration_figure(run), run=run, measured=measured(run), truth=true_value(run),
+        name=parameter_title(run.scenario.calibration.parameter), draws=run["calibration/draw_value"],
+        unit="dimensionless" if unit == "1" else unit,
+    )  # fmt: skip
+    yield from _structure(run, folder, check)
 
 
-def _structure_picture(run_folder: Path, step: str) -> Iterator[ReportFigure]:
-    """Draw the structure that was flown, where the run left its field."""
-    field = structure_figure(run_folder)
-    if field is not None:
-        caption = (
-            "Surface of the mesh, coloured by the stiffness that each region has lost by the twin's last "
-            f"estimate; the edges of regions are black. Displacements under the last control are shown "
-            f"{field.scale:.3g} times as large; the largest is {1e3 * field.largest:.3g} mm."
+def _structure(run: Run, folder: Path, check: PredictiveCheck) -> Iterator[ReportFigure]:
+    """Draw the structure itself, where the run holds the planform of its wing or the field of its mesh."""
+    planform = planform_of(design_of(folder), run.scenario)
+    if (folder / FIELD_NAME).is_file():
+        picture = mesh_figure(run, folder, check.residual[-1])
+        yield WORDS.figure("structure", picture.figure, run=run, picture=picture)
+    elif planform is not None:
+        figure = planform_figure(run, planform, check.residual[-1])
+        yield WORDS.figure("structure", figure, run=run, picture=None)
+
+
+def _check_words(run: Run, check: PredictiveCheck) -> dict[str, str | bool]:
+    """Return the assumed noise with its units, the error of the model, and the sensor of lowest coverage."""
+    section, sensors = run.scenario.observation, run.sensors
+    noise, error = np.asarray(section.standard_deviation), 100.0 * np.asarray(section.model_error)
+    told = f"{sensors.scale * float(noise.flat[0]):.4g} {sensors.unit}"
+    if noise.ndim or not sensors.unit:
+        each = zip(np.broadcast_to(noise, section.count).tolist(), sensors.units, sensors.titles, strict=True)
+        told = ", ".join(
+            f"{sensors.scale * value:.4g} {unit} ({small(title)})" for value, unit, title in each
         )
-        yield ReportFigure("structure", field.figure, f"The structure after the last {step}", caption)
+    low, high = float(error.min()), float(error.max())
+    share = f"{low:.3g} %" if low == high else f"{low:.3g} to {high:.3g} %"
+    lowest = ""
+    if len(check.transform):
+        sensor = int(np.nanargmin(check.coverage))
+        lowest = f"{small(sensors.titles[sensor])}, {100.0 * check.coverage[sensor]:.0f} %"
+    learnt = run.get("filtered/noise_standard_deviation") is not None
+    return {"noise": told, "error": share if high else "", "lowest": lowest, "learnt": learnt}
 
 
-def render_page(record: RunRecord, drawings: Sequence[Drawing]) -> str:
-    """Return the page: outcome, mission, belief, decision, check, model and run."""
-    mission = record.scenario.get("mission")
-    mission = mission if isinstance(mission, Mapping) else {}
-    name = str(mission.get("name") or record.attributes.get("scenario") or "run")
+def render_page(run: Run, drawings: Mapping[str, bytes], words: Mapping[str, tuple[str, str]]) -> str:
+    """Return the page: outcome, mission, belief, decision, check, model and run.
+
+    Parameters
+    ----------
+    run
+        The run.
+    drawings, words
+        Its figures as SVG by the names of their files, and title and caption of each.
+    """
+    mission = run.scenario.mission
     page = Page(
-        title=str(mission.get("title") or name),
-        subtitle=f"Scenario {name}, {record.step_count} {record.step_word}s, seed {_seed(record)}",
-        footer=_SOURCES,
+        mission.title or mission.name,
+        WORDS.say("subtitle", run=run, name=mission.name, seed=_seed(run)),
+        footer=(WORDS.say("sources"), WORDS.say("colours")),
     )
     page.add_section("Outcome")
-    _add_outcome(page, record)
-    for title, names in (
-        ("The mission", (MAIN_FIGURE, "mission_whole")),
-        ("What the twin believes", ("belief",)),
-        ("What the twin learnt", ("learnt",)),
-        ("What the twin decides", ("policy",)),
-        ("Whether the data agree", ("check",)),
-        ("The model", ("structure", "calibration", "network")),
-    ):
-        present = [drawing for drawing in drawings if drawing.name in names]
-        if present:
-            page.add_section(title)
-        for figure in present:
-            page.add_figure(figure.svg, figure.caption, title=figure.title)
-            if figure.name == "calibration":
-                _add_calibrated_wing(page, calibration_view(record))
-                _add_calibrated_model(page, record)
-            if figure.name == "learnt":
-                for table, caption, title in learnt_tables(record):
-                    page.add_table(table, caption, title=title)
+    _add_outcome(page, run)
+    for section in WORDS.content["section"]:
+        shown = [name for name in section["figures"] if name in drawings]
+        if shown:
+            page.add_section(section["title"])
+        for name in shown:
+            page.add_figure(drawings[name], words[name][1], title=words[name][0])
+            if name == "calibration":
+                _add_calibrated(page, run)
+            if name == "learnt":
+                add_learnt(page, run)
     page.add_section("The run")
-    _add_run(page, record)
+    _add_run(page, run)
     return page.render()
 
 
-def _seed(record: RunRecord) -> str:
-    seed = record.config.get("seed", record.attributes.get("seed"))
-    return "unknown" if seed is None else str(seed)
+def _seed(run: Run) -> str:
+    return str(run.config.get("seed", run.tree.attrs.get("seed", "unknown")))
 
 
-def _summary_figures(record: RunRecord) -> list[Mapping[str, Any]]:
-    figures = record.summary.get("figures", [])
-    return [figure for figure in figures if isinstance(figure, Mapping)] if isinstance(figures, list) else []
-
-
-def _add_outcome(page: Page, record: RunRecord) -> None:
-    page.add_paragraph(" ".join(opening_sentences(record)))
-    for text in _notices(record):
+def _add_outcome(page: Page, run: Run) -> None:
+    page.add_paragraph(" ".join(opening_sentences(run)))
+    for text in _notices(run):
         page.add_notice(text)
-    figures = _summary_figures(record)
-    referred = any(figure.get("reference") is not None for figure in figures)
-    columns = [Column("figure"), Column("this run", numeric=True), Column("unit")]
-    if referred:
-        columns += [Column("reference", numeric=True), Column("source of the reference")]
+    figures = run.summary.get("figures", ())
+    referred = any(figure["reference"] is not None for figure in figures)
     rows = []
     for figure in figures:
-        row = [str(figure.get("title", figure.get("key", ""))), number(figure.get("value"))]
-        row.append(str(figure.get("unit") or ""))
-        if referred:
-            reference = figure.get("reference")
-            row += ["" if reference is None else number(reference), str(figure.get("reference_source") or "")]
-        rows.append(tuple(row))
-    if rows:
-        page.add_table(
-            Table(tuple(columns), rows),
-            f"{_points(record)}A dash means that it did not happen.",
-            title="Figures of the run" + (", beside their references" if referred else ""),
-        )
+        beside = "" if figure["reference"] is None else number(figure["reference"])
+        row = (figure["title"], number(figure["value"]), figure["unit"], beside, figure["reference_source"])
+        rows.append(row if referred else row[:3])
+    points = " and ".join(factor.title for factor in run.factors if factor.unit == "%")
+    WORDS.add_table(page, "figures", rows, points=points, referred=referred)
 
 
-def _points(record: RunRecord) -> str:
-    titles = [title for k, title in enumerate(record.state_titles) if state_scale(record, k)[1] == "%"]
-    return f"Points are percentage points of {' and '.join(titles)}. " if titles else ""
-
-
-def _add_calibrated_wing(page: Page, view: CalibrationView | None) -> None:
-    """Add what the calibration file says of the wing, where the run flew with one."""
-    if view is None or not view.figures:
-        return
-    rows = [
-        (
-            figure.title,
-            number(figure.mean),
-            number(figure.standard_deviation),
-            " to ".join(number(end) for end in figure.interval),
-            "" if figure.unit == "1" else figure.unit,
-        )
-        for figure in view.figures
-    ]
-    columns = (
-        Column("figure"),
-        Column("mean", numeric=True),
-        Column("standard deviation", numeric=True),
-        Column("95 % interval", numeric=True),
-        Column("unit"),
+def add_learnt(page: Page, run: Run) -> None:
+    """Add the last values of what was learnt, of the asset and of its sensors."""
+    given = getattr(run.scenario.transition, "probability", {}) or {}
+    plain = listing(f"{value:g} in {name}" for name, value in given.items() if isinstance(value, int | float))
+    factor = any(learnt.name == "transition_factor" for learnt in run.learnt)
+    WORDS.add_table(page, "learnt_asset", asset_rows(run), run=run, factor=factor, plain=plain)
+    own = [learnt for learnt in run.learnt if learnt.of_sensors]
+    # The prior of the sensors is one, unless the scenario gives one for each.
+    prior = "; ".join(
+        f"{learnt.title.lower()} {with_interval(np.nanmedian(learnt.prior, axis=0))}" for learnt in own
     )
-    if not view.campaign:
-        source, what = "of the healthy wing", "wing"
-    else:
-        source, what = f"from the campaign {view.campaign}", "parameters"
-    page.add_table(
-        Table(columns, rows),
-        f"From the samples of the calibration file, {source}.",
-        title=f"The calibrated {what}: {view.wing}",
+    WORDS.add_table(
+        page,
+        "learnt_sensors",
+        sensor_rows(run),
+        run=run,
+        prior=prior,
+        more=[label_of(learnt) for learnt in own],
     )
-    for sentence in view.findings:
+
+
+def _add_calibrated(page: Page, run: Run) -> None:
+    """Add what the calibration file says of the wing or the model, where the run flew with one."""
+    kept = run.calibration
+    rows = calibrated_rows(run)
+    WORDS.add_table(page, "calibrated", rows, campaign=kept.get("campaign"), wing=kept.get("asset"))
+    for sentence in kept.get("findings", ()) if rows else ():
         page.add_paragraph(sentence)
+    asset, model = run.summary.get("asset"), run.summary.get("twin_model")
+    told = asset and model and calibrated_with(kept, asset, model, run.config.get("inputs", {}))
+    if told:
+        page.add_paragraph(told)
 
 
-def _add_calibrated_model(page: Page, record: RunRecord) -> None:
-    """Say which model a campaign calibrated, and which was flown."""
-    asset, believed = (record.summary.get(key) for key in ("asset", "twin_model"))
-    if asset and believed:
-        inputs = record.config.get("inputs")
-        hashes = inputs if isinstance(inputs, Mapping) else {}
-        told = calibrated_with(record.calibration, str(asset), str(believed), hashes)
-        if told is not None:
-            page.add_paragraph(told)
-
-
-def _notices(record: RunRecord) -> list[str]:
-    """Return what a reader must not miss: another model, alarms, lost observations."""
-    said = record.summary.get("notices")
-    notices = [
-        str(notice.get("sentence", ""))
-        for notice in (said if isinstance(said, list) else [])
-        if isinstance(notice, Mapping)
-    ]
-    notices += _loss_notices(record)
-    if record.summary.get("asset_and_model_differ") is True:
-        asset, model = record.summary.get("asset"), record.summary.get("twin_model")
-        notices.insert(
-            0,
-            f"The asset and the twin's model differ: flown was the {asset}, and the twin believes the "
-            f"{model}. Its intervals hold as far as that model holds.",
-        )
-    return notices
-
-
-def _loss_notices(record: RunRecord) -> list[str]:
-    if record.observation is None:
-        return ["The run holds no observations, so the figures show the twin's beliefs only."]
-    view = calibration_view(record)
-    notices = []
-    fixed = view is not None and all(learnt.name != view.parameter for learnt in record.learnt)
-    if view is not None and view.true_value is not None and fixed:
-        believed = view.moments or (float(view.draws.mean()), float(view.draws.std()))
-        sentence = another_truth(view.parameter, view.true_value, *believed)
+def _notices(run: Run) -> list[str]:
+    """Return what a reader must not miss: another model, alarms, another truth, lost observations."""
+    notices = [notice["sentence"] for notice in run.summary.get("notices", ())]
+    if run.summary.get("asset_and_model_differ"):
+        asset, model = run.summary["asset"], run.summary["twin_model"]
+        notices.insert(0, WORDS.say("differ", asset=asset, model=model))
+    truth, parameter = true_value(run), run.scenario.calibration.parameter
+    if truth is not None and all(learnt.name != parameter for learnt in run.learnt):
+        sentence = another_truth(parameter, truth, *believed(run))
         notices += [] if sentence is None else [sentence]
-    lost = np.isnan(record.observation)
-    if not lost.any():
-        return notices
-    word = sensor_word(record).lower()
-    notices += [f"Observations lost ({100.0 * lost.mean():.1f} %): {lost_ranges(record)}."]
-    blind = np.flatnonzero(lost.all(axis=1))
-    if len(blind):
-        notices.append(
-            f"No {word} reported at {turn_ranges(blind, record.step_word)}: there the belief followed the "
-            "dynamics alone."
-        )
+    lost = np.isnan(run.observed)
+    if lost.any():
+        notices.append(WORDS.say("lost", share=100.0 * lost.mean(), ranges=lost_ranges(run)))
+        if lost.all(axis=1).any():
+            turns = turn_ranges(np.flatnonzero(lost.all(axis=1)), run.step)
+            notices.append(WORDS.say("blind", run=run, turns=turns))
     return notices
 
 
-def _add_run(page: Page, record: RunRecord) -> None:
-    rows: list[tuple[str, str]] = [
-        (f"{record.step_word}s flown", str(record.step_count)),
-        (f"{record.step_word}s predicted", str(record.horizon)),
-        ("states", f"{len(record.coordinates)} ({' × '.join(str(len(level)) for level in record.levels)})"),
-        ("controls", ", ".join(record.controls)),
-        (f"{sensor_word(record).lower()}s", _sensor_list(record)),
-        ("seed", _seed(record)),
+def turn_ranges(turns: ArrayLike, step_word: str = "turn") -> str:
+    """Return increasing turns in words: ``turns 3–4, 12–18``."""
+    values = np.asarray(turns, dtype=int)
+    parts = np.split(values, np.flatnonzero(np.diff(values) > 1) + 1)
+    words = [f"{part[0]}" if len(part) == 1 else f"{part[0]}–{part[-1]}" for part in parts]
+    return f"{step_word} {words[0]}" if len(values) == 1 else f"{step_word}s {', '.join(words)}"
+
+
+def lost_ranges(run: Run) -> str:
+    """Return which sensors were lost when, those lost together in one phrase."""
+    lost = np.isnan(run.observed)
+    blind = lost.all(axis=1)
+    together: dict[tuple[int, ...], list[str]] = {}
+    for sensor in range(lost.shape[1]):
+        turns = tuple(np.flatnonzero(lost[:, sensor] & ~blind).tolist())
+        if turns:
+            together.setdefault(turns, []).append(str(sensor + 1))
+    word = run.sensors.word
+    phrases = [
+        f"{word}{'s' if len(labels) > 1 else ''} {', '.join(labels)} at {turn_ranges(turns, run.step)}"
+        for turns, labels in together.items()
+    ]
+    if blind.any():
+        phrases.append(f"all {word}s at {turn_ranges(np.flatnonzero(blind), run.step)}")
+    return "; ".join(phrases)
+
+
+def _add_run(page: Page, run: Run) -> None:
+    levels, sensors = [len(factor.levels) for factor in run.factors], run.sensors
+    named = f": {', '.join(sensors.titles)}" if sensors.named else ""
+    rows: list[Sequence[str]] = [
+        (f"{run.step}s flown", str(run.steps)),
+        (f"{run.step}s predicted", str(run.horizon)),
+        ("states", f"{len(run.coordinates)} ({' × '.join(map(str, levels))})"),
+        ("controls", ", ".join(run.controls)),
+        (f"{sensors.word}s", f"{len(sensors.titles)}{named}"),
+        ("seed", _seed(run)),
     ]
     for title, key in (("asset", "asset"), ("model that the twin believes", "twin_model")):
-        if key in record.attributes:
-            rows.append((title, str(record.attributes[key])))
-    if record.log_evidence is not None:
-        rows.append(("log evidence of all observations", f"{float(np.sum(record.log_evidence)):.2f}"))
-    for name, (values, unit) in record.monitors.items():
-        scale, printed = (1.0e6, "µε") if name == "strain_error_bound" else (1.0, unit)
-        if printed != "1" and np.isfinite(values).any():
-            rows.append(
-                (f"largest {name.replace('_', ' ')}", f"{scale * float(np.nanmax(values)):.3g} {printed}")
-            )
-    page.add_table(
-        Table((Column("item"), Column("value")), rows), "From run.nc and config.json.", title="Run"
-    )
-    page.add_paragraph("Wall-clock times stand in timing.json, so that equal runs give equal reports.")
-    origin = _origin(record)
-    if origin:
-        page.add_table(
-            Table((Column("item"), Column("value")), origin),
-            "Versions of the software, and the first 12 digits of the SHA-256 of sources and inputs; "
-            "config.json has them in full.",
-            title="Provenance",
-        )
+        if key in run.tree.attrs:
+            rows.append((title, str(run.tree.attrs[key])))
+    rows.append(("log evidence of all observations", f"{float(np.sum(run['filtered/log_evidence'])):.2f}"))
+    monitors = run.tree["truth"].data_vars if run.truth is not None else {}
+    for name, variable in monitors.items():
+        strain = name == "strain_error_bound"
+        scale, unit = (1.0e6, "µε") if strain else (1.0, variable.attrs.get("units", "1"))
+        if variable.dims == ("step",) and unit != "1" and np.isfinite(variable.values).any():
+            largest = scale * float(np.nanmax(variable.values))
+            rows.append((f"largest {str(name).replace('_', ' ')}", f"{largest:.3g} {unit}"))
+    WORDS.add_table(page, "run", rows)
+    page.add_paragraph(WORDS.say("timing"))
+    WORDS.add_table(page, "provenance", _origin(run.config))
 
 
-def _sensor_list(record: RunRecord) -> str:
-    count = str(len(record.sensors))
-    if not record.sensor_titles:
-        return count
-    return f"{count}: {', '.join(sensor_title(record, k) for k in range(len(record.sensors)))}"
-
-
-def _origin(record: RunRecord) -> list[tuple[str, str]]:
+def _origin(config: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return versions and hashes as the configuration keeps them."""
-    origin, inputs = record.config.get("provenance", {}), record.config.get("inputs", {})
-    origin = origin if isinstance(origin, Mapping) else {}
-    rows: list[tuple[str, str]] = []
-    versions = origin.get("versions")
-    if isinstance(versions, Mapping) and versions:
-        rows.append(
-            ("software", ", ".join(f"{name} {version}" for name, version in sorted(versions.items())))
-        )
-    for title, hashes in (
-        ("sources", origin.get("source_hashes")),
-        ("inputs", origin.get("input_hashes")),
-        ("inputs", inputs),
-    ):
-        if isinstance(hashes, Mapping) and hashes:
-            rows.append(
-                (title, ", ".join(f"{name} {str(value)[:12]}" for name, value in sorted(hashes.items())))
-            )
-    return rows
+    origin = config.get("provenance", {})
+    found = [("software", origin.get("versions"), 99), ("sources", origin.get("source_hashes"), 12)]
+    found += [("inputs", origin.get("input_hashes"), 12), ("inputs", config.get("inputs"), 12)]
+    return [
+        (title, ", ".join(f"{name} {str(value)[:digits]}" for name, value in sorted(own.items())))
+        for title, own, digits in found
+        if own
+    ]

@@ -1,35 +1,193 @@
-"""Reading a run folder into a `RunRecord`."""
+"""A run as its pages read it: the stored arrays by their names, and what the scenario says of them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from reporting.errors import DamagedFileError
 from reporting.folders import restore_folder
 from reporting.json_file import read_json
-from reporting.netcdf import read_groups
-from twin_master.errors import RunFolderError
-from twin_master.report.data import (
-    NORMAL_95,
-    Estimate,
-    LearntCourse,
-    PolicyTable,
-    RunRecord,
-    Uncertain,
-    moments,
-)
-from twin_master.store.learnt import MOMENTS
+from reporting.words import capital, parameter_title
+from twin_master.errors import RunFolderError, TwinMasterError
+from twin_master.network.twin import build_graphical_model
+from twin_master.report.view import PrintedFactor, PrintedSensors, printed_factors, printed_sensors
+from twin_master.run_folder import CONFIG_NAME
+from twin_master.scenario.reading import parse_scenario
+from twin_master.scenario.schema import Scenario
+from twin_master.store.learnt import MOMENTS, LearntQuantity, printed_learnt
+from twin_master.store.writing import RUN_NAME, SUMMARY_NAME
+from twin_master.store.writing import read_run as read_tree
 
-Float = NDArray[np.floating[Any]]
+if TYPE_CHECKING:
+    import xarray as xr
 
+Float = NDArray[np.float64]
+
+_OF_A_BELIEF = {
+    "probability": "state", "mean": "region", "standard_deviation": "region", "quantity_mean": "sensor",
+    "quantity_standard_deviation": "sensor", "quantity_lower": "sensor", "quantity_upper": "sensor",
+    "reward_mean": "reward", "reward_standard_deviation": "reward",
+}  # fmt: skip
+_OPTIONAL = ("truth", "learnt", "notice")
+"""Groups that not every run has."""
+_TITLES = {
+    "noise_scale": "Noise, as a factor on the assumed one",
+    "gauge_gain": "Gain error",
+    "gauge_offset": "Offset",
+    "transition_factor": "Factor on the transitions",
+}
 _ROUNDING = 1e-6
 
 
-def read_run(folder: Path) -> RunRecord:
+@dataclass(frozen=True)
+class Run:
+    """A run of T steps, S joint states of K factors, G sensors, U controls, H predicted steps.
+
+    ``run["filtered/mean"]`` is a variable of `run.nc` as an array, SI; see `docs/run_folder.md`.
+
+    Attributes
+    ----------
+    tree : DataTree
+        All groups of `run.nc`.
+    scenario : Scenario
+        What was flown.
+    config, summary, calibration : mapping
+        The JSON files of the folder; the last two are empty where there is none.
+    """
+
+    tree: "xr.DataTree"
+    scenario: Scenario
+    config: Mapping[str, Any]
+    summary: Mapping[str, Any]
+    calibration: Mapping[str, Any]
+
+    def __getitem__(self, path: str) -> Float:
+        """Return a variable."""
+        return np.asarray(self.tree[path].values)
+
+    def get(self, path: str) -> Float | None:
+        """Return a variable; None where the run does not have it."""
+        group, _, name = path.partition("/")
+        return self[path] if group in self.tree.children and name in self.tree[group] else None
+
+    @cached_property
+    def factors(self) -> tuple[PrintedFactor, ...]:
+        """The K factors of the state, as printed."""
+        return printed_factors(self.scenario)
+
+    @cached_property
+    def sensors(self) -> PrintedSensors:
+        """The G sensors, as printed."""
+        return printed_sensors(self.scenario)
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        """Names of the U controls."""
+        return self.scenario.control_names
+
+    @property
+    def step(self) -> str:
+        """What a step is called."""
+        return self.scenario.mission.step_name
+
+    @property
+    def watched(self) -> bool:
+        """Whether it is that of a real asset."""
+        return bool(self.config.get("watched"))
+
+    @property
+    def observed(self) -> Float:
+        """What the sensors said, SI: (T, G); NaN where lost."""
+        return self[f"observed/{self.sensors.quantity}"]
+
+    @property
+    def truth(self) -> Float | None:
+        """True state, SI: (T, K); None where nobody knows it."""
+        return self.get("truth/state")
+
+    @cached_property
+    def control_index(self) -> NDArray[np.int64]:
+        """Control in force: (T,)."""
+        return self["observed/control_index"].astype(np.int64)
+
+    @property
+    def steps(self) -> int:
+        """Number T of steps."""
+        return len(self.control_index)
+
+    @property
+    def first_step(self) -> int:
+        """Number of the first step."""
+        return int(self["observed/step"][0])
+
+    @property
+    def horizon(self) -> int:
+        """Number H of predicted steps."""
+        return int(self["predicted/mean"].shape[1])
+
+    @cached_property
+    def scales(self) -> Float:
+        """From the stored units of the factors to the printed ones: (K,)."""
+        return np.array([factor.scale for factor in self.factors])
+
+    @cached_property
+    def coordinates(self) -> Float:
+        """Levels of each joint state, SI: (S, K)."""
+        return np.stack([self[f"policy/{name}"] for name in self.scenario.state_names], axis=-1)
+
+    @cached_property
+    def learnt(self) -> tuple[LearntQuantity, ...]:
+        """What was learnt, in printed units, in the order in which it is stored; empty where nothing is."""
+        if "learnt" not in self.tree.children:
+            return ()
+        found = []
+        for variable, stored in self.tree["learnt"].data_vars.items():
+            name = str(variable).removesuffix(f"_prior_{MOMENTS[0]}")
+            if name == variable:
+                continue
+            scale, unit = printed_learnt(name, str(stored.attrs["units"]))
+            course, prior = (
+                scale * np.stack([self[f"learnt/{name}{part}_{moment}"] for moment in MOMENTS], axis=-1)
+                for part in ("", "_prior")
+            )
+            truth = self.get(f"truth/{name}")
+            title = _TITLES.get(name, capital(parameter_title(name)))
+            unit = "µε" if unit == "microstrain" else unit
+            found.append(
+                LearntQuantity(name, title, unit, course, prior, None if truth is None else scale * truth)
+            )
+        return tuple(found)
+
+    def smoothed_until(self, now: int) -> Float:
+        """Return p(D_t | o_0..o_now) for t = 0..now, (now + 1, S), from the filtered beliefs.
+
+        The backward recursion of the smoother needs nothing but the transitions: with f the filtered belief
+        and T the transition under u_t, s_t = f_t * T (s_{t+1} / (f_t T)).
+        """
+        transition = build_graphical_model(self.scenario).transition
+        filtered = self["filtered/probability"]
+        smoothed = filtered[: now + 1].copy()
+        for step in range(now - 1, -1, -1):
+            control = int(self.control_index[step])
+            forecast = transition.forward(control, filtered[step])
+            ratio = np.divide(smoothed[step + 1], forecast, out=np.zeros_like(forecast), where=forecast > 0.0)
+            smoothed[step] = filtered[step] * transition.expected(control, ratio)
+            smoothed[step] /= smoothed[step].sum()
+        return smoothed
+
+    def moments(self, probability: Float) -> tuple[Float, Float]:
+        """Return mean and standard deviation of each factor under beliefs: (..., S) -> two of (..., K)."""
+        mean = probability @ self.coordinates
+        square = (self.coordinates - mean[..., None, :]) ** 2
+        return mean, np.sqrt(np.einsum("...s,...sk->...k", probability, square))
+
+
+def read_run(folder: Path) -> Run:
     """Read a run folder.
 
     Raises
@@ -37,22 +195,27 @@ def read_run(folder: Path) -> RunRecord:
     RunFolderError
         There is no ``run.nc``, it is damaged, or it has another layout.
     """
-    path = folder / "run.nc"
     tree = open_run(folder)
-    groups = {name: tree[name].to_dataset() for name in tree.children}
-    attributes = {str(name): value for name, value in tree.attrs.items()}
+    config, summary, calibration = (
+        _read_json(folder / name) for name in (CONFIG_NAME, SUMMARY_NAME, "calibration.json")
+    )
     try:
-        record = _record(groups, attributes, folder)
-        _check_values(record)
-    except (KeyError, ValueError, IndexError, TypeError, AttributeError, OverflowError) as error:
+        scenario = parse_scenario(config.get("scenario", {}), str(folder / CONFIG_NAME))
+    except TwinMasterError as error:
+        raise RunFolderError(f"{error} The run cannot be shown: fly it again.") from error
+    run = Run(tree, scenario, config, summary, calibration)
+    try:
+        _check(run)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
         reason = error.args[0] if error.args else error
         raise RunFolderError(
-            f"{path} does not have the layout of a run of this version ({reason}): fly the run again."
+            f"{folder / RUN_NAME} does not have the layout of a run of this version ({reason}): fly the run "
+            "again."
         ) from error
-    return record
+    return run
 
 
-def open_run(folder: Path | str) -> xr.DataTree:
+def open_run(folder: Path | str) -> "xr.DataTree":
     """Return everything that a run has stored, `run.nc`; `watch.snapshot.open_run` also reads what goes on.
 
     Raises
@@ -60,248 +223,54 @@ def open_run(folder: Path | str) -> xr.DataTree:
     RunFolderError
         There is no ``run.nc``, or it is damaged.
     """
-    path = Path(folder) / "run.nc"
-    restore_folder(path.parent)
-    if not path.is_file():
+    restore_folder(Path(folder))
+    if not (Path(folder) / RUN_NAME).is_file():
         raise RunFolderError(
             f"{folder} holds no run.nc, so there is no run to report: fly or resume the run first."
         )
     try:
-        return read_groups(path)
+        return read_tree(Path(folder))
     except DamagedFileError as error:
-        raise RunFolderError(
-            f"{error}, so that it cannot be read: resume the run or fly it again."
-        ) from error
+        raise RunFolderError(str(error)) from error
 
 
-def _check_values(record: RunRecord) -> None:
+def _check(run: Run) -> None:
     """Refuse what no twin has ever stored; the figures rely on it."""
-    controls, (lowest, highest) = len(record.controls), (0, len(record.controls) - 1)
-    indices = [("observed/control_index", record.control_index)]
-    if record.policy is not None:
-        indices.append(("policy/control_index", record.policy.control_index))
-    for name, values in indices:
-        if values.size and not (lowest <= values.min() and values.max() <= highest):
-            raise ValueError(f"{name} goes beyond its {controls} controls")
-    for name, estimate in (
-        ("filtered", record.filtered),
-        ("smoothed", record.smoothed),
-        ("predicted", record.predicted),
-    ):
-        if estimate is None:
+    role = run.sensors.quantity
+    layout: dict[str, tuple[str, ...]] = {
+        "observed/control_index": ("step",), f"observed/{role}": ("step", "sensor"),
+        "filtered/log_evidence": ("step",), "filtered/decision_probability": ("step", "control"),
+        "predicted/control_probability": ("step", "horizon", "control"),
+        "policy/control_index": ("state",), "policy/action_value": ("state", "control"),
+        "calibration/draw_value": ("draw",), "truth/state": ("step", "region"),
+        f"truth/{role}": ("step", "sensor"),
+    }  # fmt: skip
+    for group, lead in (("filtered", ()), ("smoothed", ()), ("predicted", ("horizon",))):
+        layout |= {f"{group}/{name}": ("step", *lead, axis) for name, axis in _OF_A_BELIEF.items()}
+    for path, axes in layout.items():
+        group, _, name = path.partition("/")
+        if group in _OPTIONAL and group not in run.tree.children:
             continue
-        total = estimate.probability.sum(axis=-1)
-        if not (np.all(estimate.probability >= 0.0) and np.all(np.abs(total - 1.0) < _ROUNDING)):
-            raise ValueError(f"a row of {name}/probability is no distribution")
-        for part in (estimate.mean, estimate.standard_deviation):
-            if not np.all(np.isfinite(part)):
-                raise ValueError(f"a moment of {name} is not finite")
-    if not np.all(np.isfinite(record.coordinates)):
+        if group not in run.tree.children or name not in run.tree[group]:
+            raise ValueError(f"the variable {path} is missing")
+        if run.tree[path].dims != axes:
+            raise ValueError(f"{name} has the axes {run.tree[path].dims} and not {axes}")
+    for path in ("observed/control_index", "policy/control_index"):
+        if not (run[path].min() >= 0 and run[path].max() < len(run.controls)):
+            raise ValueError(f"{path} goes beyond its {len(run.controls)} controls")
+    for group in ("filtered", "smoothed", "predicted"):
+        belief = run[f"{group}/probability"]
+        if not (np.all(belief >= 0.0) and np.all(np.abs(belief.sum(axis=-1) - 1.0) < _ROUNDING)):
+            raise ValueError(f"a row of {group}/probability is no distribution")
+        for name in ("mean", "standard_deviation"):
+            if not np.all(np.isfinite(run[f"{group}/{name}"])):
+                raise ValueError(f"a moment of {group} is not finite")
+    if not np.all(np.isfinite(run.coordinates)):
         raise ValueError("a level of the state is not finite")
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    content = read_json(path, RunFolderError)
+    content = read_json(path, RunFolderError) if path.is_file() else {}
     if not isinstance(content, dict):
         raise RunFolderError(f"{path} must hold one JSON object: fly the run again.")
     return content
-
-
-def _array(dataset: xr.Dataset | None, name: str, *dimensions: str) -> Float | None:
-    """Return a variable with its axes in the order given, or None if it was not stored."""
-    if dataset is None or name not in dataset:
-        return None
-    variable = dataset[name]
-    if set(variable.dims) != set(dimensions):
-        raise ValueError(f"{name} has the axes {variable.dims} and not {dimensions}")
-    return np.asarray(variable.transpose(*dimensions).values, dtype=np.float64)
-
-
-def _needed(dataset: xr.Dataset | None, group: str, name: str, *dimensions: str) -> Float:
-    values = _array(dataset, name, *dimensions)
-    if values is None:
-        raise ValueError(f"the variable {group}/{name} is missing")
-    return values
-
-
-def _names(groups: Mapping[str, xr.Dataset], dimension: str, fallback: int) -> tuple[str, ...]:
-    for dataset in groups.values():
-        if dimension in dataset.coords and dataset.coords[dimension].dims == (dimension,):
-            return tuple(_text(value) for value in dataset.coords[dimension].values)
-    return tuple(str(index + 1) for index in range(fallback))
-
-
-def _text(value: Any) -> str:
-    return value.decode("utf-8") if isinstance(value, bytes) else str(value)
-
-
-def _estimate(dataset: xr.Dataset | None, group: str, coordinates: Float, *lead: str) -> Estimate | None:
-    if dataset is None or "probability" not in dataset:
-        return None
-    probability = _needed(dataset, group, "probability", *lead, "state")
-    mean = _array(dataset, "mean", *lead, "region")
-    deviation = _array(dataset, "standard_deviation", *lead, "region")
-    if mean is None or deviation is None:
-        mean, deviation = moments(probability, coordinates)
-    return Estimate(
-        probability=probability,
-        mean=mean,
-        standard_deviation=deviation,
-        quantity=_uncertain(dataset, "quantity", *lead, "sensor"),
-        quantity_standard_deviation=None
-        if group == "predicted"  # nothing of the report shows it, and it is large
-        else _array(dataset, "quantity_standard_deviation", *lead, "sensor"),
-        reward=_uncertain(dataset, "reward", *lead, "reward"),
-    )
-
-
-def _uncertain(dataset: xr.Dataset, name: str, *dimensions: str) -> Uncertain | None:
-    """Read mean and 95 % interval; without stored bounds they are those of a normal distribution."""
-    mean, lower, upper, deviation = (
-        _array(dataset, f"{name}_{part}", *dimensions)
-        for part in ("mean", "lower", "upper", "standard_deviation")
-    )
-    if mean is None:
-        return None
-    if lower is None or upper is None:
-        half = np.zeros_like(mean) if deviation is None else NORMAL_95 * deviation
-        lower = mean - half if lower is None else lower
-        upper = mean + half if upper is None else upper
-    return Uncertain(mean, lower, upper)
-
-
-def _coordinates(groups: Mapping[str, xr.Dataset], names: tuple[str, ...]) -> Float:
-    for dataset in groups.values():
-        if all(name in dataset.coords and dataset.coords[name].dims == ("state",) for name in names):
-            return np.stack([np.asarray(dataset.coords[name].values, dtype=float) for name in names], axis=-1)
-    raise ValueError(f"the states have no coordinates {', '.join(names)}")
-
-
-def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], folder: Path) -> RunRecord:
-    config = _read_json(folder / "config.json")
-    observed, filtered_group, predicted_group = (
-        groups.get(name) for name in ("observed", "filtered", "predicted")
-    )
-    control_index = _needed(observed, "observed", "control_index", "step").astype(np.int64)
-    role = _role(observed, config)
-    observation = _array(observed, role, "step", "sensor")
-    names = _names(groups, "region", 0)
-    if not names or not len(control_index):
-        raise ValueError("the axis `region` has no names" if not names else "it holds no step")
-    coordinates = _coordinates(groups, names)
-    filtered = _estimate(filtered_group, "filtered", coordinates, "step")
-    if filtered is None:
-        raise ValueError("the variable filtered/probability is missing")
-    policy_group, truth, draws_group = (groups.get(name) for name in ("policy", "truth", "calibration"))
-    chosen = _array(policy_group, "control_index", "state")
-    value = _array(policy_group, "action_value", "state", "control")
-    policy = None if chosen is None else PolicyTable(chosen.astype(np.int64), value)
-    sensor_count = 0 if observation is None else observation.shape[1]
-    sensors = np.asarray([int(name) for name in _names(groups, "sensor", sensor_count)], dtype=np.int64)
-    unit = "1" if observed is None or role not in observed else str(observed[role].attrs.get("units", "1"))
-    return RunRecord(
-        state_names=names,
-        state_titles=_titles(config, names),
-        levels=tuple(np.unique(coordinates[:, k]) for k in range(len(names))),
-        coordinates=coordinates,
-        sensors=sensors,
-        controls=_names(groups, "control", int(control_index.max()) + 1),
-        rewards=_names(groups, "reward", 0),
-        observation=observation,
-        observation_name=role,
-        observation_unit=unit,
-        control_index=control_index,
-        filtered=filtered,
-        smoothed=_estimate(groups.get("smoothed"), "smoothed", coordinates, "step"),
-        predicted=_estimate(predicted_group, "predicted", coordinates, "step", "horizon"),
-        control_probability=_array(predicted_group, "control_probability", "step", "horizon", "control"),
-        decision_probability=_array(filtered_group, "decision_probability", "step", "control"),
-        log_evidence=_array(filtered_group, "log_evidence", "step"),
-        policy=policy,
-        truth_state=_array(truth, "state", "step", "region"),
-        truth_observation=_array(truth, role, "step", "sensor"),
-        monitors=_monitors(truth),
-        parameter_name="" if draws_group is None else _text(draws_group.attrs.get("parameter", "parameter")),
-        parameter_draws=_array(draws_group, "draw_value", "draw"),
-        calibration=_read_json(folder / "calibration.json"),
-        attributes=attributes,
-        config=config,
-        summary=_read_json(folder / "summary.json"),
-        state_units=_state_units(groups, names),
-        sensor_units=_sensor_texts(observed, "sensor_unit"),
-        sensor_titles=_sensor_texts(observed, "sensor_title"),
-        parameter_unit=_draw_unit(draws_group),
-        learnt=_learnt(groups.get("learnt"), truth),
-        first_step=0 if observed is None else int(observed["step"].values[0]),
-        learnt_noise=_array(filtered_group, "noise_standard_deviation", "step", "sensor"),
-    )
-
-
-def _learnt(dataset: xr.Dataset | None, truth: xr.Dataset | None) -> tuple[LearntCourse, ...]:
-    """Return what was learnt, in the order in which it is stored."""
-    found = []
-    for variable in () if dataset is None else dataset.data_vars:
-        name = str(variable).removesuffix(f"_prior_{MOMENTS[0]}")
-        if dataset is None or name == variable:
-            continue
-        sensor = ("sensor",) if "sensor" in dataset[variable].dims else ()
-        course = [_needed(dataset, "learnt", f"{name}_{moment}", "step", *sensor) for moment in MOMENTS]
-        prior = [_needed(dataset, "learnt", f"{name}_prior_{moment}", *sensor) for moment in MOMENTS]
-        unit = str(dataset[variable].attrs.get("units", "1"))
-        found.append(
-            LearntCourse(
-                name, unit, np.stack(course, axis=-1), np.stack(prior, axis=-1), _array(truth, name, *sensor)
-            )
-        )
-    return tuple(found)
-
-
-def _state_units(groups: Mapping[str, xr.Dataset], names: tuple[str, ...]) -> tuple[str, ...]:
-    for dataset in groups.values():
-        if all(name in dataset.coords for name in names):
-            return tuple(str(dataset.coords[name].attrs.get("units", "1")) for name in names)
-    return ()
-
-
-def _sensor_texts(observed: xr.Dataset | None, name: str) -> tuple[str, ...]:
-    if observed is None or name not in observed.coords:
-        return ()
-    return tuple(_text(value) for value in observed.coords[name].values)
-
-
-def _draw_unit(draws: xr.Dataset | None) -> str:
-    return (
-        "1"
-        if draws is None or "draw_value" not in draws
-        else str(draws["draw_value"].attrs.get("units", "1"))
-    )
-
-
-def _monitors(truth: xr.Dataset | None) -> dict[str, tuple[Float, str]]:
-    """Return the variables of `truth` with one value a step, and their units."""
-    if truth is None:
-        return {}
-    return {
-        str(name): (np.asarray(variable.values, dtype=np.float64), str(variable.attrs.get("units", "1")))
-        for name, variable in truth.data_vars.items()
-        if variable.dims == ("step",) and variable.dtype.kind == "f"
-    }
-
-
-def _role(observed: xr.Dataset | None, config: Mapping[str, Any]) -> str:
-    """Return the name of the observed variable: as the scenario has it, else the only one of each sensor."""
-    scenario = config.get("scenario")
-    section = scenario.get("observation") if isinstance(scenario, Mapping) else None
-    if isinstance(section, Mapping) and "role" in section:
-        return str(section["role"])
-    names = [] if observed is None else [str(n) for n, v in observed.data_vars.items() if "sensor" in v.dims]
-    return names[0] if names else "strain"
-
-
-def _titles(config: Mapping[str, Any], names: tuple[str, ...]) -> tuple[str, ...]:
-    scenario = config.get("scenario")
-    factors = scenario.get("state", []) if isinstance(scenario, Mapping) else []
-    titles = {f.get("name"): f.get("title") for f in factors if isinstance(f, Mapping)} if factors else {}
-    return tuple(str(titles.get(name) or name) for name in names)

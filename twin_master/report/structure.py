@@ -1,21 +1,127 @@
-"""The picture of a structure in the report: its surface under the last estimate, from `structure.vtu`."""
+"""The structure in the report: what is believed of its regions, and what its gauges show."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from fe.structure.design import MeshDesign, load_structure
 from fe.structure.elements import KINDS, meshio_with_wedges
+from fe.wing.design import WingDesign, load_design
 from reporting import figures as style
+from twin_master.assets.design_source import DESIGN_COPY, FLOWN_DESIGN_COPY
+from twin_master.assets.structure_source import FIELD_NAME, FLOWN_COPY, MODEL_COPY
+from twin_master.report.reading import Run
+from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
 
-FloatArray = NDArray[np.float64]
+Float = NDArray[np.float64]
 
-FIELD_NAME = "structure.vtu"
+LOSS = "YlOrRd"
+"""Colour map of what regions have lost."""
+_RESIDUALS: dict[str, Any] = {"cmap": "PuOr_r", "vmin": -4.0, "vmax": 4.0}
+_BAR = {"pad": 0.02, "fraction": 0.02, "aspect": 14}
 _LENGTH = 0.08
 """Length of the largest displacement in the picture, as a part of the structure's."""
+
+
+class Planform(NamedTuple):
+    """A wing from above [m]: x along the span from the root, y along the chord, positive to the front.
+
+    Attributes
+    ----------
+    outline : (N, 2)
+    regions : tuple of (N, 2)
+        The damage regions, in the order of the state's factors.
+    gauges : (G, 2)
+    """
+
+    outline: Float
+    regions: tuple[Float, ...]
+    gauges: Float
+
+
+def planform_of(design: WingDesign | None, scenario: Scenario) -> Planform | None:
+    """Return a wing from above; None without one that has the sensors of a scenario."""
+    if design is None or len(design.gauges.positions) != scenario.observation.count:
+        return None
+    plan = design.planform
+
+    def place(span: float, chord: float) -> tuple[float, float]:
+        return span, (plan.straight_chord_line - chord) * plan.chord(span / plan.semi_span)
+
+    def panel(start: float, end: float, front: float, rear: float) -> Float:
+        corners = ((start, front), (end, front), (end, rear), (start, rear))
+        return np.array([place(span, chord) for span, chord in corners])
+
+    places = {
+        f"z{number}": panel(d.span_start, d.span_end, d.chord_start, d.chord_end)
+        for number, d in enumerate(design.defects, start=1)
+    }
+    names = scenario.state_names
+    return Planform(
+        outline=panel(0.0, plan.semi_span, 0.0, 1.0),
+        regions=tuple(places[name] for name in names) if {*names} <= {*places} else (),
+        gauges=np.array([place(span, chord) for span, chord in design.gauges.positions]),
+    )
+
+
+def design_of(folder: Path) -> WingDesign | None:
+    """Return the design that the twin of a run folder believes, or else that of what is flown."""
+    for copy in (DESIGN_COPY, FLOWN_DESIGN_COPY):
+        if (folder / copy).is_file():
+            return load_design(folder / copy)
+    if (folder / CALIBRATION_COPY).is_file():
+        from calibration.result.file import load_calibration
+
+        return load_calibration(folder / CALIBRATION_COPY).design
+    return None
+
+
+def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
+    """Draw a wing after its last turn: regions by belief, gauges by reading and by residual (G,)."""
+    measured = run.sensors.scale * run.observed[-1]
+    shown: tuple[tuple[str, str, Float, str, dict[str, Any]], ...] = (
+        (
+            "a",
+            f"Measured {run.sensors.quantity}",
+            measured,
+            f"{run.sensors.quantity} ({run.sensors.unit})",
+            {},
+        ),
+        ("b", "Measured less expected", residual, "standard deviations", _RESIDUALS),
+    )
+    with style.publication_style():
+        figure, rows = style.panels(2, 1, 4.0, 0.3, 0.1, left=0.1, right=0.92, hspace=0.25)
+        for (axes,), (label, title, values, unit, look) in zip(rows, shown, strict=True):
+            axes.fill(*planform.outline.T, facecolor="#f2f4f6", edgecolor=style.REFERENCE)
+            regions = PolyCollection(
+                planform.regions, array=(run.scales * run["filtered/mean"][-1])[: len(planform.regions)],
+                cmap=LOSS, edgecolors="black", linewidths=0.7,
+                clim=(run.factors[0].levels[0], max(factor.levels[-1] for factor in run.factors)),
+            )  # fmt: skip
+            axes.add_collection(regions)
+            _draw_gauges(figure, axes, planform.gauges, values, unit, **look)
+            axes.set_aspect("equal")
+            axes.axis("off")
+            style.panel_label(axes, label, title)
+            if planform.regions:
+                unit = run.factors[0].unit
+                style.color_bar(figure, regions, f"expected loss ({unit})", ax=axes, location="left", **_BAR)
+    return figure
+
+
+def _draw_gauges(figure: Figure, axes: Axes, places: Float, values: Float, unit: str, **look: Any) -> None:
+    """Draw gauges (G, 2) by their values (G,), and a cross where one was lost."""
+    known = np.isfinite(values)
+    look = {"cmap": style.LEVELS, **look}
+    (x, y), (left, low) = places[known].T, places[~known].T
+    dots = axes.scatter(x, y, c=values[known], s=36.0, edgecolors="black", linewidths=0.5, **look)
+    axes.scatter(left, low, marker="x", s=30.0, color=style.TRUTH, label="lost")
+    style.color_bar(figure, dots, unit, ax=axes, **_BAR)
 
 
 class StructurePicture(NamedTuple):
@@ -26,15 +132,9 @@ class StructurePicture(NamedTuple):
     scale: float
 
 
-def structure_figure(run_folder: Path) -> StructurePicture | None:
-    """Draw the surface of the structure of a run, coloured by the stiffness that its regions have lost.
-
-    None, where the run has no such field.
-    """
-    path = run_folder / FIELD_NAME
-    if not path.is_file():
-        return None
-    mesh = meshio_with_wedges().read(path)
+def mesh_figure(run: Run, folder: Path, residual: Float) -> StructurePicture:
+    """Draw the surface of a structure, regions by what they have lost, gauges by residual (G,)."""
+    mesh = meshio_with_wedges().read(folder / FIELD_NAME)
     kind = KINDS[mesh.cells[0].type]
     loss = np.asarray(mesh.cell_data["stiffness_loss"][0], dtype=np.float64)
     region = np.asarray(mesh.cell_data["region"][0])
@@ -44,7 +144,39 @@ def structure_figure(run_folder: Path) -> StructurePicture | None:
     scale = _LENGTH * size / largest if largest > 0.0 else 0.0
     cells, corners = surface(kind.faces, np.asarray(mesh.cells[0].data))
     points = np.asarray(mesh.points + scale * displacement)
-    return StructurePicture(_drawn(points, corners, loss[cells], region[cells] > 0), largest, scale)
+    # seen from above, in front and the right; what is farther is drawn first
+    turn, tilt = np.radians(-60.0), np.radians(28.0)
+    across = np.array([-np.sin(turn), np.cos(turn), 0.0])
+    towards = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
+    view = np.column_stack((across, np.cross(towards, across)))
+    order = np.argsort([(points[nodes] @ towards).mean() for nodes in corners])
+    with style.publication_style():
+        figure, ((axes,),) = style.panels(1, 1, 0.55 * style.FULL_WIDTH, 0.05, 0.05, left=0.1, right=0.9)
+        patches = PolyCollection(
+            [points[corners[number]] @ view for number in order], array=100.0 * loss[cells][order], cmap=LOSS,
+            edgecolors=["black" if region[cells[number]] > 0 else "0.6" for number in order], linewidths=0.4,
+            clim=(0.0, 100.0),
+        )  # fmt: skip
+        axes.add_collection(patches)
+        places = _gauge_places(folder, len(residual))
+        if places is not None:
+            nearest = np.argmin(np.linalg.norm(mesh.points[:, None] - places, axis=2), axis=0)
+            places = (places + scale * displacement[nearest]) @ view
+            _draw_gauges(figure, axes, places, residual, "gauges: standard deviations", **_RESIDUALS)
+        axes.autoscale_view()
+        axes.set_aspect("equal")
+        axes.axis("off")
+        style.color_bar(figure, patches, "stiffness loss (%)", ax=axes, location="left", **_BAR)
+    return StructurePicture(figure, largest, scale)
+
+
+def _gauge_places(folder: Path, count: int) -> Float | None:
+    """Return where the gauges of a structure are (G, 3) [m]; None where its file does not say it."""
+    copy = next((folder / name for name in (MODEL_COPY, FLOWN_COPY) if (folder / name).is_file()), None)
+    structure = None if copy is None else load_structure(copy)
+    if not isinstance(structure, MeshDesign) or len(structure.gauge) != count:
+        return None
+    return structure.unit * np.array([gauge.point for gauge in structure.gauge])
 
 
 def surface(
@@ -58,32 +190,3 @@ def surface(
             found[key] = None if key in found else (number, nodes)
     outer = [entry for entry in found.values() if entry is not None]
     return np.array([number for number, _ in outer]), [nodes for _, nodes in outer]
-
-
-def _drawn(
-    points: FloatArray, corners: list[NDArray[np.int64]], loss: FloatArray, in_region: NDArray[np.bool_]
-) -> Figure:
-    # seen from above, in front and the right; what is farther is drawn first
-    turn, tilt = np.radians(-60.0), np.radians(28.0)
-    across = np.array([-np.sin(turn), np.cos(turn), 0.0])
-    towards = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
-    up = np.cross(towards, across)
-    plane, depth = points @ np.column_stack((across, up)), points @ towards
-    order = np.argsort([depth[nodes].mean() for nodes in corners])
-    with style.publication_style():
-        figure = style.new_figure(0.55 * style.FULL_WIDTH)
-        axes = figure.add_axes((0.0, 0.0, 0.86, 1.0))
-        patches = PolyCollection(
-            [plane[corners[number]] for number in order],
-            array=100.0 * loss[order],
-            cmap="YlOrRd",
-            edgecolors=["black" if in_region[number] else "0.6" for number in order],
-            linewidths=0.4,
-            clim=(0.0, 100.0),
-        )
-        axes.add_collection(patches)
-        axes.autoscale_view()
-        axes.set_aspect("equal")
-        axes.axis("off")
-        figure.colorbar(patches, cax=figure.add_axes((0.88, 0.2, 0.02, 0.6)), label="stiffness loss (%)")
-    return figure

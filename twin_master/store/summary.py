@@ -363,6 +363,8 @@ def _fallback_figures(fallback: Fallback, units: Mapping[str, str], step_name: s
     if level is not None and unit == "1":
         level, unit = 100.0 * level, "%"
     switch_damage, damage_step, fallback_step, fallback_delay, early_step = FALLBACK_FIGURES
+    if fallback.early_step is not None and fallback.delay == 0:  # in force since before the damage
+        fallback = replace(fallback, fallback_step=None)
     one = fallback.delay == 1
     switch = Figure(
         switch_damage,

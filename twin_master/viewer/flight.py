@@ -4,12 +4,14 @@ The flight itself computes nothing for its viewers. Beliefs and decisions stand 
 from them is computed here, as the run does it, so that every number is that of the run.
 """
 
+import os
 from array import array
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +21,14 @@ from reporting.json_file import read_json
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import Expected, LearntExpectation
 from twin_master.learning.setup import learning_filter
+from twin_master.mission.journal import JOURNAL_NAME, array_of, damaged, whole_record
 from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, kept_knowledge
 from twin_master.mission.preparation import Knowledge
-from twin_master.network.estimator import Notice
+from twin_master.network.estimator import Learnt, Notice
 from twin_master.network.inference import known_control, predict
 from twin_master.run_folder import PICTURE, VERDICT, read_config
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.viewer.journal import GrowingJournal, SeenTurn
 
 Float = NDArray[np.float64]
 
@@ -38,6 +40,138 @@ TURNS_KEPT = 512
 
 class BegunAnewError(LookupError):
     """Another flight has taken the place of the one that is looked at."""
+
+
+@dataclass(frozen=True)
+class SeenTurn:
+    """What a line of the journal says.
+
+    Attributes
+    ----------
+    turn : int
+        The turn that the twin was at.
+    observation_turn : int
+        The turn that was observed; an earlier one where the observation came late.
+    control_index : int
+        Control in force in the turn that was observed.
+    observed : (G,)
+        What the sensors said, SI; NaN where lost.
+    truth : (K,) or None
+        True state, SI; None where nobody knows it.
+    filtered : (S,)
+        Belief about the turn that the twin was at.
+    decision_probability : (U,)
+        What its next control was decided by.
+    learnt : dict of str to Learnt
+        Posterior of what is learnt.
+    notices : tuple of Notice
+        What the operator was told.
+    """
+
+    turn: int
+    observation_turn: int
+    control_index: int
+    observed: Float
+    truth: Float | None
+    filtered: Float
+    decision_probability: Float
+    learnt: Mapping[str, Learnt]
+    notices: tuple[Notice, ...]
+
+    @classmethod
+    def of(cls, record: Mapping[str, Any]) -> "SeenTurn":
+        """Return what a record of the journal says."""
+        return cls(
+            turn=record["turn"],
+            observation_turn=record.get("observation_turn", record["turn"]),
+            control_index=record["control_index"],
+            observed=array_of(record["observed"]),
+            truth=array_of(record["state"]) if "state" in record else None,
+            filtered=array_of(record["filtered"]),
+            decision_probability=array_of(record["decision_probability"]),
+            learnt={name: Learnt(**learnt) for name, learnt in record.get("learnt", {}).items()},
+            notices=_notices(record),
+        )
+
+
+def _notices(record: Mapping[str, Any]) -> tuple[Notice, ...]:
+    return tuple(Notice(**notice) for notice in record.get("notices", ()))
+
+
+class GrowingJournal:
+    """A journal that grows; each call of `news` gives the records that were added since the last.
+
+    Parameters
+    ----------
+    folder : Path
+        The run folder; the journal need not be there yet.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / JOURNAL_NAME
+        self._end = self._lines = self._file_number = 0
+
+    def begun_anew(self) -> bool:
+        """Return whether another file took the place of the one read, or lines were taken back.
+
+        What was read is then forgotten, and `news` begins with the first line.
+        """
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            return False
+        if found.st_size >= self._end and self._file_number in (0, found.st_ino):
+            return False
+        self._end = self._lines = self._file_number = 0
+        return True
+
+    def news(self, most: int) -> list[tuple[int, dict[str, Any]]]:
+        """Return whole new records, at most so many, and where each begins, in bytes, see `read`.
+
+        Raises
+        ------
+        NotResumableError
+            A line was changed.
+        """
+        found: list[tuple[int, dict[str, Any]]] = []
+        if not self._path.is_file() or self._path.stat().st_size == self._end:
+            return found
+        with suppress(FileNotFoundError), self._path.open("rb") as file:
+            self._file_number = os.fstat(file.fileno()).st_ino
+            file.seek(self._end)
+            for line in file:
+                if len(found) == most or not line.endswith(b"\n"):  # one that is being written
+                    break
+                record = self._record(line, self._lines)
+                if self._end:  # not the heading
+                    found.append((self._end, record))
+                self._end += len(line)
+                self._lines += 1
+        return found
+
+    def read(self, places: Sequence[int]) -> list[SeenTurn] | None:
+        """Return the turns told by records that were news; None where the journal was begun anew since.
+
+        Raises
+        ------
+        NotResumableError
+            A line was changed.
+        """
+        with suppress(FileNotFoundError), self._path.open("rb") as file:
+            if os.fstat(file.fileno()).st_ino != self._file_number:
+                return None
+            found = []
+            for place in places:
+                file.seek(place)
+                found.append(SeenTurn.of(self._record(file.readline(), 0)))
+            return found
+        return None
+
+    def _record(self, line: bytes, number: int) -> dict[str, Any]:
+        record = whole_record(line)
+        if record is None:
+            raise damaged(self._path, number, "it does not have the hash that stands before it")
+        return record
 
 
 @dataclass(frozen=True)
@@ -157,23 +291,29 @@ class Flight:
             self.number += 1
             changed = True
         news = self._journal.news(TURNS_AT_ONCE)
-        for line in news:
-            if line.seen is None:
-                if line.notices:
-                    turn = max(self.turns - 1, 0)
-                    self._told[turn] = self._told.get(turn, ()) + line.notices
-                    self.number += 1
-                if line.verdict and (found := _picture(max(self.turns - 1, 0), self.folder / line.verdict)):
-                    self.pictures.append(found)
-                    self.number += 1
+        for place, record in news:
+            if "filtered" not in record:
+                self._take_in(record)
                 continue
-            if line.seen.turn == self.turns:
-                self._believed.append(line.place)
-                self._observed.append(line.place)
-                self._keep(line.seen.turn, line.seen)
+            seen = SeenTurn.of(record)
+            if seen.turn == self.turns:
+                self._believed.append(place)
+                self._observed.append(place)
+                self._keep(seen.turn, seen)
             else:
-                self._revise(line.seen, line.place)
+                self._revise(seen, place)
         return changed or bool(news)
+
+    def _take_in(self, record: Mapping[str, Any]) -> None:
+        """Take in what a watch noted where no turn came: notices, a verdict, a model that was adopted."""
+        turn = max(self.turns - 1, 0)
+        if notices := _notices(record):
+            self._told[turn] = self._told.get(turn, ()) + notices
+            self.number += 1
+        verdict = record.get("model", {}).get("verdict", record.get("verdict", {}).get("folder", ""))
+        if verdict and (found := _picture(turn, self.folder / verdict)):
+            self.pictures.append(found)
+            self.number += 1
 
     def _kept_at(self) -> tuple[int, int] | None:
         """Return what tells the file of what the twin knows from another that took its place."""

@@ -5,25 +5,21 @@ One that was away, or is slow, asks for more at once, and nothing is kept for it
 """
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
+from twin_master.report.view import NORMAL_95
 from twin_master.viewer.flight import BegunAnewError, Belief, Flight
-from twin_master.viewer.scene import NORMAL_95, Scene
+from twin_master.viewer.scene import LATEST, WINDOW, Scene
 
 Float = NDArray[np.float64]
 
-WINDOW = 240
-"""Turns that a page shows at once."""
-LATEST = -1
-"""Asked for in the place of a turn: the last one, whichever it is."""
 
-
-@dataclass(frozen=True)
-class Request:
+class Request(BaseModel, frozen=True, extra="forbid", strict=True):
     """What a page asks for.
 
     Attributes
@@ -57,16 +53,7 @@ def parse_request(text: str | bytes) -> Request:
     ValueError
         It is no such request.
     """
-    try:
-        content = json.loads(text)
-    except RecursionError:
-        raise ValueError("a request is not nested") from None
-    names = Request.__dataclass_fields__
-    if not isinstance(content, dict) or set(content) != set(names):
-        raise ValueError(f"a request is an object with {', '.join(names)}")
-    if not all(type(value) is int for value in content.values()):
-        raise ValueError("a request holds whole numbers only")
-    return Request(**content)
+    return Request.model_validate_json(text)
 
 
 class Teller:
@@ -154,11 +141,11 @@ class Teller:
         """Return lists, a row for each turn, in printed units; None stands for what there is not."""
         scene = self._scene
         scales = np.array([factor.scale for factor in scene.factors])
-        levels = np.array([(factor.lowest, factor.highest) for factor in scene.factors]).T
+        levels = np.array([(factor.levels[0], factor.levels[-1]) for factor in scene.factors]).T
         mean, reach = scales * belief.state_mean, 2.0 * scales * belief.state_deviation
         reward, reward_reach = belief.reward_mean, NORMAL_95 * belief.reward_deviation
         center, spread = belief.sensor_mean, belief.sensor_deviation
-        if scene.sensors.standardised:
+        if scene.standardised:
             observed = None if observed is None else (observed - center) / spread
             center, spread = np.zeros_like(center), np.ones_like(spread)
         scale, sensor_reach = scene.sensors.scale, NORMAL_95 * spread
@@ -178,13 +165,6 @@ class Teller:
         if observed is not None:
             record["observed"] = scale * observed
         return {name: _plain(values) for name, values in record.items()}
-
-
-def scene_record(scene: Scene) -> dict[str, Any]:
-    """Return what the page must know before its first request, ready for JSON."""
-    record = asdict(scene)
-    del record["planform"]
-    return record | {"window": WINDOW, "latest": LATEST}
 
 
 def _plain(values: Float) -> list[Any]:

@@ -3,23 +3,23 @@
 import asyncio
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
-from bokeh.util.paths import bokehjs_path
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import PeriodicCallback
 from tornado.netutil import bind_sockets
-from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
+from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from reporting.errors import ReportingError
+from reporting.page import script_source
 from twin_master.errors import TwinMasterError, ViewError
 from twin_master.viewer.flight import Flight
-from twin_master.viewer.messages import Request, Teller, parse_request, scene_record
-from twin_master.viewer.page import TALLEST_BAR, page_html
-from twin_master.viewer.scene import scene_of
+from twin_master.viewer.messages import Request, Teller, parse_request
+from twin_master.viewer.scene import page_html, scene_of
 
 ADDRESS = "127.0.0.1"
 POLL_MILLISECONDS = 15.0
@@ -32,7 +32,7 @@ OWN_NAMES = r"(localhost|127\.0\.0\.1)(:\d+)?"
 """A page of another site that lets its name point here would come with that name, and is not answered."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; connect-src 'self' ws:; img-src 'self' data: blob:; "
-    "style-src 'self' 'unsafe-inline'; script-src 'self'; frame-ancestors 'none'",
+    "style-src 'self' 'unsafe-inline'; script-src 'self' " + script_source() + "; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
 }
@@ -100,11 +100,11 @@ class _Turns(WebSocketHandler):
             self._viewers.leave(self)
 
 
-class _Text(RequestHandler):
-    """A text of the package."""
+class _Answer(RequestHandler):
+    """A text that is asked for."""
 
-    def initialize(self, text: str, kind: str) -> None:
-        self._text, self._kind = text, kind
+    def initialize(self, answer: Callable[[], str], kind: str) -> None:
+        self._answer, self._kind = answer, kind
 
     def set_default_headers(self) -> None:
         for name, value in HEADERS.items():
@@ -112,10 +112,20 @@ class _Text(RequestHandler):
 
     def get(self) -> None:
         self.set_header("Content-Type", f"{self._kind}; charset=utf-8")
-        self.write(self._text)
+        self.write(self._answer())
 
 
-class _Picture(_Text):
+def handlers_of(texts: Mapping[str, tuple[Callable[[], str], str]]) -> list[tuple[str, Any, dict[str, Any]]]:
+    """Return what answers requests of paths by texts of a kind."""
+    return [(path, _Answer, {"answer": text, "kind": kind}) for path, (text, kind) in texts.items()]
+
+
+def text_of(package: str, name: str) -> Callable[[], str]:
+    """Return what reads a file of a package."""
+    return lambda: resources.files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+class _Picture(_Answer):
     """The missing force of a verdict, by its number."""
 
     def initialize(self, flight: Flight) -> None:  # type: ignore[override]
@@ -132,26 +142,19 @@ class _Picture(_Text):
 
 
 def _application(flight: Flight, viewers: _Viewers) -> Application:
-    scene = scene_of(flight.folder, flight.knowledge)
-    page = page_html(scene, scene_record(scene) | {"tallest_bar": TALLEST_BAR})
-    package = resources.files(__package__)
-    texts = [
-        ("/", page, "text/html"),
-        *(
-            (f"/{name}", package.joinpath(name).read_text(encoding="utf-8"), kind)
-            for name, kind in (("view.js", "text/javascript"), ("view.css", "text/css"))
-        ),
+    page = page_html(scene_of(flight.folder, flight.knowledge))
+    texts = {
+        "/": (lambda: page, "text/html"),
+        "/plots.js": (text_of("twin_master.viewer", "plots.js"), "text/javascript"),
+        "/view.js": (text_of("twin_master.viewer", "view.js"), "text/javascript"),
+        "/view.css": (text_of("twin_master.viewer", "view.css"), "text/css"),
+    }
+    own: list[Any] = [
+        ("/turns", _Turns, {"viewers": viewers}),
+        ("/missing_force.svg", _Picture, {"flight": flight}),
     ]
     application = Application(websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20)
-    application.add_handlers(
-        OWN_NAMES,
-        [
-            *((path, _Text, {"text": text, "kind": kind}) for path, text, kind in texts),
-            ("/turns", _Turns, {"viewers": viewers}),
-            ("/missing_force.svg", _Picture, {"flight": flight}),
-            ("/bokeh/(bokeh.min.js)", StaticFileHandler, {"path": str(Path(bokehjs_path()) / "js")}),
-        ],
-    )
+    application.add_handlers(OWN_NAMES, [*handlers_of(texts), *own])
     return application
 
 

@@ -4,16 +4,14 @@
 // painted: a slow browser skips what it could not have shown, and one that was away gets what it missed.
 "use strict";
 
-const content = JSON.parse(document.getElementById("content").textContent);
-const scene = content.scene;
+const scene = JSON.parse(document.getElementById("content").textContent);
 const element = (id) => document.getElementById(id);
 const numbers = (values) => values.map((value) => (value === null ? NaN : value));
 
 const held = { first: 0, rows: [] }; // one row for each turn first, first + 1, ...
 const state = { request: 0, flight: -1, wanted: scene.latest, shown: -1, count: -1, chosen: 0, ahead: null };
-const sources = {};
-let views = [];
-let unpainted = new Set();
+const drawn = { past: [], ahead: [] }; // turns that are shown
+let views = {};
 let socket = null;
 let player = null;
 
@@ -60,19 +58,16 @@ async function take(answer) {
   picture(answer.picture);
   if (moved) {
     draw();
-    await allPainted();
+    await onScreen();
     window.painted.push([answer.turn, Date.now()]);
     if (window.painted.length > 5000) window.painted.splice(0, 2500);
   }
   if (answer.number === state.request) ask();
 }
 
-// Bokeh's own promise of a painted figure is never kept when a busy machine delays its timers.
-async function allPainted() {
-  unpainted = new Set(views);
-  for (let frame = 0; frame < 60 && unpainted.size > 0; frame++) {
-    await new Promise((resolve) => requestAnimationFrame(resolve));
-  }
+// What was drawn is on the screen behind the second frame.
+async function onScreen() {
+  for (let frame = 0; frame < 2; frame++) await new Promise((resolve) => requestAnimationFrame(resolve));
 }
 
 function keep(answer) {
@@ -110,39 +105,30 @@ function picture(found) {
   element("verdict").textContent = found.said;
 }
 
-function bands(rows, turns) {
-  const data = { turn: turns };
-  const band = (column, name, index) => {
-    for (const part of ["", "_lower", "_upper"]) {
-      data[column + part] = numbers(rows.map((row) => row[name + part][index]));
-    }
-  };
-  scene.factors.forEach((_, index) => band(`state${index}`, "state", index));
-  scene.rewards.forEach((_, index) => band(`reward${index}`, "reward", index));
-  band("chosen", "sensor", state.chosen);
-  return data;
-}
-
 function draw() {
   const turn = state.shown;
   const begin = Math.max(0, turn + 1 - scene.window);
   const rows = held.rows.slice(begin - held.first, turn + 1 - held.first);
-  const turns = rows.map((_, index) => begin + index);
-  const past = bands(rows, turns);
-  scene.factors.forEach((_, index) => {
-    past[`state${index}_truth`] = numbers(rows.map((row) => row.truth[index]));
-  });
-  past.chosen_observed = numbers(rows.map((row) => row.observed[state.chosen]));
-  const now = rows[rows.length - 1];
   const coming = rowsOf(state.ahead);
-  sources.turns.setv({ start: begin - 1, end: Math.max(turn + scene.horizon + 1, 20) });
-  sources.past.data = past;
-  sources.present.data = bands([now], [turn]);
-  sources.ahead.data = bands(coming, coming.map((_, index) => turn + 1 + index));
-  drawControl(rows, turns, coming, turn);
+  drawn.past = rows.map((_, index) => begin + index);
+  drawn.ahead = coming.map((_, index) => turn + 1 + index);
+  const range = [begin - 1, Math.max(turn + scene.horizon + 1, 20)];
+  const now = rows[rows.length - 1];
+  scene.factors.forEach((_, index) => {
+    const truth = rows.map((row) => row.truth[index]);
+    course(views[`state${index}`], range, rows, coming, "state", index, [
+      line(drawn.past, numbers(truth), COLOURS.truth, 'stroke-dasharray="6 3 1 3"'),
+    ]);
+  });
+  scene.rewards.forEach((_, index) => course(views[`reward${index}`], range, rows, coming, "reward", index, []));
+  const seen = numbers(rows.map((row) => row.observed[state.chosen]));
+  course(views.chosen, range, rows, coming, "sensor", state.chosen, [
+    marks(drawn.past, seen, "dot", 2, `fill="${COLOURS.observed}"`),
+  ], seen);
+  drawControl(range, rows, coming, turn);
   drawSensors(now);
   say(now, turn);
-  drawNotices(rows, turns);
+  drawNotices(rows, drawn.past);
   drawLearnt(now);
 }
 
@@ -151,60 +137,72 @@ function rowsOf(columns) {
   return columns.state.map((_, row) => Object.fromEntries(names.map((name) => [name, columns[name][row]])));
 }
 
-function bars(turns, rows) {
-  const data = { turn: [], bottom: [], top: [], probability: [], control: [] };
-  rows.forEach((probabilities, index) => probabilities.forEach((probability, row) => {
-    if (probability < 1e-4) return;
-    data.turn.push(turns[index]);
-    data.bottom.push(row);
-    data.top.push(row + scene.tallest_bar * probability);
-    data.probability.push(probability);
-    data.control.push(scene.controls[row]);
-  }));
-  return data;
+// Past and prediction of one quantity, with bands; `more` is drawn as well, and `values` are to have room.
+function course(view, range, rows, coming, name, index, more, values = []) {
+  const parts = [[drawn.past, rows, COLOURS.present, ""], [drawn.ahead, coming, COLOURS.prediction, 'stroke-dasharray="6 4"']];
+  const found = [], room = [...values];
+  for (const [turns, own, colour, look] of parts) {
+    const [mean, lower, upper] = ["", "_lower", "_upper"].map((part) => numbers(own.map((row) => row[name + part][index])));
+    found.push(band(turns, lower, upper, colour), line(turns, mean, colour, look));
+    room.push(...mean, ...lower, ...upper);
+  }
+  const ahead = numbers(coming.map((row) => row[name][index])), now = numbers([rows.at(-1)[name][index]]);
+  found.push(...more, marks(drawn.ahead, ahead, "dot", 2, `fill="${COLOURS.prediction}"`));
+  found.push(marks([state.shown], now, "diamond", 6, `fill="${COLOURS.present}"`));
+  view.draw(range, room, found, (turn) => {
+    const row = turn <= state.shown ? rows[turn - drawn.past[0]] : coming[turn - state.shown - 1];
+    if (row === undefined) return null;
+    const [mean, low, high] = ["", "_lower", "_upper"].map((part) => shortNumber(row[name + part][index] ?? NaN));
+    return [`${scene.step_name} ${turn}`, `${mean} ${view.options.unit}`, `95 %: ${low} to ${high}`];
+  });
 }
 
-function drawControl(rows, turns, coming, turn) {
+function drawControl(range, rows, coming, turn) {
   // What was concluded in a turn is the choice for the next one.
-  sources.decided.data = bars(turns.map((value) => value + 1), rows.map((row) => row.probability));
-  sources.expected.data = bars(
-    coming.slice(1).map((_, index) => turn + 2 + index), coming.slice(1).map((row) => row.probability)
-  );
-  const flown = { left: [], right: [], row: [] };
-  rows.forEach((row, index) => {
-    const last = flown.row.length - 1;
-    if (last >= 0 && flown.row[last] === row.control) {
-      flown.right[last] = turns[index] + 0.5;
-      return;
-    }
-    flown.left.push(turns[index] - 0.5);
-    flown.right.push(turns[index] + 0.5);
-    flown.row.push(row.control);
+  const decided = rows.map((row, index) => [drawn.past[index] + 1, row.probability]);
+  const expected = coming.slice(1).map((row, index) => [turn + 2 + index, row.probability]);
+  const found = [[decided, COLOURS.decision], [expected, COLOURS.prediction]].flatMap(([entries, colour]) =>
+    scene.controls.map((_, control) => {
+      const tops = entries.map(([, probability]) => control + scene.tallest_bar * probability[control]);
+      return bars(entries.map(([at]) => at), tops.map(() => control), tops, 0.8, colour, 0.75);
+    }));
+  const flown = scene.controls.map((_, control) => {
+    const own = rows.map((row) => (row.control === control ? control : NaN));
+    const half = 0.5 * (1 - 1e-3);
+    const turns = drawn.past.flatMap((at) => [at - half, at + half]);
+    return line(turns, own.flatMap((value) => [value, value]), COLOURS.truth, 'style="stroke-width:4"');
   });
-  sources.flown.data = flown;
+  const all = new Map([...decided, ...expected]);
+  views.control.draw(range, [0], [...found, ...flown], (at) => {
+    const probability = all.get(at);
+    return probability === undefined ? null
+      : [`${scene.step_name} ${at}`, ...scene.controls.map((name, index) => `${name}: ${probability[index].toFixed(3)}`)];
+  });
 }
 
 function drawSensors(now) {
-  const observed = numbers(now.observed);
-  const outside = observed.map((value, index) =>
-    value < now.sensor_lower[index] || value > now.sensor_upper[index] ? value : NaN);
-  sources.sensors.data = {
-    number: observed.map((_, index) => index + 1), title: scene.sensors.titles, mean: numbers(now.sensor),
-    lower: numbers(now.sensor_lower), upper: numbers(now.sensor_upper), observed, outside,
-  };
-  if (sources.places) {
-    const places = sources.places.data;
-    const lost = observed.map((value, index) => (Number.isNaN(value) ? places.y[index] : NaN));
-    sources.places.data = { ...places, observed, lost };
-  }
-  if (sources.regions) {
+  const observed = numbers(now.observed), number = observed.map((_, index) => index + 1);
+  const [mean, lower, upper] = [now.sensor, now.sensor_lower, now.sensor_upper].map(numbers);
+  const outside = observed.map((value, index) => (value < lower[index] || value > upper[index] ? value : NaN));
+  views.sensors.draw([0.4, observed.length + 0.6], [...observed, ...lower, ...upper], [
+    bars(number, lower, upper, 0.62, COLOURS.present, 0.32),
+    marks(number, mean, "dash", 6, `stroke="${COLOURS.present}" stroke-width="2"`),
+    marks(number, observed, "dot", 2.5, `fill="${COLOURS.observed}"`),
+    marks(number, outside, "square", 6, `fill="none" stroke="${COLOURS.prediction}" stroke-width="2"`),
+  ], (at) => {
+    const index = at - 1;
+    if (observed[index] === undefined) return null;
+    return [scene.sensors.titles[index], `observed ${shortNumber(observed[index])}`,
+      `expected ${shortNumber(mean[index])} (${shortNumber(lower[index])} to ${shortNumber(upper[index])})`];
+  });
+  if (views.wing) {
     const said = scene.factors.map((factor, index) => estimate(factor, index, now));
-    sources.regions.data = { ...sources.regions.data, loss: now.state, said };
+    views.wing.draw(now.state, said, observed);
   }
 }
 
 function estimate(factor, index, now) {
-  const decimals = factor.highest - factor.lowest > 10 ? 0 : 2;
+  const decimals = factor.levels.at(-1) - factor.levels[0] > 10 ? 0 : 2;
   const [mean, deviation] = [now.state[index], now.state_deviation[index]].map((value) => value.toFixed(decimals));
   return `${factor.symbol} ${mean} ± ${deviation} ${factor.unit}`;
 }
@@ -298,19 +296,28 @@ function listen() {
   });
 }
 
-async function begin() {
-  await Bokeh.embed.embed_items(content.documents, content.items);
-  const [shown] = Bokeh.documents;
-  for (const model of shown._all_models.values()) {
-    if (model.name) sources[model.name] = model;
+function build() {
+  const { sensors, step_name: step } = scene, capital = (text) => text[0].toUpperCase() + text.slice(1);
+  if (scene.planform !== null) {
+    const title = "The wing from above: damage of the regions, measured strain of the gauges";
+    views.wing = new Wing(element("wing"), title, scene.planform, sensors, scene.factors);
   }
-  views = shown.roots().map((root) => Bokeh.index.get_one(root));
-  for (const view of views) {
-    const repaint = view.repaint.bind(view);
-    view.repaint = () => { repaint(); unpainted.delete(view); };
-  }
-  listen();
-  connect();
+  scene.factors.forEach((factor, index) => {
+    const [low, high] = [factor.levels[0], factor.levels.at(-1)], margin = 0.06 * (high - low) || 1;
+    const options = { unit: `${factor.symbol} (${factor.unit})`, height: 175, range: [low - margin, high + margin] };
+    views[`state${index}`] = new Plot(element("states"), capital(factor.title), options);
+  });
+  const rows = scene.controls.length, control = { height: 50 + 55 * rows, names: scene.controls, range: [-0.06, rows + 0.04] };
+  views.control = new Plot(element("states"), "Control: flown (line), probability of the choice (bars)", control);
+  const unit = `${sensors.quantity} (${sensors.unit})`;
+  const title = `All ${sensors.word}s at this ${step}: expected, 95 %, observed; square: outside its interval`;
+  views.sensors = new Plot(element("plots"), title, { unit, height: 215 });
+  views.chosen = new Plot(element("plots"), `One ${sensors.word} over the ${step}s`, { unit, height: 210 });
+  scene.rewards.forEach((name, index) => {
+    views[`reward${index}`] = new Plot(element("rows"), `${capital(name)} reward`, { unit: "reward", height: 140 });
+  });
 }
 
-begin();
+build();
+listen();
+connect();

@@ -140,7 +140,7 @@ def test_journal_store_and_summary_agree(folder: Path) -> None:
 
 
 def test_the_report_has_the_alarm(folder: Path) -> None:
-    text = render_page(read_run(folder), [])
+    text = render_page(read_run(folder), {}, {})
     assert "gauge 5 shows too much" in text
     decided = read_run(folder).summary["figures"][-1]
     assert decided["key"] == "decided_by"

@@ -6,9 +6,8 @@ import pytest
 import xarray as xr
 
 from tests.twin_master.report import synthetic_run
-from twin_master.report import data as report_data
 from twin_master.report import page as report
-from twin_master.report import reading as report_reading
+from twin_master.report.reading import Run, read_run
 
 
 @pytest.fixture(scope="session")
@@ -22,8 +21,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, tree: xr.DataTree) -> Path:
 
 
 @pytest.fixture(scope="session")
-def record(folder: Path) -> report_data.RunRecord:
-    return report_reading.read_run(folder)
+def run(folder: Path) -> Run:
+    return read_run(folder)
 
 
 @pytest.fixture

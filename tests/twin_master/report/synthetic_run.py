@@ -1,13 +1,16 @@
 """A small run in the layout of the run folder, by plain enumeration, apart from the mission loop."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from twin_master.report.reading import Run
 from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.schema import Scenario
 
 LEVELS = np.array([0.0, 0.2, 0.4, 0.6, 0.8])
 CONTROLS = ("2g", "3g")
@@ -85,7 +88,7 @@ def build_tree(
             choices.append(np.array([coming[policy == u].sum() for u in range(2)]))
             coming = sum((coming * (policy == u)) @ transition[u] for u in range(2))
         if step + 1 < steps:
-            control[step + 1] = int(np.argmax(choices[0])) if horizon else 1
+            control[step + 1] = int(np.argmax(choices[0]))
         filtered.append(belief)
         predicted.append(future)
         control_probability.append(choices)
@@ -130,6 +133,7 @@ def build_tree(
     flown = np.eye(2)[control]
     estimates = describe(filtered, flown, ("step",))
     estimates["log_evidence"] = ("step", np.array(evidence))
+    estimates["decision_probability"] = (("step", "control"), np.array(control_probability)[:, 0])
     groups = {
         "observed": xr.Dataset(
             {
@@ -159,10 +163,9 @@ def build_tree(
     )
     groups["truth"]["strain_error_bound"] = ("step", np.full(steps, 1.2e-6), {"units": "1"})
     groups["truth"]["tip_displacement"] = ("step", np.full(steps, 0.18), {"units": "m"})
-    if horizon:
-        groups["predicted"] = describe(
-            np.array(predicted), np.array(control_probability), ("step", "horizon")
-        ).assign(control_probability=(("step", "horizon", "control"), np.array(control_probability)))
+    groups["predicted"] = describe(
+        np.array(predicted), np.array(control_probability), ("step", "horizon")
+    ).assign(control_probability=(("step", "horizon", "control"), np.array(control_probability)))
     coordinates: dict[str, Any] = {
         "step": np.arange(steps),
         "sensor": np.arange(1, sensors + 1),
@@ -215,7 +218,37 @@ def summary() -> dict[str, Any]:
 def write_run(folder: Path, tree: xr.DataTree | None = None) -> Path:
     """Write a run folder and return it."""
     folder.mkdir(parents=True, exist_ok=True)
-    (build_tree() if tree is None else tree).to_netcdf(folder / "run.nc", engine="h5netcdf")
-    (folder / "config.json").write_text(json.dumps(config()))
+    run = build_tree() if tree is None else tree
+    run.to_netcdf(folder / "run.nc", engine="h5netcdf")
+    record = config()
+    record["scenario"]["observation"]["count"] = run["smoothed/sensor"].size
+    (folder / "config.json").write_text(json.dumps(record))
     (folder / "summary.json").write_text(json.dumps(summary()))
     return folder
+
+
+def altered(run: Run, **values: np.ndarray | None) -> Run:
+    """A run with other values of variables, GROUP__VARIABLE; None takes a group or a variable away."""
+    groups = {name: run.tree[name].to_dataset().copy() for name in run.tree.children}
+    for name, content in values.items():
+        group, _, variable = name.partition("__")
+        if content is None and not variable:
+            del groups[group]
+        elif content is None:
+            groups[group] = groups[group].drop_vars(variable)
+        else:
+            groups[group][variable] = (groups[group][variable].dims, content)
+    tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=run.tree.attrs), **groups})
+    return replace(run, tree=tree)
+
+
+def rescripted(run: Run, **tables: dict[str, Any]) -> Run:
+    """A run whose scenario has other values in its tables."""
+    scenario = run.scenario.to_dict()
+    for table, changes in tables.items():
+        if isinstance(scenario[table], dict):
+            scenario[table] |= changes
+        else:
+            scenario[table] = [entry | changes for entry in scenario[table]]
+    made = Scenario.model_validate(scenario)
+    return replace(run, scenario=made, config={**run.config, "scenario": scenario})

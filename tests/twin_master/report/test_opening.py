@@ -4,79 +4,96 @@ import html
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from twin_master.report import check as report_check
-from twin_master.report import data as report_data
-from twin_master.report import page as report
+from tests.twin_master.report.synthetic_run import altered
+from twin_master.report.check import predictive_check
 from twin_master.report.opening import opening_sentences
+from twin_master.report.page import render_page
+from twin_master.report.reading import Run
+from twin_master.store.learnt import LearntQuantity
+
+REGION = "the stiffness loss of region 1"
+KEPT = "The twin kept 3g at every turn"
 
 
-def test_the_page_begins_with_what_was_decided_believed_and_explained(record: report_data.RunRecord) -> None:
-    decided, believed, explained = opening_sentences(record)
+def test_the_page_begins_with_what_was_decided_believed_and_explained(run: Run) -> None:
+    decided, believed, explained = opening_sentences(run)
     assert decided == "The twin left 3g for 2g at turn 21."  # by a policy of both states
-    mean, deviation = 100 * record.filtered.mean[-1, 0], 100 * record.filtered.standard_deviation[-1, 0]
+    mean, deviation = (100 * run[f"filtered/{name}"][-1, 0] for name in ("mean", "standard_deviation"))
     low, high = max(mean - 2 * deviation, 0.0), min(mean + 2 * deviation, 80.0)
-    assert (
-        f"puts the stiffness loss of region 1 at {mean:.1f} % ({low:.1f} to {high:.1f}, truth 60)" in believed
-    )
-    check = report_check.predictive_check(record)  # 150 µε of noise, 125 assumed
-    assert check is not None
-    assert f"{check.standard_deviation:.3g} times as far as it assumes" in explained
-    assert " ".join(opening_sentences(record)) in " ".join(
-        html.unescape(report.render_page(record, [])).replace("\N{NO-BREAK SPACE}", " ").split()
-    )
+    assert f"puts {REGION} at {mean:.1f} % ({low:.1f} to {high:.1f}, truth 60)" in believed
+    # 150 µε of noise, 125 assumed
+    assert f"{predictive_check(run).standard_deviation:.3g} times as far as it assumes" in explained
+    text = html.unescape(render_page(run, {}, {})).replace("\N{NO-BREAK SPACE}", " ")
+    assert " ".join(opening_sentences(run)) in " ".join(text.split())
 
 
-def flown(record: report_data.RunRecord, *gentle: int, **changes: object) -> str:
-    """The first sentence of a run that flew 2g at these turns."""
+def flown(run: Run, *gentle: int, level: float = 0.6, **changes: np.ndarray | None) -> str:
+    """The first sentence of a run that flew 2g at these turns, by a policy that leaves 3g from a level on."""
     control = np.ones(50, dtype=np.int64)
     control[list(gentle)] = 0
-    policy = report_data.PolicyTable(np.where(record.coordinates[:, 0] > 0.59, 0, 1), None)
-    changes = {"policy": policy, "control_index": control} | changes
-    return opening_sentences(replace(record, **changes))[0]  # type: ignore[arg-type]
+    policy = np.where(run.coordinates[:, 0] > level - 0.01, 0, 1)
+    return opening_sentences(
+        altered(run, observed__control_index=control, policy__control_index=policy, **changes)
+    )[0]
 
 
-def test_the_first_sentence_follows_the_record(record: report_data.RunRecord) -> None:
-    region = "the stiffness loss of region 1"
-    reached = f"; {region} reached the 60 % from which the policy leaves 3g at turn 30."
-    never = f"; {region} never reached the 60 % from which the policy leaves 3g."
-    assert record.truth_state is not None
-    healthy = np.zeros_like(record.truth_state)
-    assert flown(record, *range(30, 50)).endswith(
-        "at turn 30, when the stiffness loss of region 1 had reached 60 %."
-    )
-    assert flown(record) == f"The twin kept 3g at every turn{reached}"
-    assert flown(record, truth_state=healthy) == f"The twin kept 3g at every turn{never}"
-    assert flown(record, *range(12, 50)) == f"The twin left 3g for 2g at turn 12{reached}"
-    again = flown(record, 33, *range(40, 50))
-    assert again.endswith(
-        "; the first change came 3 turns after the stiffness loss of region 1 had reached 60 %."
-    )
-    # of a real asset nothing is known but what was recorded
-    watched = replace(record, config={**record.config, "watched": True}, truth_state=None, first_step=1000)
+REACHED = f"; {REGION} reached the 60 % from which the policy leaves 3g at turn 30."
+
+
+@pytest.mark.parametrize(
+    ("gentle", "changes", "said"),
+    [
+        (range(30, 50), {}, f"The twin fell back from 3g to 2g at turn 30, when {REGION} had reached 60 %."),
+        ((), {}, f"{KEPT}{REACHED}"),
+        (
+            (), {"truth__state": np.zeros((50, 2))},
+            f"{KEPT}; {REGION} never reached the 60 % from which the policy leaves 3g.",
+        ),
+        (range(12, 50), {}, f"The twin left 3g for 2g at turn 12{REACHED}"),
+        (
+            range(31, 50), {},
+            f"The twin fell back from 3g to 2g at turn 31, one turn after {REGION} had reached 60 %.",
+        ),
+        (
+            (33, *range(40, 50)), {},
+            "The twin left 3g for 2g at turn 33, left 2g for 3g at turn 34, left 3g for 2g at turn 40; "
+            f"the first change came 3 turns after {REGION} had reached 60 %.",
+        ),
+        (
+            range(1, 50), {"level": 0.0},
+            "The twin left 3g for 2g at turn 1; the policy leaves 3g in every state.",
+        ),
+        ((), {"truth": None}, "The twin kept 3g at every turn."),
+    ],
+)  # fmt: skip
+def test_the_first_sentence_follows_the_record(
+    run: Run, gentle: tuple[int, ...], changes: dict[str, np.ndarray | None], said: str
+) -> None:
+    assert flown(run, *gentle, **changes) == said  # type: ignore[arg-type]
+
+
+def test_of_a_real_asset_nothing_is_said_but_what_was_recorded(run: Run) -> None:
+    watched = replace(altered(run, truth=None), config={**run.config, "watched": True})
+    observed = watched.tree["observed"].to_dataset()
+    watched.tree["observed"] = observed.assign_coords(step=observed["step"] + 1000)
     obeyed = np.tile([0.1, 0.9], (50, 1))
     obeyed[30:] = [0.8, 0.2]  # asked for 2g from turn 31 on
-    left = flown(watched, *range(31, 50), decision_probability=obeyed)
+    left = flown(watched, *range(31, 50), filtered__decision_probability=obeyed)
     assert left == "The asset left 3g for 2g at turn 1031."
-    kept = flown(watched, decision_probability=obeyed)
+    kept = flown(watched, filtered__decision_probability=obeyed)
     assert kept == "The asset kept 3g at every turn; at 19 turns the twin had asked for another control."
     assert "truth" not in " ".join(opening_sentences(watched))
-    assert flown(record, policy=None) == "The twin kept 3g at every turn."
-    one = replace(record, controls=("3g",), control_index=np.zeros(50, dtype=np.int64))
-    assert opening_sentences(one)[0] == "There was one control, 3g, and nothing to decide."
 
 
-def test_the_last_sentence_judges_the_scatter(record: report_data.RunRecord) -> None:
-    assert record.filtered.quantity is not None
-    random, expected = np.random.default_rng(3), record.filtered.quantity.mean
-    noise = np.full(expected.shape, 125e-6)
-    known = replace(record, learnt_noise=noise, filtered=replace(
-        record.filtered, quantity_standard_deviation=np.zeros_like(expected)
-    ))  # fmt: skip
+def test_the_last_sentence_judges_the_scatter(run: Run) -> None:
+    random, expected, noise = np.random.default_rng(3), run["filtered/quantity_mean"], 125e-6
+    known = altered(run, filtered__quantity_standard_deviation=np.zeros_like(expected))
     draws = random.standard_normal(expected.shape)
 
     def last(scatter: np.ndarray) -> str:
-        return opening_sentences(replace(known, observation=expected + noise * scatter))[-1]
+        return opening_sentences(altered(known, observed__strain=expected + noise * scatter))[-1]
 
     assert last(draws).startswith(
         "The twin's model explains the observations within the noise that it assumes: 9"
@@ -86,21 +103,15 @@ def test_the_last_sentence_judges_the_scatter(record: report_data.RunRecord) -> 
     draws[:, 6] += 1.4  # one gauge is off, and the others hide it
     assert "intervals, but" in last(draws)
     assert last(draws).endswith("% of those of gauge 7.")
-    assert len(opening_sentences(replace(known, observation=None))) == 2
+    assert len(opening_sentences(altered(known, observed__strain=np.full_like(expected, np.nan)))) == 2
 
 
-def test_what_was_learnt_and_many_states(record: report_data.RunRecord) -> None:
+def test_what_was_learnt_is_said(run: Run) -> None:
     course = np.tile([1.02, 0.004, 1.01, 1.03], (50, 1))
-    learnt = report_data.LearntCourse("young_modulus_factor", "1", course, course[0], np.array(1.025))
-    said = opening_sentences(replace(record, parameter_name=learnt.name, learnt=(learnt,)))[1]
+    learnt = LearntQuantity(
+        "young_modulus_factor", "Young modulus factor", "", course, course[0], np.array(1.025)
+    )
+    changed = replace(run)
+    vars(changed)["learnt"] = (learnt,)
+    said = opening_sentences(changed)[1]
     assert said.endswith("; it learnt the Young modulus factor: 1.020 (1.012 to 1.028, truth 1.025).")
-    moments = (np.tile(part[:, :1], 6) for part in (record.filtered.mean, record.filtered.standard_deviation))
-    mean, deviation = moments
-    six = replace(
-        record,
-        state_names=tuple("abcdef"), state_titles=tuple("abcdef"), levels=record.levels[:1] * 6,
-        state_units=("mm",) * 6, policy=None, truth_state=None,
-        filtered=replace(record.filtered, mean=mean, standard_deviation=0.0 * deviation),
-    )  # fmt: skip
-    said = opening_sentences(six)[1]
-    assert f"d at {mean[-1, 0]:.3g} mm (no other level is believed) and 2 other states as the figures" in said
