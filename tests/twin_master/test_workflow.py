@@ -97,9 +97,11 @@ def test_the_field_of_a_belief_that_rounds_beyond_the_last_level() -> None:
     belief = next(b for b in (b / b.sum() for b in beliefs) if model.states.mean(b)[0] > 0.8)
     seen: dict[str, float] = {}
     source = SimpleNamespace(write_field=lambda path, state, control: seen.update(state))
-    flight = SimpleNamespace(filtered=belief[np.newaxis], control_index=np.array([0]))
-    knowledge = SimpleNamespace(scenario=scenario, model=model)
-    workflow._field_writer(knowledge, source, SimpleNamespace(flight=flight))(Path("wing.vtu"))  # type: ignore[arg-type]
+    turn = SimpleNamespace(concluded=SimpleNamespace(filtered=belief, control_index=0))
+    result = SimpleNamespace(
+        scenario=scenario, knowledge=SimpleNamespace(model=model), flight=SimpleNamespace(turns=[turn])
+    )
+    workflow._field_writer(source, result)(Path("wing.vtu"))  # type: ignore[arg-type]
     assert seen["z1"] == 0.8
     assert 0.0 < seen["z2"] < 0.8
 

@@ -15,13 +15,13 @@ from reporting.toml_file import read_toml
 from twin_master.assets.resolution import Overrides, portable_scenario, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.opening import file_record
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Name, NotNegative, Number, Probability, Section, Seed
 from twin_master.seeds import generator
 from twin_master.watch.broker import is_broker
 from twin_master.watch.feeds import Fed
-from twin_master.watch.opening import file_record
 
 __all__ = ["Fleet", "Group", "Member", "ensemble", "load_fleet", "seed_range"]
 

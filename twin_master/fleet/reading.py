@@ -1,6 +1,6 @@
 """What stands in the store of a fleet, as figures with their errors."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -278,17 +278,15 @@ def fly_seeds(
     seed = seeds[0] if calibration_seed is None else calibration_seed
     knowledge = prepare_knowledge(scenario, source, seed)
     truths, asset = [knowledge.truth(seed) for seed in seeds], source.open()
+    start = asset.save_state()
+
+    def again(_twin: int, _sound: bool) -> Asset:
+        asset.restore_state(start)
+        return asset
+
     try:
         if isinstance(asset, StatelessAsset) and scenario.learning is None and scenario.notice is None:
             return Outcomes.flown(knowledge, fly_side_by_side(knowledge, truths, [asset] * len(truths)))
-        return Outcomes.flown(knowledge, fly_one_by_one(knowledge, truths, _again(asset, len(truths))))
+        return Outcomes.flown(knowledge, fly_one_by_one(knowledge, truths, again))
     finally:
         asset.close()
-
-
-def _again(asset: Asset, count: int) -> Iterator[Asset]:
-    """Yield an asset at its start, again and again."""
-    start = asset.save_state()
-    for _ in range(count):
-        asset.restore_state(start)
-        yield asset

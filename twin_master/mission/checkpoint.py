@@ -8,14 +8,10 @@ they were taken. Beside it a line has the belief of the turn, for those who read
 import base64
 import binascii
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from twin_master.mission.journal import (
     JOURNAL_NAME,
@@ -28,11 +24,8 @@ from twin_master.mission.journal import (
     plain,
     read_records,
 )
-from twin_master.mission.plant import PlantRecord
-from twin_master.network.twin import TwinTurn
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from twin_master.mission.loop import Checkpoint
+from twin_master.mission.turns import Happened, Reading, Turn
 
 STATE_ALLOWANCE = 64_000_000
 STATE_SHARE = 4_000
@@ -41,84 +34,6 @@ STATE_SHARE = 4_000
 States that need more are kept less often, so that the file grows with the turns and not with their square
 (an asset that is replayed keeps the inputs of all its steps); the turns after the last one are flown again.
 """
-
-
-@dataclass(frozen=True)
-class FlownTurn:
-    """What cannot be computed again of one turn.
-
-    Attributes
-    ----------
-    control_index, next_control : int
-        Control in force, and the one decided for the next turn.
-    observed : (G,)
-        What the sensors said, SI; NaN where lost.
-    state : (F,)
-        True state, SI.
-    observation : (G,)
-        Noise-free observation, SI.
-    monitors : dict of str to float
-        Figures that the asset reported of itself.
-    asset_state : bytes or None
-        State of the asset after the turn; None where it was not kept.
-    concluded : TwinTurn or None
-        What the twin concluded, for those who read along; None once read back.
-    """
-
-    control_index: int
-    next_control: int
-    observed: Float
-    state: Float
-    observation: Float
-    monitors: dict[str, float]
-    asset_state: bytes | None
-    concluded: TwinTurn | None = None
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """A mission after t turns.
-
-    Attributes
-    ----------
-    observed : (t, G)
-        What the sensors said, SI.
-    control_index : (t + 1,)
-        Controls flown, and the one decided for the next turn.
-    plant : PlantRecord
-        What really happened.
-    asset_state : bytes
-        State of the asset after the last turn.
-    """
-
-    observed: Float
-    control_index: Index
-    plant: PlantRecord
-    asset_state: bytes
-
-    @property
-    def turns(self) -> int:
-        """Number of turns flown."""
-        return len(self.observed)
-
-
-def checkpoint_of(turns: Sequence[FlownTurn]) -> Checkpoint | None:
-    """Return where a mission stopped after these turns; None without a turn whose asset state was kept."""
-    count = next((n for n in range(len(turns), 0, -1) if turns[n - 1].asset_state is not None), 0)
-    if not count:
-        return None
-    flown, state = turns[:count], turns[count - 1].asset_state
-    assert state is not None
-    return Checkpoint(
-        observed=np.array([turn.observed for turn in flown]),
-        control_index=np.array([*(turn.control_index for turn in flown), flown[-1].next_control]),
-        plant=PlantRecord(
-            state=np.array([turn.state for turn in flown]),
-            observation=np.array([turn.observation for turn in flown]),
-            monitors={name: np.array([turn.monitors[name] for turn in flown]) for name in flown[-1].monitors},
-        ),
-        asset_state=state,
-    )
 
 
 class CheckpointFile:
@@ -134,14 +49,31 @@ class CheckpointFile:
 
     def __init__(self, path: Path, config_hash: str, journal: JournalFile) -> None:
         self._journal = journal
-        turns, ends, kept = _read(path, config_hash)
-        self.checkpoint = checkpoint_of(turns)
-        count = self.checkpoint.turns if self.checkpoint else 0
-        self.turns, self._state_bytes = count, kept[count]
-        if count < len(turns):  # without the state of the asset they are flown again
-            journal.truncate(ends[count])
+        readings: list[Reading] = []
+        decided: list[int] = []
+        whole, state, size, end = 0, "", 0, len(line_of({"config_hash": config_hash}))
+        self._state_bytes = 0
+        for record, behind in read_records(path, config_hash):
+            if record.get("turn") != len(readings):
+                raise damaged(path, len(readings) + 1, f"turn {len(readings)} was expected")
+            try:
+                readings.append(_reading(record))
+                decided.append(int(record["next_control"]))
+                size += len(record["asset_state"] or "")
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                raise damaged(path, len(readings), f"it has another layout, {error}") from error
+            if record["asset_state"] is not None:
+                whole, state, self._state_bytes, end = len(readings), record["asset_state"], size, behind
+        try:
+            content = zlib.decompress(base64.b64decode(state)) if whole else b""
+        except (TypeError, ValueError, zlib.error, binascii.Error) as error:
+            raise damaged(path, whole, f"it has another layout, {error}") from error
+        self.turns = whole
+        self.checkpoint = Checkpoint(readings[:whole], decided[:whole], content) if whole else None
+        if whole < len(readings):  # without the state of the asset they are flown again
+            journal.truncate(end)
 
-    def keep(self, turn: FlownTurn) -> None:
+    def keep(self, turn: Turn, asset_state: bytes) -> None:
         """Add a turn; it is on the disk when this returns.
 
         Raises
@@ -149,25 +81,25 @@ class CheckpointFile:
         FileNotWrittenError
             The disk is full or the folder cannot be written; the turns before are still there.
         """
+        happened = turn.reading.happened
+        assert happened is not None  # of a simulated asset
         self.turns += 1
-        state = None
-        if turn.asset_state is not None:
-            packed = base64.b64encode(zlib.compress(turn.asset_state, 1)).decode("ascii")
-            if self._state_bytes + len(packed) <= STATE_ALLOWANCE + STATE_SHARE * self.turns:
-                state = packed
-                self._state_bytes += len(packed)
+        state: str | None = base64.b64encode(zlib.compress(asset_state, 1)).decode("ascii")
+        if self._state_bytes + len(state or "") > STATE_ALLOWANCE + STATE_SHARE * self.turns:
+            state = None
+        self._state_bytes += len(state or "")
         self._journal.append(
             {
                 "turn": self.turns - 1,
-                "control_index": turn.control_index,
-                "next_control": turn.next_control,
-                "observed": plain(turn.observed),
-                "state": plain(turn.state),
-                "observation": plain(turn.observation),
-                "monitors": dict(zip(turn.monitors, plain(list(turn.monitors.values())), strict=True)),
+                "control_index": turn.concluded.control_index,
+                "next_control": turn.concluded.next_control,
+                "observed": plain(turn.reading.observed),
+                "state": plain(happened.state),
+                "observation": plain(happened.observation),
+                "monitors": dict(zip(happened.monitors, plain([*happened.monitors.values()]), strict=True)),
                 "asset_state": state,
+                **belief_record(turn.concluded),
             }
-            | ({} if turn.concluded is None else belief_record(turn.concluded))
         )
 
 
@@ -193,32 +125,8 @@ def open_checkpoint(folder: Path, config_hash: str) -> Iterator[CheckpointFile]:
         yield CheckpointFile(folder / JOURNAL_NAME, config_hash, journal)
 
 
-def _read(path: Path, config_hash: str) -> tuple[list[FlownTurn], list[int], list[int]]:
-    """Return the turns, where the lines before and after them end, and the bytes of asset states so far."""
-    turns: list[FlownTurn] = []
-    ends, kept = [len(line_of({"config_hash": config_hash}))], [0]
-    for record, end in read_records(path, config_hash):
-        number = len(turns) + 1
-        if record.get("turn") != len(turns):
-            raise damaged(path, number, f"turn {len(turns)} was expected")
-        try:
-            state = record["asset_state"]
-            turns.append(_turn(record, state))
-        except (KeyError, TypeError, ValueError, AttributeError, zlib.error, binascii.Error) as error:
-            raise damaged(path, number, f"it has another layout, {error}") from error
-        ends.append(end)
-        kept.append(kept[-1] + len(state or ""))
-    return turns, ends, kept
-
-
-def _turn(record: dict[str, Any], state: str | None) -> FlownTurn:
+def _reading(record: dict[str, Any]) -> Reading:
     monitors = record["monitors"]
-    return FlownTurn(
-        control_index=int(record["control_index"]),
-        next_control=int(record["next_control"]),
-        observed=array_of(record["observed"]),
-        state=array_of(record["state"]),
-        observation=array_of(record["observation"]),
-        monitors=dict(zip(monitors, array_of(list(monitors.values())).tolist(), strict=True)),
-        asset_state=None if state is None else zlib.decompress(base64.b64decode(state)),
-    )
+    told = dict(zip(monitors, array_of(list(monitors.values())).tolist(), strict=True))
+    happened = Happened(array_of(record["state"]), array_of(record["observation"]), told)
+    return Reading(array_of(record["observed"]), int(record["control_index"]), happened=happened)

@@ -5,6 +5,7 @@ still goes on: a view of it costs the flight nothing.
 """
 
 import io
+import json
 import os
 import zipfile
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, atomic_write_text
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import RunFolderError
 from twin_master.mission.preparation import Knowledge, knowledge_of
@@ -20,7 +21,7 @@ from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
-KNOWLEDGE_NAME = "twin.npz"
+KNOWLEDGE_NAME, CALIBRATION_NAME = "twin.npz", "calibration.json"
 
 
 def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
@@ -45,6 +46,9 @@ def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
         arrays |= {f"belief_{name}": array for name, array in vars(knowledge.plan.on_belief).items()}
     np.savez(content, **arrays | ({} if true is None else {"true": true}))
     atomic_write_bytes(folder / KNOWLEDGE_NAME, content.getvalue())
+    if knowledge.draws.record is not None:
+        text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
+        atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
 
 
 def share_knowledge(folder: Path, other: Path) -> None:

@@ -1,35 +1,19 @@
-"""The flown asset with its truth; the mission loop shows the twin its observations and nothing else."""
+"""The flown asset with its truth, as a source: the twin is shown its observations and nothing else."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fmu_asset.errors import FmuEndedError
 from twin_master.assets.interface import Asset, AssetReading
-from twin_master.errors import AssetOutputError
+from twin_master.errors import AssetOutputError, TwinMasterError
 from twin_master.mission.truth import Truth
+from twin_master.mission.turns import Happened, Reading
+from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class PlantRecord:
-    """What happened so far, for the store and the checkpoint; never for the twin.
-
-    Attributes
-    ----------
-    state : (t, F)
-        True state of each step, SI.
-    observation : (t, G)
-        Noise-free observation, SI.
-    monitors : dict of str to (t,)
-        Figures that the asset reported of itself.
-    """
-
-    state: Float
-    observation: Float
-    monitors: dict[str, Float]
 
 
 def checked_values(scenario: Scenario, reading: AssetReading, step: int, control: str) -> Float:
@@ -38,7 +22,7 @@ def checked_values(scenario: Scenario, reading: AssetReading, step: int, control
     Raises
     ------
     AssetOutputError
-        If it holds NaN, an infinity or the wrong number of values.
+        It has another number of values, or one that is not finite.
     """
     values = np.asarray(reading.values, dtype=np.float64)
     if values.shape != (scenario.observation.count,):
@@ -55,83 +39,99 @@ def checked_values(scenario: Scenario, reading: AssetReading, step: int, control
     return values
 
 
+def decided_to_end(scenario: Scenario, control_index: int) -> str:
+    """Return that an action has ended a mission."""
+    return f"the twin decided on `{scenario.control_names[control_index]}`."
+
+
 class Plant:
-    """An asset, driven by its truth.
+    """An asset, driven by its truth, and flown under the controls that a twin proposes.
 
     Parameters
     ----------
     scenario : Scenario
-        Controls and their inputs.
     truth : Truth
-        Damage, noise and faults.
     asset : Asset
-        What is flown.
+        At its start.
+
+    Attributes
+    ----------
+    step : int
+        Turns flown.
+    ended : str
+        How the asset ended the mission before its last turn; empty where it did not.
     """
 
     def __init__(self, scenario: Scenario, truth: Truth, asset: Asset) -> None:
-        self._scenario = scenario
-        self._truth = truth
-        self._asset = asset
-        self._states: list[Float] = []
-        self._observations: list[Float] = []
-        self._monitors: dict[str, list[float]] = {}
+        self._scenario, self._truth, self._asset = scenario, truth, asset
+        self._state: Float | None = None
+        self.step, self.ended = 0, ""
 
-    def turn(self, control_index: int, previous_control_index: int | None) -> Float:
-        """Fly one turn and return what the sensors say, and behind it the readings of inspections: (G + I,).
+    def read(self, twin: Twin) -> Reading | None:
+        """Return what comes of the next turn, see `Source`; None at the end of the mission."""
+        if twin.turns == self._scenario.mission.steps:
+            return None
+        before = twin.control_of(twin.turns - 1) if twin.turns else None
+        if before is not None and self._scenario.ends(before):
+            self.ended = decided_to_end(self._scenario, before)
+            return None
+        try:
+            return self.turn(twin.proposed_control, before)
+        except FmuEndedError as error:
+            if not twin.turns:
+                raise
+            self.ended = error.sentence
+            return None
 
-        NaN where a sensor is lost, and where a reading was not asked for.
+    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
+        """Refuse to go on: what is simulated was observed, whatever the twin believes."""
+        raise error
+
+    def turn(self, control_index: int, previous_control_index: int | None) -> Reading:
+        """Fly one turn.
+
+        Parameters
+        ----------
+        control_index
+            Control in force.
+        previous_control_index
+            Control of the turn before; None in the first one.
 
         Raises
         ------
         AssetOutputError
-            If the asset returns NaN, an infinity or the wrong number of values.
+            The asset returned something that is no observation.
         """
-        step = len(self._states)
         control = self._scenario.control[control_index]
         if self._truth.in_asset:
             reading = self._asset.step(control.values, {})
-            state = self._told(step, reading)
+            state = self._told(reading)
         else:
-            previous = self._states[-1] if self._states else None
-            state = self._truth.state(step, previous, previous_control_index)
+            state = self._truth.state(self.step, self._state, previous_control_index)
             health = dict(zip(self._scenario.state_names, state.tolist(), strict=True))
             reading = self._asset.step(control.values, health)
-        values = checked_values(self._scenario, reading, step, control.name)
-        self._states.append(state)
-        self._observations.append(values)
-        for name, value in reading.monitors.items():
-            self._monitors.setdefault(name, []).append(float(value))
-        sensed = self._truth.sense(step, values) if reading.inner is None else reading.inner.sensed
-        return np.concatenate((sensed, self._truth.inspected(step, state, control_index)))
+        values = checked_values(self._scenario, reading, self.step, control.name)
+        sensed = self._truth.sense(self.step, values) if reading.inner is None else reading.inner.sensed
+        inspected = self._truth.inspected(self.step, state, control_index)
+        self._state, self.step = state, self.step + 1
+        monitors = {name: float(value) for name, value in reading.monitors.items()}
+        happened = Happened(state, values, monitors)
+        return Reading(np.concatenate((sensed, inspected)), control_index, happened=happened)
 
-    def _told(self, step: int, reading: AssetReading) -> Float:
+    def _told(self, reading: AssetReading) -> Float:
         """Return the true state that an asset with damage of its own tells."""
         if reading.inner is None:
             raise AssetOutputError(
-                f"step {step}: the asset does not tell its damage, which `truth` asks of it"
+                f"step {self.step}: the asset does not tell its damage, which `truth` asks of it"
             )
         return np.array([reading.inner.state[name] for name in self._scenario.state_names])
-
-    def latest(self) -> tuple[Float, Float, dict[str, float]]:
-        """Return true state (F,), noise-free observation (G,) and monitors of the last turn."""
-        monitors = {name: values[-1] for name, values in self._monitors.items()}
-        return self._states[-1], self._observations[-1], monitors
-
-    def record(self) -> PlantRecord:
-        """Return what happened so far."""
-        return PlantRecord(
-            state=np.array(self._states).reshape(-1, len(self._scenario.state)),
-            observation=np.array(self._observations).reshape(-1, self._scenario.observation.count),
-            monitors={name: np.array(values) for name, values in self._monitors.items()},
-        )
 
     def save_state(self) -> bytes:
         """Return the state of the asset as bytes."""
         return self._asset.save_state()
 
-    def restore(self, record: PlantRecord, asset_state: bytes) -> None:
-        """Continue from a record and a saved state of the asset."""
-        self._states = list(record.state)
-        self._observations = list(record.observation)
-        self._monitors = {name: values.tolist() for name, values in record.monitors.items()}
+    def restore(self, readings: Sequence[Reading], asset_state: bytes) -> None:
+        """Continue behind turns that were flown, and from a saved state of the asset."""
+        happened = readings[-1].happened
+        self.step, self._state = len(readings), None if happened is None else happened.state
         self._asset.restore_state(asset_state)

@@ -56,6 +56,12 @@ class LearntQuantity:
         """Whether each sensor has its own."""
         return self.course.ndim == 3
 
+    @property
+    def words(self) -> dict[str, str]:
+        """What names it in the schema of `run.nc`."""
+        of = "sensor" if self.of_sensors else ""
+        return {"quantity": self.name, "title": self.title, "unit": self.unit, "of": of}
+
 
 def learnt_quantities(
     scenario: Scenario,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.mission.journal import array_of
-from twin_master.mission.loop import Beliefs
+from twin_master.mission.turns import History
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -53,21 +53,19 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
     return record
 
 
-def gap_of(beliefs: Beliefs, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:
+def gap_of(history: History, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:
     """Return root mean square residual and log evidence of the turns behind `skipped`; None without any.
 
     The residuals are in standard deviations of the noise that is assumed, or learnt where the twin learns.
     """
-    observed = np.array(beliefs.observed[skipped:])
-    if not len(observed) or np.isnan(observed).all():
+    left = history.behind(skipped)
+    if not left.turns or np.isnan(left.observed).all():
         return {"rms_residual": None, "log_evidence": None}
-    if beliefs.residual:
-        residual = np.array(beliefs.residual[skipped:])
-    else:
-        filtered, control = np.array(beliefs.filtered[skipped:]), np.array(beliefs.control_index[skipped:])
-        joint = known_control(filtered, control, sensors.control_count)
-        residual = (observed - sensors.moments(joint)[0]) / sensors.noise(joint)
+    residual = left.residual()
+    if not len(residual):
+        joint = known_control(left.filtered, left.control_index, sensors.control_count)
+        residual = (left.observed - sensors.moments(joint)[0]) / sensors.noise(joint)
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
-        "log_evidence": float(np.sum(beliefs.log_evidence[skipped:])),
+        "log_evidence": float(np.sum(left.log_evidence)),
     }

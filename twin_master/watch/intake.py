@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from reporting.files import atomic_write_text, write_error
 from twin_master.errors import TwinMasterError
 from twin_master.learning.setup import words_of
-from twin_master.mission.loop import Reading
+from twin_master.mission.turns import Reading
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario

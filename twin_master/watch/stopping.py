@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 from twin_master.errors import TwinMasterError
-from twin_master.mission.loop import Reading
+from twin_master.mission.turns import Reading
 from twin_master.network.twin import Twin
 from twin_master.watch.intake import Intake
 

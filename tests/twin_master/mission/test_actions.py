@@ -325,7 +325,7 @@ def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path: Path) -
         names = known.scenario.control_names
         for turn in range(15):
             before = names.index(controls[-2]) if turn else None
-            row = plant.turn(names.index(controls[-1]), before)
+            row = plant.turn(names.index(controls[-1]), before).observed
             rows.append(row)
             read = {
                 f"{name}_percent": 100.0 * value

@@ -29,10 +29,7 @@ def result(library_file: Path) -> MissionResult:
     knowledge = prepare_knowledge(scenario, source, 3)
     truth = knowledge.truth(3)
     flight = fly(scenario, knowledge.twin(), knowledge.plant(truth, source.open()))
-    return MissionResult(
-        scenario, knowledge.model, knowledge.sensor_model, knowledge.draws.values,
-        knowledge.rewards, knowledge.plan, truth, flight,
-    )  # fmt: skip
+    return MissionResult(scenario, knowledge, flight, truth)
 
 
 def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(
@@ -55,15 +52,15 @@ def test_what_is_stored_agrees_with_itself(result: MissionResult, tmp_path: Path
     write_run(tmp_path, groups_of(result), {})
     tree = read_run(tmp_path)
     filtered, predicted = tree["filtered"].to_dataset(), tree["predicted"].to_dataset()
-    levels = result.model.states.coordinates
+    levels = result.knowledge.model.states.coordinates
     np.testing.assert_allclose(filtered["mean"], filtered["probability"].values @ levels)
     np.testing.assert_allclose(predicted["control_probability"].sum("control"), 1.0)
     decided = filtered["decision_probability"]
     np.testing.assert_array_equal(decided.argmax("control")[:-1], result.flight.control_index[1:])
     assert "filtered belief" in decided.attrs["long_name"]
     # A healthy wing at 3g: the mean over the draws of e is the quantity of interest.
-    np.testing.assert_allclose(filtered["quantity_mean"][0], result.sensor_model.mean[0, 1])
-    deviation = result.sensor_model.value_per_draw[:, 0, 1].std(axis=0)
+    np.testing.assert_allclose(filtered["quantity_mean"][0], result.knowledge.sensor_model.mean[0, 1])
+    deviation = result.knowledge.sensor_model.value_per_draw[:, 0, 1].std(axis=0)
     np.testing.assert_allclose(filtered["quantity_standard_deviation"][0], deviation)
     assert np.all(filtered["quantity_lower"] <= filtered["quantity_mean"])
     assert np.all(filtered["quantity_mean"] <= filtered["quantity_upper"])

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.mission.loop import fly
@@ -73,40 +72,34 @@ def test_rms_error_of_a_certain_belief() -> None:
 
 
 @pytest.fixture(scope="module", params=["level_turns", "failing_gauges", "growing_damage"])
-def result(request: pytest.FixtureRequest, library_file: Path) -> tuple[MissionResult, ParameterDraws]:
+def result(request: pytest.FixtureRequest, library_file: Path) -> MissionResult:
     scenario = load_scenario(request.param).scenario
     source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
     knowledge = prepare_knowledge(scenario, source, 3)
     truth = knowledge.truth(3)
     flight = fly(scenario, knowledge.twin(), knowledge.plant(truth, source.open()))
-    mission = MissionResult(
-        scenario, knowledge.model, knowledge.sensor_model, knowledge.draws.values,
-        knowledge.rewards, knowledge.plan, truth, flight,
-    )  # fmt: skip
-    return mission, knowledge.draws
+    return MissionResult(scenario, knowledge, flight, truth)
 
 
-def test_every_figure_is_one_that_a_reference_can_name(result: tuple[MissionResult, ParameterDraws]) -> None:
-    mission, draws = result
-    rewards = np.zeros((50, 3))
-    record = mission.flight.truth
-    monitored = replace(record, monitors={"strain_error_bound": np.full(50, 2e-6)})
-    complete = replace(mission, flight=replace(mission.flight, truth=monitored))
-    assert (
-        tuple(figure.key for figure in summarise(complete, draws, rewards)) == mission.scenario.figure_names
-    )
+def test_every_figure_is_one_that_a_reference_can_name(result: MissionResult) -> None:
+    turns = []
+    for turn in result.flight.turns:
+        happened = turn.reading.happened._replace(monitors={"strain_error_bound": 2e-6})
+        turns.append(replace(turn, reading=replace(turn.reading, happened=happened)))
+    complete = replace(result, flight=replace(result.flight, turns=turns))
+    figures = summarise(complete, np.zeros((50, 3)))
+    assert tuple(figure.key for figure in figures) == result.scenario.figure_names
 
 
 def test_figures_stand_beside_the_references_of_the_scenario(
-    result: tuple[MissionResult, ParameterDraws],
+    result: MissionResult,
 ) -> None:
-    mission, draws = result
     references = (
         Reference(figure="fallback_delay", value="1 or 2", source="somewhere"),
         Reference(figure="mean_reward_error", value=-0.4, source="elsewhere"),
     )
-    scenario = mission.scenario.model_copy(update={"reference": references})
-    figures = summarise(replace(mission, scenario=scenario), draws, np.zeros((50, 3)))
+    scenario = result.scenario.model_copy(update={"reference": references})
+    figures = summarise(replace(result, scenario=scenario), np.zeros((50, 3)))
     found = {f.key: (f.reference, f.reference_source) for f in figures if f.reference is not None}
     assert found == {"fallback_delay": ("1 or 2", "somewhere"), "mean_reward_error": (-0.4, "elsewhere")}
 

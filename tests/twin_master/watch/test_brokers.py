@@ -21,7 +21,7 @@ from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, lines, soon_quiet, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.loop import Flight
+from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.broker import PASSWORD_VARIABLE, Broker, broker_of
 from twin_master.watch.folder import Watch
@@ -37,7 +37,7 @@ needs_mosquitto = pytest.mark.skipif(shutil.which("mosquitto") is None, reason="
 @needs_mosquitto
 @pytest.mark.parametrize("tls", [False, True])
 def test_over_a_broker_that_stops_and_a_hostile_publisher(
-    base: Watch, mission: Flight, whole: Path, tmp_path: Path, tls: bool, monkeypatch: pytest.MonkeyPatch
+    base: Watch, mission: History, whole: Path, tmp_path: Path, tls: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broker = Mosquitto(tmp_path, tls=tls)
     scheme, host = ("mqtts", "localhost") if tls else ("mqtt", "127.0.0.1")
