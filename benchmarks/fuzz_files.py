@@ -118,7 +118,7 @@ def _run(folder: Path) -> None:
 
 def _checkpoint(folder: Path) -> None:
     from tests.twin_master.mission.test_checkpoint import flown
-    from twin_master.mission.checkpoint import open_checkpoint
+    from twin_master.mission.loop import open_checkpoint
 
     place = folder / "checkpoint"
     place.mkdir()

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.seeds import outcomes
 from fe.full.operators import assemble
 from fe.full.statics import solve_static
 from fe.reduction.model_cache import reduced_model
@@ -92,7 +93,7 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
     spread = float(np.sqrt(share * (1.0 - share) / max(len(covered), 1)))
     root = float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
     per_turn = seconds / (len(seeds) * scenario.mission.steps)
-    return Result(Outcomes.flown(knowledge, flights), Estimated(share, spread), root, per_turn)
+    return Result(outcomes(knowledge, flights), Estimated(share, spread), root, per_turn)
 
 
 @dataclass(frozen=True)

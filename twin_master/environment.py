@@ -18,8 +18,8 @@ from twin_master.assets.interface import Asset
 from twin_master.assets.resolution import Overrides, given_overrides, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.fleet.flight import source_of
-from twin_master.mission.plant import Plant
 from twin_master.mission.preparation import prepare_knowledge
+from twin_master.mission.truth import Plant
 from twin_master.network.rewards import health_reward
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 

@@ -19,13 +19,11 @@ from twin_master.assets.asset_source import AssetSource, calibrated_with
 from twin_master.assets.mismatch import Misfit, find_misfit
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import NotResumableError
-from twin_master.mission.checkpoint import open_checkpoint
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.kept_knowledge import keep_knowledge
-from twin_master.mission.loop import fly
+from twin_master.mission.loop import fly, open_checkpoint
 from twin_master.mission.opening import begin_folder, file_record, restore, resume_folder
 from twin_master.mission.planning import read_policy
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
 from twin_master.mission.turns import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
@@ -33,9 +31,8 @@ from twin_master.run_folder import check_versions, tidy, to_json, with_inputs
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.outcome import RunOutcome, finished_run, read_outcome
 from twin_master.store.summary import another_truth
-from twin_master.store.writing import TIMING_NAME, store_flight
+from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
 
 POLICY_NAME = "policy.npy"
 """In the run folder: the policy that was given in the place of a plan, (S, U) or on the belief."""

@@ -30,7 +30,7 @@ from twin_master.errors import (
 from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import lock_run_folder
 from twin_master.scenario.reading import load_scenario
-from twin_master.store.outcome import RunOutcome
+from twin_master.store.writing import RunOutcome
 from twin_master.workflow import new_run, resume_run
 
 ROOT = Path(__file__).parents[2]

@@ -15,8 +15,6 @@ from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
-__all__ = ["Worsening", "node_evidence", "scaled_likelihood", "transition_evidence"]
-
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 Unsigned = NDArray[np.uint64]

@@ -21,14 +21,11 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source, located_scenario, portable_scenario
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine, Piece, flown
-from twin_master.fleet.outcome import FAILED, sizes_of
 from twin_master.fleet.plan import Fleet, Group, load_fleet
-from twin_master.fleet.recorded import read_recording
-from twin_master.fleet.shard import Kit, ShardResult, with_parameters
-from twin_master.fleet.store import FleetStore, check_installed, written
-from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, keep_knowledge
+from twin_master.fleet.shard import Kit, ShardResult, read_recording, with_parameters
+from twin_master.fleet.store import FAILED, FleetStore, check_installed, sizes_of, written
 from twin_master.mission.opening import released
-from twin_master.mission.preparation import prepare_knowledge
+from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.mission.truth import Truth
 from twin_master.network.twin import build_graphical_model

@@ -15,19 +15,16 @@ from twin_master.assets.resolution import located_scenario
 from twin_master.errors import FleetError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import GROUPS, fleet_config, source_of
-from twin_master.fleet.outcome import has_flown
 from twin_master.fleet.posterior import POINTS, Grid, Line, Shared, narrowed, population, refined, shared
 from twin_master.fleet.reading import noticed
-from twin_master.fleet.store import open_group
-from twin_master.mission.kept_knowledge import kept_knowledge
-from twin_master.mission.preparation import Knowledge
+from twin_master.fleet.store import has_flown, open_group
+from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["FleetLessons", "GroupLessons", "Line", "learn_fleet"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

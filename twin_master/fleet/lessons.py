@@ -12,8 +12,6 @@ from twin_master.fleet.learn import FleetLessons, learn_fleet
 from twin_master.fleet.posterior import Line
 from twin_master.run_folder import to_json
 
-__all__ = ["LESSONS_NAME", "learn_from_fleet", "lessons_record", "write_learnt"]
-
 LESSONS_NAME = "learnt.json"
 """In the folder of a fleet: what was learnt from it, for its report."""
 

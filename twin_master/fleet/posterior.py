@@ -7,8 +7,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Grid", "Line", "Shared", "narrowed", "population", "refined", "shared"]
-
 Float = NDArray[np.float64]
 Axes = tuple[Float, ...]
 

@@ -22,9 +22,8 @@ from reporting.words import counted
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.flight import RESULT_NAME, fleet_config
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.outcome import FAILED, has_flown
 from twin_master.fleet.reading import WITHIN, group_figures, last_turns, leaving, noticed, shown
-from twin_master.fleet.store import open_group
+from twin_master.fleet.store import FAILED, has_flown, open_group
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:

@@ -21,10 +21,9 @@ from reporting.words import counted
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.outcome import FAILED, has_flown
 from twin_master.fleet.report import LOST, Standing, add_failures, add_flown_group, add_group, add_lessons
 from twin_master.fleet.standing import STATE_NAME, FleetRecord
-from twin_master.fleet.store import DONE_NAME, open_group
+from twin_master.fleet.store import DONE_NAME, FAILED, has_flown, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario

@@ -31,8 +31,6 @@ from twin_master.watch.message import MessageReader
 from twin_master.watch.mqtt import Outbox, Session, placed
 from twin_master.watch.opening import begin_resolved, resume_watch
 
-__all__ = ["KIND", "FleetWatch"]
-
 KIND = "uav-twin fleet watch"
 TURNS_AT_ONCE = 64
 """Turns of one asset before the next one is looked at."""

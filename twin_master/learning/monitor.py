@@ -33,7 +33,7 @@ from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothes
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.scenario.notice import MOST_DRAWS
+from twin_master.scenario.tables import MOST_DRAWS
 
 __all__ = ["MonitorSettings", "WatchfulEstimator", "Words"]
 

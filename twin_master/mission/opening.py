@@ -16,8 +16,6 @@ from twin_master.run_folder import CONFIG_NAME, KIND, create_run_folder, lock_ru
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 
-__all__ = ["begin_folder", "file_record", "resume_folder"]
-
 Held = tuple[dict[str, Any], Scenario, int]
 """Configuration of a folder, its scenario located in it, and the descriptor by which it is held."""
 

@@ -16,14 +16,11 @@ from fmu_asset.errors import FmuError
 from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
 from twin_master.mission.loop import ended_sentence, fly
-from twin_master.mission.plant import checked_values, decided_to_end
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth
+from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth, checked_values, decided_to_end
 from twin_master.mission.turns import History
 from twin_master.network.estimator import Notice
 from twin_master.network.step_many import decide_many, filter_step_many, rationed
-
-__all__ = ["Flights", "fly_one_by_one", "fly_side_by_side"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from twin_master.network.estimator import Carried, Notice, Suspicion
 from twin_master.network.twin import Twin, TwinTurn
 
-__all__ = ["Happened", "History", "Reading", "Turn"]
-
 Float = NDArray[np.float64]
 
 

@@ -17,7 +17,7 @@ from reporting.words import parameter_title
 from twin_master.report.data import LearntCourse, RunRecord
 from twin_master.report.text import number
 from twin_master.report.view import capital, sensor_title, sensor_word
-from twin_master.store.learnt import printed_learnt
+from twin_master.store.mission_result import printed_learnt
 
 __all__ = ["learnt_caption", "learnt_figure", "learnt_tables"]
 

@@ -40,8 +40,8 @@ from twin_master.report.text import (
     turn_ranges,
 )
 from twin_master.report.view import choose_sensors, default_now, sensor_title, sensor_word, state_scale
-from twin_master.store.outcome import REPORT_NAME
 from twin_master.store.summary import another_truth
+from twin_master.store.writing import REPORT_NAME
 
 FIGURE_FOLDER = "figures"
 MAIN_FIGURE = "mission_now"

@@ -22,7 +22,7 @@ from twin_master.report.data import (
     Uncertain,
     moments,
 )
-from twin_master.store.learnt import MOMENTS
+from twin_master.store.mission_result import MOMENTS
 
 Float = NDArray[np.floating[Any]]
 

@@ -2,26 +2,27 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text
 from reporting.groups import Group, write_groups
+from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from reporting.provenance import hash_record
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.assets.mismatch import Misfit
-from twin_master.run_folder import FIELD_NAME, to_json
-from twin_master.store.learnt import learnt_record
-from twin_master.store.mission_result import MissionResult
-from twin_master.store.results import groups_of
+from twin_master.errors import NotResumableError
+from twin_master.run_folder import FIELD_NAME, read_config, to_json
+from twin_master.store.mission_result import MissionResult, learnt_record
+from twin_master.store.results import groups_of, tables_of
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
-from twin_master.store.tables import tables_of
 
 if TYPE_CHECKING:
     from xarray import DataTree
+
 
 RUN_NAME = "run.nc"
 SUMMARY_NAME = "summary.json"
@@ -161,3 +162,74 @@ def store_flight(
     }
     rewards = groups["filtered"]["reward_mean"].values
     write_summary(folder, [*figures, *summarise(result, rewards, misfit)], heading)
+
+
+REPORT_NAME = "report.html"
+"""In the run folder: the report."""
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """A finished run.
+
+    Attributes
+    ----------
+    folder : Path
+        The run folder.
+    report : Path or None
+        The report in it; None where none was asked for.
+    figures : tuple of Figure
+        The summary.
+    timing : dict
+        Content of `timing.json`.
+    origin : FlownAndBelieved
+        What was flown and what the twin believed, in words.
+    step_name : str
+        What a step is called.
+    control : str
+        When which control was left for which, in words.
+    notices : tuple of str
+        What the operator should know, a sentence each.
+    """
+
+    folder: Path
+    report: Path | None
+    figures: tuple[Figure, ...]
+    timing: Mapping[str, Any]
+    origin: FlownAndBelieved
+    step_name: str
+    control: str
+    notices: tuple[str, ...] = ()
+
+
+def read_outcome(folder: Path) -> RunOutcome:
+    """Return what came of the run in a folder.
+
+    Raises
+    ------
+    KeyError, TypeError, DamagedFileError, NotResumableError
+        A result is missing or damaged.
+    """
+    report = folder / REPORT_NAME
+    timing, summary = (read_json(folder / name, DamagedFileError) for name in (TIMING_NAME, SUMMARY_NAME))
+    return RunOutcome(
+        folder,
+        report if report.is_file() else None,
+        tuple(Figure(**figure) for figure in summary["figures"]),
+        timing,
+        FlownAndBelieved(
+            str(summary["asset"]), str(summary["twin_model"]), bool(summary["asset_and_model_differ"])
+        ),
+        str(read_config(folder)["scenario"]["mission"]["step_name"]),
+        str(summary["control"]),
+        tuple(str(notice["sentence"]) for notice in summary.get("notices", ())),
+    )
+
+
+def finished_run(folder: Path) -> RunOutcome | None:
+    """Return the outcome of a run that is finished; None where its results are missing or damaged."""
+    try:
+        read_run(folder)
+        return read_outcome(folder)
+    except (KeyError, TypeError, DamagedFileError, NotResumableError):
+        return None

@@ -19,8 +19,7 @@ from reporting.json_file import read_json
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import Expected, LearntExpectation
 from twin_master.learning.setup import learning_filter
-from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, kept_knowledge
-from twin_master.mission.preparation import Knowledge
+from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import known_control, predict
 from twin_master.run_folder import PICTURE, VERDICT, read_config

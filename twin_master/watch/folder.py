@@ -22,9 +22,8 @@ from twin_master.mission.journal import (
     read_lines,
     records_backwards,
 )
-from twin_master.mission.kept_knowledge import keep_knowledge, share_knowledge
 from twin_master.mission.loop import Source, operate
-from twin_master.mission.preparation import prepare_knowledge
+from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
@@ -32,11 +31,9 @@ from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
-from twin_master.watch.decision import journalled_decision
-from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
+from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping
 from twin_master.watch.keeping import Keeper, Standing
-from twin_master.watch.replay import BelievedModel, replay
-from twin_master.watch.stopping import Stopping
+from twin_master.watch.replay import BelievedModel, journalled_decision, replay
 from twin_master.watch.teaching import (
     LEAST_GAIN,
     TRIAL_TURNS,

@@ -32,8 +32,7 @@ from twin_master.network.twin import Twin
 from twin_master.report.view import printed_state
 from twin_master.scenario.schema import Scenario
 from twin_master.store.summary import policy_switch
-from twin_master.watch.decision import gap_of
-from twin_master.watch.replay import BelievedModel, replay
+from twin_master.watch.replay import BelievedModel, gap_of, replay
 
 COURTESY = 10
 """Niceness of what is worked out beside a watch: the watch comes first."""

@@ -15,7 +15,7 @@ import xarray as xr
 from fmu_asset.errors import FmuError, FmuFileError
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides
-from twin_master.mission.checkpoint import open_checkpoint
+from twin_master.mission.loop import open_checkpoint
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario
 from twin_master.workflow import new_run, resume_run

@@ -19,8 +19,8 @@ from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet, seed_range
 from twin_master.fleet.reading import Estimated, fleet_groups, group_figures
 from twin_master.fleet.store import FleetStore
-from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.mission.loop import fly
+from twin_master.mission.preparation import kept_knowledge
 from twin_master.workflow import new_run
 from uav_twin.cli import app
 

@@ -28,7 +28,7 @@ from twin_master.fleet.posterior import (
 )
 from twin_master.fleet.reading import attention, fleet_groups
 from twin_master.fleet.report import write_fleet_report
-from twin_master.mission.kept_knowledge import kept_knowledge
+from twin_master.mission.preparation import kept_knowledge
 from twin_master.network.inference import filter_sequence
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model

@@ -22,7 +22,7 @@ from twin_master.report.page import render_page
 from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.reading import load_scenario
 from twin_master.viewer.flight import Flight
-from twin_master.watch.decision import gap_of
+from twin_master.watch.replay import gap_of
 from twin_master.workflow import resume_run
 from uav_twin.cli import app
 

@@ -24,7 +24,6 @@ from twin_master.errors import FleetError, PlanningError, ScenarioError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
 from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator
-from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
     decision_problem,
@@ -34,7 +33,13 @@ from twin_master.mission.planning import (
     risk_of,
     write_policy,
 )
-from twin_master.mission.preparation import Knowledge, knowledge_of, prepare_knowledge
+from twin_master.mission.preparation import (
+    Knowledge,
+    keep_knowledge,
+    kept_knowledge,
+    knowledge_of,
+    prepare_knowledge,
+)
 from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.network.estimator import Carried, Estimator, ExactFilter
 from twin_master.network.planner import BeliefPolicy

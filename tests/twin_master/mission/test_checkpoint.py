@@ -11,10 +11,9 @@ import pytest
 
 from reporting.errors import DiskFullError
 from twin_master.errors import NotResumableError
-from twin_master.mission import checkpoint
-from twin_master.mission.checkpoint import open_checkpoint
+from twin_master.mission import loop as checkpoint
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.loop import Checkpoint
+from twin_master.mission.loop import Checkpoint, open_checkpoint
 from twin_master.mission.turns import Happened, Reading, Turn
 from twin_master.network.inference import Predicted
 from twin_master.network.twin import TwinTurn

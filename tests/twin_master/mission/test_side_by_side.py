@@ -14,8 +14,8 @@ from twin_master.assets.interface import AssetReading, StatelessAsset
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import AssetOutputError
-from twin_master.fleet.outcome import ENDED, FLOWN, in_credible_set, outcomes_of
 from twin_master.fleet.plan import Member
+from twin_master.fleet.store import ENDED, FLOWN, in_credible_set, outcomes_of
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side

@@ -27,7 +27,7 @@ from twin_master.watch.broker import PASSWORD_VARIABLE, Broker, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import MqttFeed
-from twin_master.watch.snapshot import flown
+from twin_master.watch.opening import flown
 from uav_twin.cli import app
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches

@@ -28,7 +28,7 @@ from tests.discrepancy.rigs import ORIGIN
 from tests.twin_master.watch.watches import lines, watchful
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
+from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.mission.turns import History
 from twin_master.network.inference import known_control
 from twin_master.viewer.flight import Flight as SeenFlight

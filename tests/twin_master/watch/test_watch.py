@@ -32,14 +32,12 @@ from twin_master.network.estimator import ExactFilter
 from twin_master.report.reading import open_run as stored_run
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.viewer.flight import Flight as SeenFlight
-from twin_master.watch.decision import journalled_decision
 from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, file_feed
 from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.message import Message
-from twin_master.watch.opening import resume_watch
-from twin_master.watch.replay import BelievedModel
-from twin_master.watch.snapshot import flown
+from twin_master.watch.opening import flown, resume_watch
+from twin_master.watch.replay import BelievedModel, journalled_decision
 from uav_twin.cli import app
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
