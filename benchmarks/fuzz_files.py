@@ -118,11 +118,11 @@ def _run(folder: Path) -> None:
 
 def _checkpoint(folder: Path) -> None:
     from tests.twin_master.mission.test_checkpoint import flown
-    from twin_master.mission.loop import open_checkpoint
+    from twin_master.mission.loop import CheckpointFile
 
     place = folder / "checkpoint"
     place.mkdir()
-    with open_checkpoint(place, CONFIG_HASH) as file:
+    with CheckpointFile(place, CONFIG_HASH) as file:
         for turn, state in flown(4):
             file.keep(turn, state)
 

@@ -20,7 +20,7 @@ from twin_master.assets.mismatch import Misfit, find_misfit
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.loop import fly, open_checkpoint
+from twin_master.mission.loop import CheckpointFile, fly
 from twin_master.mission.opening import begin_folder, file_record, restore, resume_folder
 from twin_master.mission.planning import read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
@@ -292,7 +292,7 @@ def _fly(
     truth = knowledge.truth(scenario.mission.seed)
     asset = source.open()
     try:
-        with open_checkpoint(folder, hash_record(config)) as kept:
+        with CheckpointFile(folder, hash_record(config)) as kept:
             flight = fly(
                 scenario,
                 knowledge.twin(),

@@ -5,7 +5,6 @@ import binascii
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -24,7 +23,6 @@ from twin_master.mission.journal import (
     belief_record,
     damaged,
     line_of,
-    open_journal,
     plain,
     read_records,
 )
@@ -168,7 +166,7 @@ States that need more are kept less often, so that the file grows with the turns
 """
 
 
-class CheckpointFile:
+class CheckpointFile(JournalFile):
     """The checkpoint of a run folder, open to be continued.
 
     Attributes
@@ -179,8 +177,8 @@ class CheckpointFile:
         Turns in the file.
     """
 
-    def __init__(self, path: Path, config_hash: str, journal: JournalFile) -> None:
-        self._journal = journal
+    def __init__(self, folder: Path, config_hash: str) -> None:
+        path = folder / JOURNAL_NAME
         readings: list[Reading] = []
         decided: list[int] = []
         whole, state, size, end = 0, "", 0, len(line_of({"config_hash": config_hash}))
@@ -202,8 +200,9 @@ class CheckpointFile:
             raise damaged(path, whole, f"it has another layout, {error}") from error
         self.turns = whole
         self.checkpoint = Checkpoint(readings[:whole], decided[:whole], content) if whole else None
+        super().__init__(folder, config_hash)
         if whole < len(readings):  # without the state of the asset they are flown again
-            journal.truncate(end)
+            self.truncate(end)
 
     def keep(self, turn: Turn, asset_state: bytes) -> None:
         """Add a turn; it is on the disk when this returns.
@@ -220,7 +219,7 @@ class CheckpointFile:
         if self._state_bytes + len(state or "") > STATE_ALLOWANCE + STATE_SHARE * self.turns:
             state = None
         self._state_bytes += len(state or "")
-        self._journal.append(
+        self.append(
             {
                 "turn": self.turns - 1,
                 "control_index": turn.concluded.control_index,
@@ -233,28 +232,6 @@ class CheckpointFile:
                 **belief_record(turn.concluded),
             }
         )
-
-
-@contextmanager
-def open_checkpoint(folder: Path, config_hash: str) -> Iterator[CheckpointFile]:
-    """Open the checkpoint of a run folder, to be read and continued.
-
-    Parameters
-    ----------
-    folder
-        The run folder, held by this process.
-    config_hash
-        SHA-256 of the configuration that the mission belongs to.
-
-    Raises
-    ------
-    NotResumableError
-        The journal was changed or is damaged, or belongs to another configuration.
-    FileNotWrittenError
-        The disk is full or the folder cannot be written.
-    """
-    with open_journal(folder, config_hash) as journal:
-        yield CheckpointFile(folder / JOURNAL_NAME, config_hash, journal)
 
 
 def _reading(record: dict[str, Any]) -> Reading:

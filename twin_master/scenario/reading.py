@@ -151,7 +151,9 @@ def _sentence(error: Mapping[str, Any], table: Mapping[str, Any]) -> str:
     where, value = _written(location, table)
     if kind == "unknown_key":
         return f"unknown key `{where}`; the keys known there are {error['ctx']['told']}."
-    if kind == "missing_key":
+    if kind == "missing":
+        return f"`{where}` is missing."
+    if kind == "missing_key":  # which may carry a unit
         return f"`{where.removesuffix(str(location[-1]))}{error['ctx']['told']}` is missing."
     if kind == "value_error":
         return f"{error['ctx']['error']}{f' (in `{where}`)' if where else ''}."

@@ -97,7 +97,7 @@ class Section(BaseModel):
             for key, (base, _) in given.items()
             if base not in known
         ]
-        required = [name for name, field in cls.model_fields.items() if field.is_required()]
+        required = [name for name in cls.units if cls.model_fields[name].is_required()]
         wrong += [
             _wrong_key("missing_key", name, known[name], table) for name in required if name not in bases
         ]

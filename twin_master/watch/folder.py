@@ -18,7 +18,6 @@ from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
     last_turn,
-    open_journal,
     read_lines,
     records_backwards,
 )
@@ -177,7 +176,7 @@ class Watch:
         """Give the open journal, and what keeps the turns of the twin as it stands after it; see `run`."""
         rejected = RejectedFile(self.folder / REJECTED_NAME)
         intake = Intake(self.scenario, feed, rejected)
-        with open_journal(self.folder, self._hash, FLUSH_SECONDS if feed.replayable else 0.0) as journal:
+        with JournalFile(self.folder, self._hash, FLUSH_SECONDS if feed.replayable else 0.0) as journal:
             self._take_up()
             if patched is not None:
                 self._patch(journal, patched)

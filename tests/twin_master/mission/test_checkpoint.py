@@ -13,7 +13,7 @@ from reporting.errors import DiskFullError
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop as checkpoint
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.loop import Checkpoint, open_checkpoint
+from twin_master.mission.loop import Checkpoint, CheckpointFile
 from twin_master.mission.turns import Happened, Reading, Turn
 from twin_master.network.inference import Predicted
 from twin_master.network.twin import TwinTurn
@@ -37,14 +37,14 @@ def flown(count: int) -> list[tuple[Turn, bytes]]:
 
 
 def write(folder: Path, turns: list[tuple[Turn, bytes]]) -> bytes:
-    with open_checkpoint(folder, "abc") as file:
+    with CheckpointFile(folder, "abc") as file:
         for turn in turns:
             file.keep(*turn)
     return (folder / JOURNAL_NAME).read_bytes()
 
 
 def read(folder: Path, config_hash: str = "abc") -> Checkpoint | None:
-    with open_checkpoint(folder, config_hash) as file:
+    with CheckpointFile(folder, config_hash) as file:
         return file.checkpoint
 
 
@@ -75,7 +75,7 @@ def test_a_line_cut_off_anywhere_is_flown_again(tmp_path: Path) -> None:
     for cut in [0, 1, ends[0] - 1, ends[0], ends[0] + 70, ends[1] - 1, ends[1], ends[3] + 1, ends[4] - 1]:
         (tmp_path / JOURNAL_NAME).write_bytes(whole[:cut])
         left = sum(end <= cut for end in ends[1:])
-        with open_checkpoint(tmp_path, "abc") as file:
+        with CheckpointFile(tmp_path, "abc") as file:
             assert file.turns == left
             for turn in turns[left:]:
                 file.keep(*turn)
@@ -115,7 +115,7 @@ def test_large_states_are_kept_less_often_and_their_turns_flown_again(
     found = read(tmp_path)
     assert found is not None
     assert len(found.readings) == 10
-    with open_checkpoint(tmp_path, "abc") as file:
+    with CheckpointFile(tmp_path, "abc") as file:
         for turn in turns[10:]:
             file.keep(*turn)
     assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
@@ -127,7 +127,7 @@ def test_a_full_disk_leaves_the_turns_before(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
-        with open_checkpoint(tmp_path, "abc") as file:
+        with CheckpointFile(tmp_path, "abc") as file:
             resource.setrlimit(resource.RLIMIT_FSIZE, (size + 50, hard))
             with pytest.raises(DiskFullError, match="No space is left"):
                 file.keep(*turns[2])
