@@ -286,8 +286,9 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
             raise FleetError(f'no file fits `{key}s = "{pattern}"` in {folder}.')
         scenarios, wrong = [], []
         for file in found:
+            own: dict[str, Any] = {key: file}
             try:
-                scenarios.append(resolve_scenario(loaded, replace(common, **{key: file})))
+                scenarios.append(resolve_scenario(loaded, replace(common, **own)))
             except TwinMasterError as error:
                 wrong.append(f"{file.name}: {error}")
         if wrong:
