@@ -31,10 +31,10 @@ def run() -> list[Measurement]:
     knowledge, asset = prepare_knowledge(scenario, source, 0), source.open()
     truths = [knowledge.truth(seed) for seed in range(TWINS)]
     turns = TWINS * scenario.mission.steps
-    fly_one_by_one(knowledge, truths[:1], [asset])  # compiles
+    fly_one_by_one(knowledge, truths[:1], lambda *_: asset)  # compiles
     flown = fly_side_by_side(knowledge, truths, [asset] * TWINS)
     together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS)) / turns
-    alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], [asset] * ALONE))
+    alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], lambda *_: asset))
     alone /= ALONE * scenario.mission.steps
     seen = flown.observed, flown.control_index
     sensors = knowledge.sensor_model

@@ -8,8 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from fe.wing.design import SHIPPED_DESIGN, load_design
 from scenarios import binding_files, scenario_files
@@ -119,15 +117,14 @@ def _run(folder: Path) -> None:
 
 
 def _checkpoint(folder: Path) -> None:
-    from twin_master.mission.checkpoint import FlownTurn, open_checkpoint
+    from tests.twin_master.mission.test_checkpoint import flown
+    from twin_master.mission.loop import CheckpointFile
 
     place = folder / "checkpoint"
     place.mkdir()
-    generator = np.random.default_rng(1)
-    with open_checkpoint(place, CONFIG_HASH) as file:
-        for _ in range(4):
-            observed = generator.normal(size=24)
-            file.keep(FlownTurn(1, 0, observed, observed[:2], observed, {"rounds": 2.0}, b"state" * 20))
+    with CheckpointFile(place, CONFIG_HASH) as file:
+        for turn, state in flown(4):
+            file.keep(turn, state)
 
 
 def _static(folder: Path) -> None:

@@ -52,13 +52,12 @@ from fmu_asset.ssp.reader import read_ssp
 from scenarios import binding_files
 from twin_master.assets.observation_library import load_observation_library
 from twin_master.assets.strain_library import load_strain_library
-from twin_master.mission.checkpoint import open_checkpoint
+from twin_master.mission.loop import CheckpointFile
 from twin_master.report.reading import read_run as read_record
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario_check import check_scenario
-from twin_master.store.outcome import finished_run
-from twin_master.store.writing import read_run
+from twin_master.store.writing import finished_run, read_run
 
 CPU_SECONDS = 20
 MEMORY = 4 * 1024**3
@@ -87,7 +86,7 @@ class Loader:
 
 
 def _checkpoint(path: Path) -> None:
-    with open_checkpoint(path.parent, CONFIG_HASH):
+    with CheckpointFile(path.parent, CONFIG_HASH):
         pass
 
 

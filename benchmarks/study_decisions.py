@@ -65,7 +65,7 @@ def flown(
     for seed in seeds:
         asset = spoiled(source.open(), partial(fault, seed))
         flight = fly(scenario, knowledge.twin(lag=1), knowledge.plant(knowledge.truth(seed), asset))
-        state = flight.happened.state
+        state = flight.state
         error = flight.filtered @ knowledge.model.states.coordinates - state
         squares.append(np.mean(error[BEGINS:] ** 2, axis=0))
         beyond = beyond_the_limit(flight.control_index == sharp, state[:, 0])

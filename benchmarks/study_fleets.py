@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from fe.reduction.model_cache import reduced_model
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.evidence import Worsening, scaled_likelihood, transition_evidence
-from twin_master.fleet.outcome import outcomes_of
 from twin_master.fleet.plan import Member
 from twin_master.fleet.posterior import Grid, refined, shared
+from twin_master.fleet.store import outcomes_of
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.inference import predict

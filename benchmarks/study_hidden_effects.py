@@ -55,7 +55,7 @@ from twin_master.assets.resolution import (
     portable_scenario,
     resolve_scenario,
 )
-from twin_master.fleet.outcome import in_credible_set
+from twin_master.fleet.store import in_credible_set
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.run_folder import create_run_folder
@@ -214,17 +214,13 @@ def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Fl
         units = asset.units
     finally:
         asset.close()
-    result = MissionResult(
-        scenario=scenario, model=knowledge.model, sensor_model=knowledge.sensor_model,
-        draws=knowledge.draws.values, rewards=knowledge.rewards, plan=knowledge.plan, truth=truth,
-        flight=flight, units=units,
-    )  # fmt: skip
+    result = MissionResult(scenario, knowledge, flight, truth, units)
     attributes = {
         "title": scenario.mission.title, "scenario": scenario.mission.name, "seed": seed,
         "parameter": knowledge.draws.name,
     }  # fmt: skip
     store_mission(folder, result, attributes)
-    state = flight.truth.state
+    state = flight.state
     error = flight.filtered @ knowledge.model.states.coordinates - state
     held = in_credible_set(knowledge.model, flight.filtered, state, 0.9)
     sharp = flight.control_index == scenario.control_names.index("3g")

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.seeds import outcomes
 from fe.full.operators import assemble
 from fe.full.statics import solve_static
 from fe.reduction.model_cache import reduced_model
@@ -71,8 +72,9 @@ def with_factor(scenario: Scenario, wing: ReducedModel, e: float) -> ReducedMode
 
 def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
     """Fly one mission with each wing."""
-    scenario, flights, covered, errors, seconds = knowledge.scenario, [], [], [], 0.0
-    for seed in seeds:
+    scenario, covered, errors, seconds = knowledge.scenario, [], [], 0.0
+    flights = Flights.empty(knowledge, len(seeds))
+    for number, seed in enumerate(seeds):
         e = factor_of(scenario, seed)
         asset = with_factor(scenario, wing, e).open()
         twin = knowledge.twin()
@@ -80,7 +82,7 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
         begin = time.process_time()
         flight = fly(scenario, twin, plant)
         seconds += time.process_time() - begin
-        flights.append(Flights.of(knowledge, flight))
+        flights.put(number, flight)
         # What was learnt at the end: the belief is pure, so the last turn can be asked again.
         learnt = twin.revise(twin.turns - 1, twin.observed(twin.turns - 1)).learnt
         if scenario.calibration.parameter in learnt:
@@ -91,9 +93,7 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
     spread = float(np.sqrt(share * (1.0 - share) / max(len(covered), 1)))
     root = float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
     per_turn = seconds / (len(seeds) * scenario.mission.steps)
-    return Result(
-        Outcomes.flown(knowledge, Flights.joined(flights)), Estimated(share, spread), root, per_turn
-    )
+    return Result(outcomes(knowledge, flights), Estimated(share, spread), root, per_turn)
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def fly_for_alarms(
             named.append(said is not None and "no state" in said.sentence)
         else:
             named.append(said is not None and said.sensors == (gauge + 1,))
-        shown = flight.happened.observation
+        shown = flight.observation
         healthy = shown / np.array([fault(seed, turn) for turn in range(len(shown))])
         gained = ((flight.observed - healthy) ** 2 - (flight.observed - shown) ** 2) / (
             2.0 * np.square(noise)

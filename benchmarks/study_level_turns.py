@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.seeds import fly_seeds, outcomes
 from fe.runtime.reduced import ReducedModel
 from reporting.progress import RichProgress
 from twin_master.assets.asset_source import AssetSource, PairedSource
@@ -34,7 +35,7 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
-from twin_master.fleet.reading import Estimated, Outcomes, fly_seeds
+from twin_master.fleet.reading import Estimated, Outcomes
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.network.graphical_model import GraphicalModel
@@ -218,7 +219,7 @@ def fly_own_wings(
     chosen = np.random.default_rng(seeds[0]).integers(len(knowledge.draws.values), size=len(seeds))
     assets = [wing(knowledge.draws, index).open() for index in chosen.tolist()]
     truths = [knowledge.truth(seed) for seed in seeds]
-    return Outcomes.flown(knowledge, fly_side_by_side(knowledge, truths, assets))
+    return outcomes(knowledge, fly_side_by_side(knowledge, truths, assets))
 
 
 def library_wings(scenario: Scenario, folder: Path) -> Callable[[ParameterDraws, int], AssetSource]:

@@ -17,13 +17,13 @@ from scipy.linalg import qr
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.outcome import outcomes_of
 from twin_master.fleet.plan import Member
+from twin_master.fleet.store import outcomes_of
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.sensor_design import chosen_sensors, drawn_readings
 from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.scenario.reading import load_scenario
-from twin_master.scenario.truth import SensorFault
+from twin_master.scenario.tables import SensorFault
 
 COUNT = 8
 RANDOM = 5

@@ -187,13 +187,13 @@ def synthetic_library() -> dict[str, object]:
 @pytest.fixture
 def die_after_turn() -> Callable[..., None]:
     """Let runs die when a turn was put on the disk: `die_after_turn(monkeypatch, number of turns, error)`."""
-    from twin_master.mission.checkpoint import CheckpointFile, FlownTurn
+    from twin_master.mission.loop import CheckpointFile
 
     def install(patch: pytest.MonkeyPatch, turns: int, error: BaseException | None = None) -> None:
         keep = CheckpointFile.keep
 
-        def dying(self: CheckpointFile, turn: FlownTurn) -> None:
-            keep(self, turn)
+        def dying(self: CheckpointFile, *turn: Any) -> None:
+            keep(self, *turn)
             if self.turns == turns:
                 raise error or KeyboardInterrupt
 

@@ -2,18 +2,18 @@
 
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from reporting import terminal
-from twin_master.fleet.command import Cluster, Workers, engine_of, run_ensemble
+from twin_master.fleet.command import Cluster, Workers, engine_of, fly_and_show
 from twin_master.viewer.command import View, shown
 
 if TYPE_CHECKING:
-    from twin_master.store.outcome import RunOutcome
-    from twin_master.workflow import Begun
+    from twin_master.store.writing import RunOutcome
 
 
 Scenario = Annotated[
@@ -100,34 +100,30 @@ def run(
     overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt)
     told: dict[str, Any] = {"progress": terminal.progress(), "report": not no_report}
     if seeds is not None:
+        from twin_master.fleet.plan import ensemble, seed_range
+
         chosen = _alone(scenario, resume is not None or seed is not None or view or policy is not None)
-        engine = engine_of(workers, cluster)
-        run_ensemble(chosen, seeds, out, overrides, engine, replace=replace, report=not no_report, json=json)
+        fleet, engine = ensemble(chosen, seed_range(seeds), overrides), engine_of(workers, cluster)
+        fly_and_show(fleet, out, engine, replace=replace, report=not no_report, json=json)
         return
     if workers is not None or cluster is not None:
         given = "--workers" if cluster is None else "--cluster"
         raise typer.BadParameter("belongs to --seeds: one mission flies alone.", param_hint=given)
+    loaded = None if scenario is None else load_scenario(scenario)
     if resume is not None:
         if out is not None or replace or policy is not None or overrides != Overrides():
             raise typer.BadParameter(
                 "a run is continued with what its folder holds: give nothing beside it that would change it.",
                 param_hint="--resume",
             )
-        folder, loaded = resume, None if scenario is None else load_scenario(scenario)
-
-        def fly(begun: "Begun | None") -> "RunOutcome":
-            return resume_run(resume, loaded, begun=begun, **told)
+        folder, fly = resume, partial(resume_run, resume, loaded)
     else:
-        if scenario is None:
+        if loaded is None:
             raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
-        loaded = load_scenario(scenario)
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
-
-        def fly(begun: "Begun | None") -> "RunOutcome":
-            return new_run(loaded, folder, overrides, policy=policy, replace=replace, begun=begun, **told)
-
+        fly = partial(new_run, loaded, folder, overrides, policy=policy, replace=replace)
     with shown(view) as begun:
-        outcome = _interruptible(lambda: fly(begun), folder)
+        outcome = _interruptible(lambda: fly(begun=begun, **told), folder)
         if json:
             terminal.print_json(_record(outcome))
         else:
@@ -181,26 +177,22 @@ def _interruptible(fly: "Callable[[], RunOutcome]", folder: Path) -> "RunOutcome
 
 def show_outcome(outcome: "RunOutcome") -> None:
     """Print the figures of a run beside their references, and where the report is."""
-    from rich import box
-    from rich.table import Table
-
     console = terminal.console()
     referred = any(figure.reference is not None for figure in outcome.figures)
-    headings = ("figure", "this run", "reference") if referred else ("figure", "this run")
-    table = Table(*headings, box=box.SIMPLE_HEAD)
+    rows: list[list[str]] = []
     sources: dict[str, int] = {}
     for figure in outcome.figures:
         reference = _shown(figure.reference, figure.unit)
         if figure.reference_source:
             reference += f" ({sources.setdefault(figure.reference_source, len(sources) + 1)})"
-        table.add_row(figure.title, _shown(figure.value, figure.unit, "none"), *[reference] * referred)
+        rows.append([figure.title, _shown(figure.value, figure.unit, "none"), *[reference] * referred])
     for part in ("asset", "twin", "checkpoint"):
         entry = outcome.timing.get(f"{part}_seconds")
         if entry:
             median, largest = 1e3 * entry["median"], 1e3 * entry["largest"]
-            table.add_row(f"{part}, per {outcome.step_name}", f"{median:.3g} ms (largest {largest:.3g} ms)")
-    table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s")
-    console.print(table)
+            rows.append([f"{part}, per {outcome.step_name}", f"{median:.3g} ms (largest {largest:.3g} ms)"])
+    rows.append(["whole run", f"{outcome.timing['total_seconds']:.3g} s"])
+    terminal.print_table(["figure", "this run", *["reference"] * referred], rows)
     console.print(f"The twin {outcome.control}.", soft_wrap=True)
     if outcome.origin.differ:
         console.print(

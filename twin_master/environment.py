@@ -18,8 +18,8 @@ from twin_master.assets.interface import Asset
 from twin_master.assets.resolution import Overrides, given_overrides, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.fleet.flight import source_of
-from twin_master.mission.plant import Plant
 from twin_master.mission.preparation import prepare_knowledge
+from twin_master.mission.truth import Plant
 from twin_master.network.rewards import health_reward
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 
@@ -163,11 +163,12 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
 
     def _fly(self, control: int, before: int | None) -> tuple[Float, float, dict[str, Any]]:
         assert self._plant is not None
-        sensed = self._plant.turn(control, before)
-        state, shown, _ = self._plant.latest()
+        reading = self._plant.turn(control, before)
+        sensed, happened = reading.observed, reading.happened
+        assert happened is not None
         settings, weights = self.knowledge.rewards.settings, self.scenario.rewards
         chosen = slice(None) if settings.health_sensors is None else list(settings.health_sensors)
-        health = float(health_reward(shown[chosen], settings.limit))
+        health = float(health_reward(happened.observation[chosen], settings.limit))
         worth = settings.control_reward[control]
         reward = weights.health_weight * health + weights.control_weight * worth
         info = {
@@ -175,7 +176,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
             "control": control,
             "step": self._step,
             "seed": self._seed,
-            "state": dict(zip(self.scenario.state_names, state.tolist(), strict=True)),
+            "state": dict(zip(self.scenario.state_names, happened.state.tolist(), strict=True)),
             "reward_health": health,
             "reward_control": worth,
         }

@@ -2,29 +2,6 @@
 
 from collections.abc import Collection, Iterable, Mapping
 
-__all__ = [
-    "AssetOutputError",
-    "FleetError",
-    "ImpossibleObservation",
-    "InvalidDistributionError",
-    "InvalidModelError",
-    "InvalidObservationError",
-    "InvalidObservationLibraryError",
-    "InvalidStrainLibraryError",
-    "MissingObservationModelError",
-    "MissionError",
-    "MissionInputError",
-    "NotResumableError",
-    "PlanningError",
-    "RunFolderError",
-    "RunFolderExistsError",
-    "ScenarioError",
-    "TwinMasterError",
-    "UnknownScenarioError",
-    "ViewError",
-    "check_names",
-]
-
 
 class TwinMasterError(Exception):
     """Any failure of `twin_master` that has a cause which the user can act upon."""

@@ -1,7 +1,7 @@
 """`uav-twin plan` and `uav-twin design`: what is decided by the belief, what it is worth, what tells most."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,15 +32,6 @@ ValueOf = Annotated[
 ]
 
 
-@dataclass(frozen=True)
-class _Planned:
-    """A plan, what it was made for, and what it brings."""
-
-    problem: "DecisionProblem"
-    plan: "BeliefPlan"
-    promised: "ComparedPolicy"
-
-
 def plan(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A shipped scenario, or a TOML file.")],
     out: Annotated[
@@ -59,8 +50,7 @@ def plan(
     from twin_master.report.plan import plan_figure
 
     knowledge, _ = _knowledge(scenario, seed, calibration)
-    found = _planned(knowledge)
-    plan, promised = found.plan, found.promised
+    problem, plan, promised = _planned(knowledge)
     if out is not None:
         write_policy(out, plan.policy, knowledge.model)
     if picture is not None:
@@ -70,11 +60,11 @@ def plan(
         "upper": plan.upper,
         "simulated": promised.mean,
         "half_width": promised.half_width,
-        "beyond_limit": risk_of(knowledge.scenario, found.problem, knowledge.rewards, plan.policy),
+        "beyond_limit": risk_of(knowledge.scenario, problem, knowledge.rewards, plan.policy),
     }
-    rows = [promised, *([] if value_of else compared(knowledge.scenario, found.problem))]
+    rows = [promised, *([] if value_of else compared(knowledge.scenario, problem))]
     if value_of is not None:
-        without = _planned(_without(knowledge, [value_of])).promised
+        without = _planned(_without(knowledge, [value_of]))[2]
         worth = promised.beyond(without)
         rows.append(replace(without, name=f"planned without {value_of}"))
         record["value"] = {"of": value_of, "mean": worth.mean, "half_width": worth.half_width}
@@ -108,13 +98,14 @@ def _knowledge(
     return replace(found, scenario=unplanned.model_copy(update={"planner": planner})), places
 
 
-def _planned(knowledge: "Knowledge") -> _Planned:
+def _planned(knowledge: "Knowledge") -> "tuple[DecisionProblem, BeliefPlan, ComparedPolicy]":
+    """Return what is decided on, the plan, and what it promises."""
     from twin_master.mission.planning import decision_problem, expected_plan, promised
 
     scenario, rewards = knowledge.scenario, knowledge.rewards
     problem = decision_problem(scenario, knowledge.model, knowledge.sensor_model, rewards)
     plan = expected_plan(scenario, problem, rewards)[0]
-    return _Planned(problem, plan, promised(scenario, problem, plan.policy))
+    return problem, plan, promised(scenario, problem, plan.policy)
 
 
 def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
@@ -167,13 +158,8 @@ def _draw(path: Path, figure: "Figure") -> None:
 
 
 def _show(record: Mapping[str, Any], rows: "list[ComparedPolicy]") -> None:
-    from rich import box
-    from rich.table import Table
-
-    table = Table("rule", "expected return", "± (95 %)", box=box.SIMPLE_HEAD)
-    for row in rows:
-        table.add_row(row.name, f"{row.mean:.4g}", f"{row.half_width:.2g}")
-    terminal.console().print(table)
+    told = [(row.name, f"{row.mean:.4g}", f"{row.half_width:.2g}") for row in rows]
+    terminal.print_table(("rule", "expected return", "± (95 %)"), told)
     lower, upper = record["lower"], record["upper"]
     terminal.say(f"Bounds of the return: {lower:.5g} to {upper:.5g}, a gap of {upper - lower:.2g}.")
     terminal.say(f"Beyond a health limit: {100.0 * record['beyond_limit']:.2g} % of the turns, discounted.")
@@ -227,7 +213,7 @@ def design(
     if worth:
         others = [title for title in titles if title not in names]
         rest = [title for title in titles if title not in wanted]
-        few, every = (_planned(_without(knowledge, some)).promised for some in (others, rest))
+        few, every = (_planned(_without(knowledge, some))[2] for some in (others, rest))
         compared = {"chosen": few, "all": every, "all beyond chosen": every.beyond(few)}
         record["worth"] = {what: [one.mean, one.half_width] for what, one in compared.items()}
     _draw_design(picture, vtu, places, record, found.sensors)

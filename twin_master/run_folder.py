@@ -91,7 +91,8 @@ def create_run_folder(
         )
     held = lock_run_folder(folder) if occupied else None
     try:
-        fresh, lock = _fresh_folder(folder)
+        fresh = fresh_folder(folder)
+        lock = lock_run_folder(fresh)
         try:
             for name, content in (files or {}).items():
                 atomic_write_bytes(fresh / name, content)
@@ -110,12 +111,6 @@ def create_run_folder(
         if held is not None:
             os.close(held)
     return lock
-
-
-def _fresh_folder(folder: Path) -> tuple[Path, int]:
-    """Return an empty folder beside the one to be, held by this process."""
-    fresh = fresh_folder(folder)
-    return fresh, lock_run_folder(fresh)
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -144,11 +139,6 @@ def read_config(folder: Path) -> dict[str, Any]:
             f"{folder / CONFIG_NAME} is damaged, `inputs` is no table: fly the mission again with --replace."
         )
     return config
-
-
-def write_config(folder: Path, config: Mapping[str, Any]) -> None:
-    """Replace the configuration of a run folder in one step."""
-    atomic_write_text(folder / CONFIG_NAME, to_json(config))
 
 
 def lock_run_folder(folder: Path) -> int:
@@ -190,21 +180,15 @@ def check_versions(folder: Path, config: Mapping[str, Any], seed: int) -> None:
     recorded = config["provenance"]
     now = collect_provenance(seed).as_dict()
     for what in ("versions", "source_hashes"):
-        changed = sorted(
-            name
-            for name, value in now[what].items()
-            if name not in HARMLESS_PACKAGES and _entry(recorded, what, name) != value
-        )
+        known = recorded.get(what)
+        known = known if isinstance(known, dict) else {}
+        another = {name for name, value in now[what].items() if known.get(name) != value}
+        changed = sorted(another - HARMLESS_PACKAGES)
         if changed:
             raise NotResumableError(
                 f"{folder} was begun with another version of {', '.join(changed)}, so its results could not "
                 "be the same: fly the mission again with --replace."
             )
-
-
-def _entry(record: Mapping[str, Any], table: str, name: str) -> object:
-    entries = record.get(table)
-    return entries.get(name) if isinstance(entries, dict) else None
 
 
 def with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str]) -> dict[str, Any]:
@@ -224,5 +208,5 @@ def with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str])
         )
     if recorded is None:
         config = {**config, "inputs": dict(hashes)}
-        write_config(folder, config)
+        atomic_write_text(folder / CONFIG_NAME, to_json(config))
     return config

@@ -79,8 +79,8 @@ def watch(
     The same scenario as for a simulated mission; its tables `asset` and `truth` are not needed. Everything is
     kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up again.
     """
-    from twin_master.store.outcome import REPORT_NAME
-    from twin_master.watch import from_python
+    from twin_master.store.writing import REPORT_NAME
+    from twin_master.watch import opening as from_python
     from twin_master.watch.broker import is_broker
     from twin_master.watch.folder import Watch
 

@@ -1,7 +1,6 @@
 """The whole chain: design -> reduced model -> FMU -> calibration -> mission -> store -> report."""
 
 import io
-import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -14,49 +13,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.files import atomic_write_text
-from reporting.folders import restore_folder
 from reporting.progress import Progress, SilentProgress
-from reporting.provenance import collect_provenance, hash_file, hash_record
+from reporting.provenance import hash_file, hash_record
 from twin_master.assets.asset_source import AssetSource, calibrated_with
 from twin_master.assets.mismatch import Misfit, find_misfit
-from twin_master.assets.resolution import (
-    Overrides,
-    asset_source,
-    given_overrides,
-    located_scenario,
-    portable_scenario,
-    resolve_scenario,
-)
+from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import NotResumableError
-from twin_master.mission.checkpoint import open_checkpoint
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.kept_knowledge import keep_knowledge
-from twin_master.mission.loop import Flight, fly
+from twin_master.mission.loop import CheckpointFile, fly
+from twin_master.mission.opening import begin_folder, file_record, restore, resume_folder
 from twin_master.mission.planning import read_policy
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
+from twin_master.mission.turns import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
-from twin_master.run_folder import (
-    CONFIG_NAME,
-    KIND,
-    check_versions,
-    create_run_folder,
-    lock_run_folder,
-    read_config,
-    tidy,
-    with_inputs,
-)
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.run_folder import check_versions, tidy, to_json, with_inputs
+from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.outcome import RunOutcome, finished_run, read_outcome
-from twin_master.store.summary import another_truth, control_changes, noticed, summarise
-from twin_master.store.writing import store_mission, write_summary, write_timing
+from twin_master.store.summary import another_truth
+from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
 
 POLICY_NAME = "policy.npy"
 """In the run folder: the policy that was given in the place of a plan, (S, U) or on the belief."""
-CALIBRATION_NAME = "calibration.json"
 
 
 Begun = Callable[[Path], None]
@@ -120,35 +99,30 @@ def new_run(
     loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
     resolved = resolve_scenario(loaded, given_overrides(overrides))
     folder = Path("runs") / resolved.mission.name if folder is None else Path(folder)
-    config = {
-        "kind": KIND,
-        "format": 1,
-        "scenario": portable_scenario(resolved).to_dict(),
-        "scenario_file": {"name": loaded.path.name, "sha256": loaded.content_hash},
-        "provenance": collect_provenance(resolved.mission.seed).as_dict(),
-    }
-    source = asset_source(resolved)
-    source.check()  # what is not there should not cost the user a folder
-    files = dict(source.files())
-    if policy is not None:
-        model = build_graphical_model(resolved)
-        on_belief = read_policy(policy, model) if isinstance(policy, Path) else policy
-        kept = io.BytesIO()
-        if isinstance(on_belief, BeliefPolicy):
-            np.savez(kept, **vars(on_belief))
-        else:
-            np.save(kept, model.policy(on_belief))
-        files[POLICY_NAME] = kept.getvalue()
     progress = progress or SilentProgress()
+    files = {} if policy is None else {POLICY_NAME: _policy_file(policy, resolved)}
     if loaded.remark:
         progress.note(loaded.remark)
-    _restore(folder, progress)
-    lock = create_run_folder(folder, config, files, replace=replace)
+    restore(folder, progress)
+    source = asset_source(resolved)
+    config, located, lock = begin_folder(
+        resolved, file_record(loaded), folder, source, files, replace=replace
+    )
     try:
-        located = located_scenario(portable_scenario(resolved), folder)
         return _run(folder, config, located, progress, begun, report=report)
     finally:
         os.close(lock)
+
+
+def _policy_file(policy: ArrayLike | BeliefPolicy | Path, scenario: Scenario) -> bytes:
+    """Return a policy as the run folder keeps it."""
+    model, kept = build_graphical_model(scenario), io.BytesIO()
+    given = read_policy(policy, model) if isinstance(policy, Path) else policy
+    if isinstance(given, BeliefPolicy):
+        np.savez(kept, **vars(given))
+    else:
+        np.save(kept, model.policy(given))
+    return kept.getvalue()
 
 
 def resume_run(
@@ -180,31 +154,17 @@ def resume_run(
         The folder holds no run, or one of another scenario or another version.
     """
     folder, progress = Path(folder), progress or SilentProgress()
-    _restore(folder, progress)
-    config = read_config(folder)
-    scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
-    file = config["scenario_file"]
-    if loaded is not None and file.get("sha256") != loaded.content_hash:
-        raise NotResumableError(
-            f"{folder} flies another scenario ({scenario.mission.name}, {file.get('name')}) "
-            f"than {loaded.path}: resume it without naming a scenario."
-        )
-    lock = lock_run_folder(folder)
+    restore(folder, progress)
+    config, scenario, lock = resume_folder(folder, loaded)
     try:
         finished = finished_run(folder)
         if finished is not None and (finished.report or not report):
             progress.note(f"The run in {folder} is finished: nothing is flown again.")
             return finished
         check_versions(folder, config, scenario.mission.seed)
-        return _run(folder, config, located_scenario(scenario, folder), progress, begun, report=report)
+        return _run(folder, config, scenario, progress, begun, report=report)
     finally:
         os.close(lock)
-
-
-def _restore(folder: Path, progress: Progress) -> None:
-    """Put back a run that a killed --replace had moved aside."""
-    if restore_folder(folder):
-        progress.note(f"A replacement of {folder} was interrupted: the run that was there is back.")
 
 
 def _run(
@@ -225,50 +185,49 @@ def _run(
         hashes = dict(source.prepare(folder, progress))
         policy = _given_policy(folder, hashes)
     config = with_inputs(folder, config, hashes)
-    timing = _fly_and_store(folder, config, scenario, source, policy, clock, progress)
+    with _unflown(folder), clock.stage("calibration"), progress.stage("Calibrating and planning"):
+        knowledge = _known(folder, config, scenario, source, policy, progress)
+    with clock.stage("mission"), _kept(folder):
+        result = _fly(folder, config, knowledge, source, progress)
+    with clock.stage("store"), progress.stage("Storing"), _kept(folder):
+        write_field = _field_writer(source, result)
+        misfit = _misfit(knowledge, source)
+        store_flight(
+            folder, config, result, source.origin, steps=scenario.mission.steps, misfit=misfit,
+            write_field=write_field,
+        )  # fmt: skip
+    timing = _timing(result.flight)
+    del knowledge, result, write_field  # before the report is drawn
     if report:
         with clock.stage("report"), progress.stage("Writing the report"), _kept(folder):
             _report(folder)
     timing |= {"stages_seconds": dict(clock.stages), "total_seconds": time.perf_counter() - clock.begin}
-    write_timing(folder, timing)
+    atomic_write_text(folder / TIMING_NAME, to_json(timing))  # the only file with figures of a clock
     return read_outcome(folder)
 
 
-def _fly_and_store(
+def _known(
     folder: Path,
     config: Mapping[str, Any],
     scenario: Scenario,
     source: AssetSource,
     policy: NDArray[np.float64] | BeliefPolicy | None,
-    clock: _Clock,
     progress: Progress,
-) -> dict[str, Any]:
-    """Return the timing of the turns; twin and mission are let go of before the report is drawn."""
-    with (
-        _unflown(folder),
-        clock.stage("calibration"),
-        progress.stage("Calibrating and planning"),
-    ):
-        knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy)
-        _tell_of_another_truth(knowledge, progress)
-        record, origin = knowledge.draws.record or {}, source.origin
-        told = calibrated_with(record, origin.asset, origin.model, config["inputs"])
-        if told is not None:
-            progress.note(told)
-        if knowledge.draws.record is not None:
-            text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
-            atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
-        keep_knowledge(folder, knowledge)
-        # Turns without observations on a twin of its own compile the inner loops before the flight.
-        compiling = knowledge.twin()
-        for _ in range(2):
-            compiling.turn(np.full(scenario.observation.count, np.nan), 0)
-        compiling.smoothed()
-    with clock.stage("mission"), _kept(folder):
-        result = _fly(folder, config, knowledge, source, progress)
-    with clock.stage("store"), progress.stage("Storing"), _kept(folder):
-        _store(folder, config, knowledge, source, result)
-    return _timing(result.flight)
+) -> Knowledge:
+    """Return what the twin knows before its flight, and keep it."""
+    knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy)
+    _tell_of_another_truth(knowledge, progress)
+    record, origin = knowledge.draws.record or {}, source.origin
+    told = calibrated_with(record, origin.asset, origin.model, config["inputs"])
+    if told is not None:
+        progress.note(told)
+    keep_knowledge(folder, knowledge)
+    # Turns without observations on a twin of its own compile the inner loops before the flight.
+    compiling = knowledge.twin()
+    for _ in range(2):
+        compiling.turn(np.full(scenario.observation.count, np.nan), 0)
+    compiling.smoothed()
+    return knowledge
 
 
 def _given_policy(folder: Path, hashes: dict[str, str]) -> NDArray[np.float64] | BeliefPolicy | None:
@@ -333,7 +292,7 @@ def _fly(
     truth = knowledge.truth(scenario.mission.seed)
     asset = source.open()
     try:
-        with open_checkpoint(folder, hash_record(config)) as kept:
+        with CheckpointFile(folder, hash_record(config)) as kept:
             flight = fly(
                 scenario,
                 knowledge.twin(),
@@ -345,48 +304,7 @@ def _fly(
         units = asset.units
     finally:
         asset.close()
-    return MissionResult(
-        scenario=scenario,
-        model=knowledge.model,
-        sensor_model=knowledge.sensor_model,
-        draws=knowledge.draws.values,
-        rewards=knowledge.rewards,
-        plan=knowledge.plan,
-        truth=truth,
-        flight=flight,
-        units=units,
-    )
-
-
-def _store(
-    folder: Path, config: Mapping[str, Any], knowledge: Knowledge, source: AssetSource, result: MissionResult
-) -> None:
-    provenance, mission = config["provenance"], knowledge.scenario.mission
-    attributes = {
-        "title": mission.title or mission.name,
-        "scenario": mission.name,
-        "seed": mission.seed,
-        "config_hash": hash_record(config),
-        "versions": json.dumps(provenance["versions"], sort_keys=True),
-        "source_hashes": json.dumps(provenance["source_hashes"], sort_keys=True),
-        "input_hashes": json.dumps(config["inputs"], sort_keys=True),
-        "observed_quantity": knowledge.scenario.observation.role,
-        "parameter": knowledge.draws.name,
-        "parameter_source": knowledge.draws.source,
-        "asset": source.origin.asset,
-        "twin_model": source.origin.model,
-    }
-    groups = store_mission(folder, result, attributes, _field_writer(knowledge, source, result))
-    figures = summarise(
-        result, knowledge.draws, groups["filtered"]["reward_mean"].values, _misfit(knowledge, source)
-    )
-    heading = {"scenario": mission.name, "title": mission.title, "seed": mission.seed, "steps": mission.steps}
-    controls = knowledge.scenario.control_names
-    said = {"control": control_changes(controls, result.flight.control_index, mission.step_name)}
-    origin = {"asset": source.origin.asset, "twin_model": source.origin.model}
-    heading |= said | origin | {"asset_and_model_differ": source.origin.differ}
-    heading |= learnt_record(result.learnt) | noticed(result)
-    write_summary(folder, figures, heading)
+    return MissionResult(scenario, knowledge, flight, truth, units)
 
 
 def _misfit(knowledge: Knowledge, source: AssetSource) -> Misfit | None:
@@ -401,33 +319,30 @@ def _misfit(knowledge: Knowledge, source: AssetSource) -> Misfit | None:
         asset.close()
 
 
-def _field_writer(
-    knowledge: Knowledge, source: AssetSource, result: MissionResult
-) -> Callable[[Path], object]:
+def _field_writer(source: AssetSource, result: MissionResult) -> Callable[[Path], object]:
     """Return what writes the field under the last estimate and the last control."""
-    flight, scenario = result.flight, knowledge.scenario
-    estimate = knowledge.model.states.mean(flight.filtered[-1]).tolist()
+    last, scenario = result.flight.turns[-1].concluded, result.scenario
+    estimate = result.knowledge.model.states.mean(last.filtered).tolist()
     # A belief that is sure of the last level may round to a little beyond it, where no model holds.
     state = {
         factor.name: min(max(value, factor.levels[0]), factor.levels[-1])
         for factor, value in zip(scenario.state, estimate, strict=True)
     }
-    control = scenario.control[int(flight.control_index[-1])].values
+    control = scenario.control[last.control_index].values
     return lambda path: source.write_field(path, state, control)
 
 
-def _timing(flight: Flight) -> dict[str, Any]:
+def _timing(flight: History) -> dict[str, Any]:
     """Return the seconds of the turns flown by this process."""
-    record: dict[str, Any] = {"resumed_at": flight.resumed_at, "turns": len(flight.timing)}
-    for name in ("asset", "twin", "checkpoint"):
-        values = np.array([getattr(turn, name) for turn in flight.timing])
-        if len(values):
-            record[f"{name}_seconds"] = {
-                "total": float(values.sum()),
-                "median": float(np.median(values)),
-                "largest": float(values.max()),
-                "last": float(values[-1]),
-            }
+    seconds = flight.seconds[flight.resumed_at :]
+    record: dict[str, Any] = {"resumed_at": flight.resumed_at, "turns": len(seconds)}
+    for name, values in zip(("asset", "twin", "checkpoint"), seconds.T if len(seconds) else (), strict=False):
+        record[f"{name}_seconds"] = {
+            "total": float(values.sum()),
+            "median": float(np.median(values)),
+            "largest": float(values.max()),
+            "last": float(values[-1]),
+        }
     return record
 
 

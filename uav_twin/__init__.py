@@ -40,8 +40,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from twin_master.network.twin import Twin
     from twin_master.report.page import report_figures, write_report
     from twin_master.scenario.reading import load_scenario
-    from twin_master.watch.from_python import watch
-    from twin_master.watch.snapshot import open_run
+    from twin_master.watch.opening import open_run, watch
     from twin_master.workflow import new_run as fly
     from twin_master.workflow import resume_run as resume
 
@@ -117,7 +116,7 @@ _HOMES = {
     "load_scenario": "twin_master.scenario.reading",
     "natural_frequencies": "fe.structure.field",
     "open_fleet": "twin_master.fleet.reading:fleet_groups",
-    "open_run": "twin_master.watch.snapshot",
+    "open_run": "twin_master.watch.opening",
     "prepare_twin": "twin_master.mission.preparation",
     "read_campaign": "discrepancy.campaign.reading",
     "read_verdict": "discrepancy.files.verdict:read_verdict_folder",
@@ -129,7 +128,7 @@ _HOMES = {
     "static_responses": "fe.structure.field",
     "structure_files": "scenarios",
     "value_iteration": "twin_master.network.planner",
-    "watch": "twin_master.watch.from_python",
+    "watch": "twin_master.watch.opening",
     "write_report": "twin_master.report.page",
 }
 """Module of each name; behind a colon what it is called there, where that differs."""

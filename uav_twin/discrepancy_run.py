@@ -139,7 +139,7 @@ def _compared(
     from discrepancy.errors import DiscrepancyError
     from discrepancy.model_choice import choice_of_run, choose_model
     from discrepancy.sources.from_run import run_campaign
-    from twin_master.watch.snapshot import flown
+    from twin_master.watch.opening import flown
 
     if from_run is None:
         assert campaign is not None

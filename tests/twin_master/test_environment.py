@@ -50,9 +50,9 @@ def test_our_policy_flies_the_mission_of_the_loop(environment: ScenarioEnvironme
             rewards.append(reward)
     np.testing.assert_array_equal(observed, flight.observed)
     np.testing.assert_array_equal(controls, flight.control_index)
-    assert info["state"] == dict(zip(scenario.state_names, flight.happened.state[-1], strict=True))
+    assert info["state"] == dict(zip(scenario.state_names, flight.state[-1], strict=True))
     section = scenario.rewards
-    worst = (flight.happened.observation / section.health_limit).max(axis=1)
+    worst = (flight.observation / section.health_limit).max(axis=1)
     worth = np.array([section.control[scenario.control_names[u]] for u in controls])
     expected = section.health_weight * (1 - worst) + section.control_weight * worth
     np.testing.assert_allclose(rewards, expected[1:], rtol=1e-14)

@@ -21,7 +21,7 @@ from twin_master.run_folder import (
     read_config,
     tidy,
 )
-from twin_master.store.outcome import finished_run
+from twin_master.store.writing import finished_run
 
 
 def make(folder: Path, name: str, *, replace: bool = False) -> None:

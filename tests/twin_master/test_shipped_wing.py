@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from benchmarks.seeds import fly_seeds
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
@@ -19,7 +20,6 @@ from fmu_asset.errors import FmuBuildError
 from twin_master import workflow
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides
-from twin_master.fleet.reading import fly_seeds
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.workflow import new_run, resume_run

@@ -30,7 +30,7 @@ from twin_master.errors import (
 from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import lock_run_folder
 from twin_master.scenario.reading import load_scenario
-from twin_master.store.outcome import RunOutcome
+from twin_master.store.writing import RunOutcome
 from twin_master.workflow import new_run, resume_run
 
 ROOT = Path(__file__).parents[2]
@@ -97,9 +97,11 @@ def test_the_field_of_a_belief_that_rounds_beyond_the_last_level() -> None:
     belief = next(b for b in (b / b.sum() for b in beliefs) if model.states.mean(b)[0] > 0.8)
     seen: dict[str, float] = {}
     source = SimpleNamespace(write_field=lambda path, state, control: seen.update(state))
-    flight = SimpleNamespace(filtered=belief[np.newaxis], control_index=np.array([0]))
-    knowledge = SimpleNamespace(scenario=scenario, model=model)
-    workflow._field_writer(knowledge, source, SimpleNamespace(flight=flight))(Path("wing.vtu"))  # type: ignore[arg-type]
+    turn = SimpleNamespace(concluded=SimpleNamespace(filtered=belief, control_index=0))
+    result = SimpleNamespace(
+        scenario=scenario, knowledge=SimpleNamespace(model=model), flight=SimpleNamespace(turns=[turn])
+    )
+    workflow._field_writer(source, result)(Path("wing.vtu"))  # type: ignore[arg-type]
     assert seen["z1"] == 0.8
     assert 0.0 < seen["z2"] < 0.8
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from twin_master.assets.parameter import check_calibration
 from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
-from twin_master.scenario.modes import ROLE
+from twin_master.scenario.observation import ROLE
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from twin_master.assets.interface import AssetReading, InnerTruth
 from twin_master.network.identified import packed_row
-from twin_master.scenario.modes import ModesSection
+from twin_master.scenario.observation import ModesSection
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import seed_sequence
 

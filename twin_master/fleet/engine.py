@@ -20,7 +20,6 @@ from twin_master.fleet.shard import ShardResult, fly_shard, program_version
 if TYPE_CHECKING:
     from distributed import Client
 
-__all__ = ["Engine", "Piece", "flown"]
 
 WAITING = 2
 """Shards that are handed out for each core beside the one that it flies; the others wait here."""

@@ -15,38 +15,9 @@ from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
-__all__ = ["Worsening", "node_evidence", "scaled_likelihood", "transition_evidence"]
-
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 Unsigned = NDArray[np.uint64]
-
-
-@compiled
-def _forward(
-    prior: Float, start: Unsigned, source: Unsigned, probability: Float, control: Index, likelihood: Float
-) -> float:
-    """Return the log evidence of one twin: likelihood (T, S) is scaled so that the largest of a row is 1."""
-    steps, size = likelihood.shape
-    belief, following = prior.copy(), np.empty(size)
-    result = 0.0
-    for t in range(steps):
-        total = 0.0
-        for state in range(size):
-            value = belief[state]
-            if t > 0:
-                row = control[t - 1] * size + state
-                value = 0.0
-                for k in range(start[row], start[row + 1]):
-                    value += belief[source[k]] * probability[k]
-            following[state] = value * likelihood[t, state]
-            total += following[state]
-        if total <= 0.0:
-            return -np.inf
-        result += np.log(total)
-        for state in range(size):
-            belief[state] = following[state] / total
-    return float(result)
 
 
 @compiled
@@ -59,37 +30,33 @@ def _on_points(
     likelihood: Float,
     result: Float,
 ) -> None:
-    """Fill result (B, P) for probabilities (P, non-zeros) of P points."""
-    for twin in range(len(control)):
+    """Fill result (B, P) with the log evidence of B twins for probabilities (P, non-zeros) of P points.
+
+    The likelihood (B, T, S) is scaled so that the largest of a row is 1.
+    """
+    twins, steps, size = likelihood.shape
+    belief, following = np.empty(size), np.empty(size)
+    for twin in range(twins):
         for point in range(len(probability)):
-            result[twin, point] = _forward(
-                prior, start, source, probability[point], control[twin], likelihood[twin]
-            )
-
-
-@compiled
-def _on_nodes(
-    prior: Float,
-    start: Unsigned,
-    source: Unsigned,
-    probability: Float,
-    control: Index,
-    exponent: Float,
-    result: Float,
-) -> None:
-    """Fill result (E,) for log densities (T, S, E) at E nodes, up to what all nodes share."""
-    steps, size, nodes = exponent.shape
-    likelihood = np.empty((steps, size))
-    for e in range(nodes):
-        common = 0.0
-        for t in range(steps):
-            best = exponent[t, 0, e]
-            for s in range(1, size):
-                best = max(best, exponent[t, s, e])
-            common += best
-            for s in range(size):
-                likelihood[t, s] = np.exp(exponent[t, s, e] - best)
-        result[e] = common + _forward(prior, start, source, probability, control, likelihood)
+            belief[:] = prior
+            result[twin, point] = 0.0
+            for t in range(steps):
+                total = 0.0
+                for state in range(size):
+                    value = belief[state]
+                    if t > 0:
+                        row = control[twin, t - 1] * size + state
+                        value = 0.0
+                        for k in range(start[row], start[row + 1]):
+                            value += belief[source[k]] * probability[point, k]
+                    following[state] = value * likelihood[twin, t, state]
+                    total += following[state]
+                if total <= 0.0:
+                    result[twin, point] = -np.inf
+                    break
+                result[twin, point] += np.log(total)
+                for state in range(size):
+                    belief[state] = following[state] / total
 
 
 @dataclass(frozen=True)
@@ -174,12 +141,13 @@ def scaled_likelihood(model: GaussianSensorModel, observed: Float, control: Inde
     observed, control
         (B, T, G), SI, NaN where lost, and (B, T).
     """
-    rows = model.log_likelihood_sequence(observed.reshape(-1, observed.shape[-1]), control.ravel()).reshape(
-        *control.shape, -1
-    )
-    best = rows.max(axis=2, keepdims=True)
-    scaled: Float = np.exp(rows - best)
-    return scaled, best.sum(axis=(1, 2))
+    rows = model.log_likelihood_sequence(observed.reshape(-1, observed.shape[-1]), control.ravel())
+    return _scaled(rows.reshape(*control.shape, -1))
+
+
+def _scaled(log_likelihood: Float) -> tuple[Float, Float]:
+    best = log_likelihood.max(axis=2, keepdims=True)
+    return np.exp(log_likelihood - best), best.sum(axis=(1, 2))
 
 
 def transition_evidence(worsening: Worsening, points: Float, likelihood: Float, control: Index) -> Float:
@@ -218,11 +186,11 @@ def node_evidence(
     observed, control
         (B, T, G), SI, NaN where lost, and (B, T).
     """
-    entries = worsening.probability(probability[None])[0]
     result = np.empty((len(control), model.draw_count))
     for twin, (seen, in_force) in enumerate(zip(observed, control, strict=True)):
-        _on_nodes(
-            worsening.prior, worsening.start, worsening.source, entries, in_force,
-            model.log_density_of_draws(seen, in_force), result[twin],
-        )  # fmt: skip
+        scaled, common = _scaled(
+            np.ascontiguousarray(np.moveaxis(model.log_density_of_draws(seen, in_force), 2, 0))
+        )
+        alike = np.tile(in_force, (model.draw_count, 1))
+        result[twin] = transition_evidence(worsening, probability[None], scaled, alike)[:, 0] + common
     return result

@@ -21,13 +21,11 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source, located_scenario, portable_scenario
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine, Piece, flown
-from twin_master.fleet.outcome import FAILED, sizes_of
 from twin_master.fleet.plan import Fleet, Group, load_fleet
-from twin_master.fleet.recorded import read_recording
-from twin_master.fleet.shard import Kit, ShardResult, with_parameters
-from twin_master.fleet.store import FleetStore, check_installed, written
-from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, keep_knowledge
-from twin_master.mission.preparation import prepare_knowledge
+from twin_master.fleet.shard import Kit, ShardResult, read_recording, with_parameters
+from twin_master.fleet.store import FAILED, FleetStore, check_installed, sizes_of, written
+from twin_master.mission.opening import released
+from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.mission.truth import Truth
 from twin_master.network.twin import build_graphical_model
@@ -113,11 +111,15 @@ def fly_fleet(
     engine = engine or Engine()
     check_installed("zarr", *(["distributed"] if engine.workers or engine.cluster else []))
     config = {"kind": KIND, "format": 1, "fleet": fleet.record()}
-    _look_at(folder, config, fleet.seed, replace_old=replace_old)
+    see_folder(folder, config, fleet.seed, replace_old=replace_old)
     _check(fleet)
     if replace_old and folder.is_dir():
-        _remove(folder)
-    lock = _begun(folder, config, fleet.seed)
+        lock = _locked(folder)
+        try:
+            shutil.rmtree(folder)
+        finally:
+            os.close(lock)
+    lock = hold_folder(folder, config, fleet.seed)
     try:
         store = FleetStore(folder, fleet)
         kept = len(store.done)
@@ -134,65 +136,65 @@ def fly_fleet(
     return FleetOutcome(folder, fleet.size, failures, ended, seconds, len(store.done) - kept, kept)
 
 
-def _look_at(folder: Path, config: Mapping[str, Any], seed: int, *, replace_old: bool) -> None:
-    """See that a folder is free, or holds the same fleet, begun with the same program."""
-    if folder.exists() and not folder.is_dir():
-        raise RunFolderExistsError(f"{folder} exists and is no folder: choose another --out.")
-    if not folder.is_dir() or not any(folder.iterdir()):
-        return
-    found = fleet_config(folder)
-    if replace_old:
-        return
-    if {key: found.get(key) for key in config} != json.loads(to_json(config)):
-        raise RunFolderExistsError(
-            f"{folder} holds another fleet, or the same with other files: choose another --out, or give "
-            "--replace."
-        )
-    check_versions(folder, found, seed)
-
-
-def _remove(folder: Path) -> None:
-    """Remove the fleet that was flown before, unless it is being flown."""
-    lock = lock_folder(folder)
-    if lock is None:
-        raise FleetError(f"another process flies the fleet in {folder}: wait for it to end.")
-    try:
-        shutil.rmtree(folder)
-    finally:
-        os.close(lock)
-
-
-def fleet_config(folder: Path) -> dict[str, Any]:
-    """Return the configuration of a folder that holds a fleet.
+def see_folder(folder: Path, config: Mapping[str, Any], seed: int, *, replace_old: bool = False) -> None:
+    """See that a folder is free, or holds the same fleet, begun with the same program.
 
     Raises
     ------
     RunFolderExistsError
         It holds something else.
+    NotResumableError
+        It was begun by another version.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise RunFolderExistsError(f"{folder} exists and is no folder: choose another --out.")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    found = fleet_config(folder, config["kind"])
+    if replace_old:
+        return
+    if {key: found.get(key) for key in config} != json.loads(to_json(config)):
+        other = (
+            "choose another --out, or give --replace" if config["kind"] == KIND else "choose another --out"
+        )
+        raise RunFolderExistsError(f"{folder} holds another fleet, or the same with other files: {other}.")
+    check_versions(folder, found, seed)
+
+
+def fleet_config(folder: Path, kind: str = KIND) -> dict[str, Any]:
+    """Return the configuration of a folder that holds a fleet of a kind.
+
+    Raises
+    ------
+    RunFolderExistsError
+        It holds no fleet.
     """
     path = folder / CONFIG_NAME
     found = read_json(path, RunFolderExistsError) if path.is_file() else None
-    if not isinstance(found, dict) or found.get("kind") != KIND or not isinstance(found.get("fleet"), dict):
+    if not isinstance(found, dict) or found.get("kind") != kind or not isinstance(found.get("fleet"), dict):
         raise RunFolderExistsError(
             f"{folder} is not the folder of a fleet." if folder.exists() else f"there is no folder {folder}."
         )
     return found
 
 
-def _begun(folder: Path, config: Mapping[str, Any], seed: int) -> int:
+def hold_folder(folder: Path, config: Mapping[str, Any], seed: int) -> int:
     """Make the folder with its configuration, if it is not there, and hold it for this process."""
     with written(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        lock = lock_folder(folder)
-    if lock is None:
-        raise FleetError(f"another process flies the fleet in {folder}: wait for it to end.")
-    try:
+    lock = _locked(folder)
+    with released(lock):
         if not (folder / CONFIG_NAME).is_file():
             provenance = collect_provenance(seed).as_dict()
             atomic_write_text(folder / CONFIG_NAME, to_json({**config, "provenance": provenance}))
-    except BaseException:
-        os.close(lock)
-        raise
+    return lock
+
+
+def _locked(folder: Path) -> int:
+    with written(folder):
+        lock = lock_folder(folder)
+    if lock is None:
+        raise FleetError(f"another process flies or watches the fleet in {folder}: wait for it to end.")
     return lock
 
 

@@ -1,6 +1,6 @@
 """What a fleet teaches: how fast damage grows, how noisy the sensors are, how the assets differ."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,20 +15,16 @@ from twin_master.assets.resolution import located_scenario
 from twin_master.errors import FleetError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import GROUPS, fleet_config, source_of
-from twin_master.fleet.outcome import has_flown
-from twin_master.fleet.population import Line, population
-from twin_master.fleet.posterior import POINTS, Grid, Marginal, Shared, refined, shared
+from twin_master.fleet.posterior import POINTS, Grid, Line, Shared, narrowed, population, refined, shared
 from twin_master.fleet.reading import noticed
-from twin_master.fleet.store import open_group
-from twin_master.mission.kept_knowledge import kept_knowledge
-from twin_master.mission.preparation import Knowledge
+from twin_master.fleet.store import has_flown, open_group
+from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["FleetLessons", "GroupLessons", "Line", "learn_fleet"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -37,6 +33,7 @@ NOISE_TWINS = 100
 """Twins of a group from which the noise is learnt: they know it to one part in a few hundred."""
 LARGEST_NOISE = 3.0
 """Factor on the assumed noise, and one over it, up to which is looked."""
+NOISE_POINTS = 13
 NODES, NODE_DEVIATIONS = 61, 6.0
 """Values of the parameter, and how many deviations of its calibration they reach to either side."""
 
@@ -97,7 +94,7 @@ class FleetLessons:
     source: dict[str, Any]
     scenarios: dict[str, Scenario]
 
-    def probabilities(self, group: int) -> tuple[Marginal, ...]:
+    def probabilities(self, group: int) -> tuple[Line, ...]:
         """Return the posterior of each probability of a group, under what the groups share."""
         return self.groups[group].grid.marginals if self.shared is None else self.shared.groups[group]
 
@@ -276,6 +273,9 @@ def _noise(part: _Seen, worsening: Worsening, nodes: _Nodes | None) -> Line:
     observed, control = part.observed[:NOISE_TWINS], part.control[:NOISE_TWINS]
     assumed = worsening.assumed.clip(1e-3, 0.9)
 
+    def log_density(axes: tuple[Float, ...]) -> Float:
+        return np.array([log_likelihood(float(factor)) for factor in np.exp(axes[0])])
+
     def log_likelihood(factor: float) -> float:
         model = _noisier(part.knowledge.sensor_model, factor, nodes)
         if nodes is None:
@@ -287,18 +287,7 @@ def _noise(part: _Seen, worsening: Worsening, nodes: _Nodes | None) -> Line:
             evidence = best[:, 0] + np.log(np.exp(each - best) @ nodes.prior)
         return float(evidence[np.isfinite(evidence)].sum())
 
-    return _line(log_likelihood, -np.log(LARGEST_NOISE), np.log(LARGEST_NOISE))
-
-
-def _line(log_likelihood: Callable[[float], float], low: float, high: float) -> Line:
-    """Return the posterior of the exponential of a figure, narrowed until it is resolved."""
-    while True:
-        x = np.linspace(low, high, 13)
-        density = np.array([log_likelihood(float(value)) for value in np.exp(x)])
-        weight = np.exp(density - density.max())
-        weight /= weight.sum()
-        inside = np.flatnonzero(weight > np.exp(-13.0) * weight.max())
-        if len(inside) >= 7:
-            return Line(np.exp(x), weight)
-        step = x[1] - x[0]
-        low, high = x[inside[0]] - step, x[inside[-1]] + step
+    bound = np.log(LARGEST_NOISE)
+    (axis,), found = narrowed(log_density, (np.linspace(-bound, bound, NOISE_POINTS),))
+    weight = np.exp(found - found.max())
+    return Line(axis, weight / weight.sum(), np.exp)

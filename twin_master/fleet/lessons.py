@@ -9,11 +9,8 @@ import numpy as np
 from reporting.files import atomic_write_text
 from reporting.progress import Progress
 from twin_master.fleet.learn import FleetLessons, learn_fleet
-from twin_master.fleet.population import Line
-from twin_master.fleet.posterior import Marginal
+from twin_master.fleet.posterior import Line
 from twin_master.run_folder import to_json
-
-__all__ = ["LESSONS_NAME", "learn_from_fleet", "lessons_record", "write_learnt"]
 
 LESSONS_NAME = "learnt.json"
 """In the folder of a fleet: what was learnt from it, for its report."""
@@ -146,7 +143,7 @@ def lessons_record(lessons: FleetLessons) -> dict[str, Any]:
     return record
 
 
-def _figures(marginal: Marginal | Line) -> dict[str, float]:
+def _figures(marginal: Line) -> dict[str, float]:
     low, high = marginal.interval()
     deviation = marginal.standard_deviation
     return {"mean": marginal.mean, "standard_deviation": deviation, "lower_95": low, "upper_95": high}

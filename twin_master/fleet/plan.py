@@ -15,15 +15,13 @@ from reporting.toml_file import read_toml
 from twin_master.assets.resolution import Overrides, portable_scenario, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.opening import file_record
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Name, NotNegative, Number, Probability, Section, Seed
 from twin_master.seeds import generator
 from twin_master.watch.broker import is_broker
 from twin_master.watch.feeds import Fed
-from twin_master.watch.opening import file_record
-
-__all__ = ["Fleet", "Group", "Member", "ensemble", "load_fleet", "seed_range"]
 
 SHARD = 256
 """Twins that are flown in one piece, unless the file says otherwise."""
@@ -262,22 +260,11 @@ def seed_range(text: str) -> range:
 
 
 def _group(section: GroupSection, folder: Path, seed: int) -> Group:
-    given = Path(section.scenario)
-    local = folder / given
+    local = folder / section.scenario
     loaded = load_scenario(local if local.is_file() else section.scenario)
-
-    def path(name: str | None) -> Path | None:
-        return None if name is None else folder / name
-
-    common = Overrides(
-        seed=seed,
-        fmu=path(section.fmu),
-        binding=path(section.binding),
-        calibration=path(section.calibration),
-        in_process=section.in_process,
-        learnt=path(section.learnt),
-        learnt_group=section.name,
-    )
+    given = {key: getattr(section, key) for key in ("fmu", "binding", "calibration", "learnt")}
+    files: dict[str, Any] = {key: folder / name for key, name in given.items() if name is not None}
+    common = replace(Overrides(seed=seed, in_process=section.in_process, learnt_group=section.name), **files)
     if section.observations is not None:
         address = section.observations
         where = address if is_broker(address) else str(folder / address)
@@ -291,28 +278,25 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
     if section.count is not None:
         scenarios: list[Scenario] = [resolve_scenario(loaded, common)]
         names = [f"{section.name}-{number}" for number in range(section.count)]
-        files: list[str] = []
+        own_files: list[str] = []
     else:
         key, pattern = ("fmu", section.fmus) if section.fmus else ("calibration", section.calibrations)
         found = sorted(folder.glob(str(pattern)))
-
-        def own(file: Path) -> Overrides:
-            return replace(common, fmu=file) if key == "fmu" else replace(common, calibration=file)
-
         if not found:
             raise FleetError(f'no file fits `{key}s = "{pattern}"` in {folder}.')
         scenarios, wrong = [], []
         for file in found:
+            own: dict[str, Any] = {key: file}
             try:
-                scenarios.append(resolve_scenario(loaded, own(file)))
+                scenarios.append(resolve_scenario(loaded, replace(common, **own)))
             except TwinMasterError as error:
                 wrong.append(f"{file.name}: {error}")
         if wrong:
             raise FleetError("\n".join(["assets that cannot fly:", *wrong]))
-        names, files = [file.stem for file in found], [file.name for file in found]
+        names, own_files = [file.stem for file in found], [file.name for file in found]
     scenarios = [_of_group(section, scenario) for scenario in scenarios]
     members = tuple(_member(section, seed, row, name) for row, name in enumerate(names))
-    return Group(section.name, tuple(scenarios), section.parameters, members, tuple(files))
+    return Group(section.name, tuple(scenarios), section.parameters, members, tuple(own_files))
 
 
 def recordings(pattern: str) -> list[Path]:

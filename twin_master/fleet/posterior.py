@@ -1,4 +1,4 @@
-"""Posteriors on grids: refined until they are resolved, marginal, and shared by groups."""
+"""Posteriors on grids, narrowed until they are resolved: of probabilities, and of populations."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,12 +7,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Grid", "Marginal", "Shared", "refined", "shared"]
-
 Float = NDArray[np.float64]
+Axes = tuple[Float, ...]
 
 POINTS = {1: 17, 2: 13, 3: 9, 4: 7}
-"""Points of each axis of the grid, by the number of axes."""
+"""Points of each axis of the grid of probabilities, by the number of axes."""
 LOWEST, HIGHEST = 1e-4, 0.9
 """Probabilities between which is looked."""
 BELOW = 13.0
@@ -23,6 +22,12 @@ NOTHING = 1e-9
 """Share of the largest weight below which the tails of an interval are cut."""
 FINE = 121
 """Points of each axis of a group, and of the mean of the distribution that groups share."""
+POPULATION_POINTS = 41
+"""Of mean and spread of a population."""
+FREEDOM = 4.0
+"""Of the prior of a spread: twice the scale, or none of it, are nothing unusual."""
+BETWEEN_NODES = 4
+"""Values between two nodes of a member's evidence."""
 
 
 def logit(p: Float) -> Float:
@@ -36,29 +41,32 @@ def logistic(x: Float) -> Float:
 
 
 @dataclass(frozen=True)
-class Marginal:
-    """Distribution of one probability.
+class Line:
+    """Distribution of one figure.
 
     Attributes
     ----------
-    x : (n,)
-        Log odds, equally spaced.
-    weight : (n,)
-        Probability of each, summing to one.
+    x : (N,)
+        Equally spaced.
+    weight : (N,)
+        Probability of each; they sum to 1.
+    of : callable
+        Returns the figure for x: a probability for its log odds.
     """
 
     x: Float
     weight: Float
+    of: Callable[[Float], Float] = np.asarray
 
     @property
     def mean(self) -> float:
-        """Mean of the probability."""
-        return float(self.weight @ logistic(self.x))
+        """Mean of the figure."""
+        return float(self.weight @ self.of(self.x))
 
     @property
     def standard_deviation(self) -> float:
-        """Standard deviation of the probability."""
-        return float(np.sqrt(self.weight @ (logistic(self.x) - self.mean) ** 2))
+        """Standard deviation of the figure."""
+        return float(np.sqrt(self.weight @ (self.of(self.x) - self.mean) ** 2))
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
         """Return the bounds of the central interval, by the cubic through the log density."""
@@ -71,8 +79,29 @@ class Marginal:
         log_weight = np.log(np.maximum(self.weight[part], NOTHING * self.weight.max()))
         density = np.exp(CubicSpline(self.x[part], log_weight)(fine) - log_weight.max())
         reached = np.cumsum(density) / density.sum()
-        low, high = np.interp([0.5 - probability / 2.0, 0.5 + probability / 2.0], reached, fine)
-        return float(logistic(np.array(low))), float(logistic(np.array(high)))
+        bounds = np.interp([0.5 - probability / 2.0, 0.5 + probability / 2.0], reached, fine)
+        low, high = self.of(bounds).tolist()
+        return low, high
+
+
+def narrowed(log_density: Callable[[Axes], Float], axes: Axes) -> tuple[Axes, Float]:
+    """Return axes that resolve a density within the ones that are given, and its logarithm on them."""
+    limits, numbers = [(axis[0], axis[-1]) for axis in axes], range(len(axes))
+    while True:
+        found = log_density(axes)
+        weight = np.exp(found - found.max())
+        bounds, resolved = [], True
+        for k, (axis, (low, high)) in enumerate(zip(axes, limits, strict=True)):
+            others = tuple(other for other in numbers if other != k)
+            inside, step = np.flatnonzero(weight.max(axis=others) > np.exp(-BELOW)), axis[1] - axis[0]
+            bounds.append((max(low, axis[inside[0]] - step), min(high, axis[inside[-1]] + step)))
+            marginal = weight.sum(axis=others) / weight.sum()
+            spread = np.sqrt(marginal @ (axis - marginal @ axis) ** 2)
+            resolved &= bool(step <= RESOLVED * spread) and len(inside) >= len(axis) // 3
+        # Where the next grid would be no finer, this is what can be had (a posterior at the bounds).
+        if resolved or all(b - a > 0.8 * (x[-1] - x[0]) for (a, b), x in zip(bounds, axes, strict=True)):
+            return axes, found
+        axes = tuple(np.linspace(a, b, len(x)) for (a, b), x in zip(bounds, axes, strict=True))
 
 
 @dataclass(frozen=True)
@@ -81,33 +110,33 @@ class Grid:
 
     Attributes
     ----------
-    axes : tuple of (n,)
-        Log odds, equally spaced.
-    log_likelihood : (n, ..., n)
+    axes : tuple of (N,)
+        Log odds of each probability.
+    log_likelihood : (N, ..., N)
+        At each point.
     """
 
-    axes: tuple[Float, ...]
+    axes: Axes
     log_likelihood: Float
 
     @property
-    def weight(self) -> Float:
-        """Posterior probability of each point under a uniform prior of each probability."""
-        log_density = self.log_likelihood.copy()
-        for k, axis in enumerate(self.axes):
-            shape = [1] * len(self.axes)
-            shape[k] = -1
-            log_density += np.log(logistic(axis) * logistic(-axis)).reshape(shape)
-        weight = np.exp(log_density - log_density.max())
-        return np.asarray(weight / weight.sum())
-
-    @property
-    def marginals(self) -> tuple[Marginal, ...]:
+    def marginals(self) -> tuple[Line, ...]:
         """Posterior of each probability under a uniform prior."""
-        weight = self.weight
-        others = [tuple(i for i in range(weight.ndim) if i != k) for k in range(weight.ndim)]
-        return tuple(
-            Marginal(axis, weight.sum(axis=other)) for axis, other in zip(self.axes, others, strict=True)
-        )
+        log_density = self.log_likelihood + _uniform(self.axes)
+        weight = np.exp(log_density - log_density.max())
+        return _lines(weight / weight.sum(), self.axes, logistic)
+
+
+def _uniform(axes: Axes) -> Float:
+    """Return the log density of uniform probabilities in their log odds."""
+    meshed = np.meshgrid(*axes, indexing="ij")
+    return np.asarray(sum(np.log(logistic(x) * logistic(-x)) for x in meshed))
+
+
+def _lines(weight: Float, axes: Axes, of: Callable[[Float], Float] = np.asarray) -> tuple[Line, ...]:
+    """Return the marginals of weights on a grid."""
+    others = [tuple(i for i in range(weight.ndim) if i != k) for k in range(weight.ndim)]
+    return tuple(Line(axis, weight.sum(axis=other), of) for axis, other in zip(axes, others, strict=True))
 
 
 def points_of(axes: Sequence[Float]) -> Float:
@@ -121,30 +150,18 @@ def refined(log_likelihood: Callable[[Float], Float], count: int) -> Grid:
     Parameters
     ----------
     log_likelihood : callable
-        Of points (P, K) -> (P,).
+        Returns it at points (P, K): (P,).
     count : int
-        K.
+        K, from 1 to 4.
     """
-    low, high = (float(logit(np.array(p))) for p in (LOWEST, HIGHEST))
-    number = POINTS[count]
-    axes = tuple(np.linspace(low, high, number) for _ in range(count))
-    while True:
-        shape = (number,) * count
-        grid = Grid(axes, log_likelihood(points_of(axes)).reshape(shape))
-        weight = grid.weight
-        peak = np.log(np.maximum(weight, 1e-300)) - np.log(weight.max())
-        bounds, resolved = [], True
-        for k, axis in enumerate(axes):
-            profile = peak.max(axis=tuple(i for i in range(count) if i != k))
-            inside, step = np.flatnonzero(profile > -BELOW), axis[1] - axis[0]
-            bounds.append((max(low, axis[inside[0]] - step), min(high, axis[inside[-1]] + step)))
-            marginal = grid.marginals[k]
-            spread = np.sqrt(marginal.weight @ (axis - marginal.weight @ axis) ** 2)
-            resolved &= bool(step <= RESOLVED * spread) and len(inside) >= number // 3
-        # Where the next grid would be no finer, this is what can be had (a posterior at the bounds).
-        if resolved or all(b - a > 0.8 * (x[-1] - x[0]) for (a, b), x in zip(bounds, axes, strict=True)):
-            return grid
-        axes = tuple(np.linspace(a, b, number) for a, b in bounds)
+    shape = (POINTS[count],) * count
+
+    def density(axes: Axes) -> Float:
+        return log_likelihood(points_of(axes)).reshape(shape) + _uniform(axes)
+
+    axis = np.linspace(logit(np.array(LOWEST)), logit(np.array(HIGHEST)), POINTS[count])
+    axes, found = narrowed(density, (axis,) * count)
+    return Grid(axes, found - _uniform(axes))
 
 
 @dataclass(frozen=True)
@@ -155,13 +172,13 @@ class Shared:
     ----------
     mean, concentration : tuple of (float, float)
         Mean and standard deviation of m, and of log10 kappa, for each of the K probabilities.
-    groups : tuple of tuple of Marginal
+    groups : tuple of tuple of Line
         The K probabilities of each group.
     """
 
     mean: tuple[tuple[float, float], ...]
     concentration: tuple[tuple[float, float], ...]
-    groups: tuple[tuple[Marginal, ...], ...]
+    groups: tuple[tuple[Line, ...], ...]
 
 
 def shared(grids: Sequence[Grid]) -> Shared:
@@ -206,7 +223,7 @@ def shared(grids: Sequence[Grid]) -> Shared:
         joint = likelihood * (share @ prior[0] if count == 1 else prior[0].T @ share @ prior[1])
         joint /= joint.sum()
         sums = (joint,) if count == 1 else (joint.sum(axis=1), joint.sum(axis=0))
-        groups.append(tuple(Marginal(x, np.asarray(one)) for x, one in zip(own, sums, strict=True)))
+        groups.append(tuple(Line(x, np.asarray(one), logistic) for x, one in zip(own, sums, strict=True)))
     hyper = (weight,) if count == 1 else (weight.sum(axis=1), weight.sum(axis=0))
     return Shared(
         tuple(_moments(one, means) for one in hyper),
@@ -229,3 +246,41 @@ def _resampled(grid: Grid, axes: tuple[Float, ...]) -> Float:
     if len(axes) == 1:
         return np.asarray(np.exp(CubicSpline(grid.axes[0], log_likelihood)(axes[0])))
     return np.asarray(np.exp(RectBivariateSpline(*grid.axes, log_likelihood)(*axes)))
+
+
+def population(nodes: Float, log_evidence: Float, scale: float) -> tuple[Line, Line]:
+    """Return the posterior of mean m and spread s of a normal population of which B members were seen.
+
+    Parameters
+    ----------
+    nodes : (E,)
+        Equally spaced values of the parameter.
+    log_evidence : (B, E)
+        Of what was observed of each member, if its parameter is a node.
+    scale : float
+        Of the prior of s, half a Student's t of four degrees of freedom; that of m is uniform.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.special import ndtr
+
+    fine = np.linspace(nodes[0], nodes[-1], BETWEEN_NODES * (len(nodes) - 1) + 1)
+    step = fine[1] - fine[0]
+    known = log_evidence[np.isfinite(log_evidence).all(axis=1)]
+    known = np.maximum(known - known.max(axis=1, keepdims=True), -700.0)
+    likelihood = np.exp(CubicSpline(nodes, known, axis=1)(fine))
+    likelihood /= likelihood.sum(axis=1, keepdims=True)
+    edges = np.append(fine, fine[-1] + step) - 0.5 * step
+
+    def density(axes: Axes) -> Float:
+        found = np.empty((POPULATION_POINTS, POPULATION_POINTS))
+        for column, spread in enumerate(axes[1]):
+            share = np.diff(ndtr((edges[:, None] - axes[0]) / spread), axis=0)
+            found[:, column] = np.log(np.maximum(likelihood @ share, 1e-300)).sum(axis=0)
+        return found - 0.5 * (FREEDOM + 1.0) * np.log1p((axes[1] / scale) ** 2 / FREEDOM)
+
+    limits = (nodes[0], nodes[-1]), (0.25 * step, 0.5 * (nodes[-1] - nodes[0]))
+    axes, found = narrowed(density, tuple(np.linspace(*limit, POPULATION_POINTS) for limit in limits))
+    weight = np.exp(found - found.max())
+    weight[:, [0, -1]] *= 0.5
+    mean, spread = _lines(weight / weight.sum(), axes)
+    return mean, spread

@@ -1,6 +1,6 @@
 """What stands in the store of a fleet, as figures with their errors."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,22 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.assets.asset_source import AssetSource
-from twin_master.assets.interface import Asset, StatelessAsset
-from twin_master.errors import FleetError
 from twin_master.fleet.flight import GROUPS, fleet_config
-from twin_master.fleet.outcome import ENDED, FAILED, FLOWN, NOTICE_KINDS, has_flown, outcomes_of
-from twin_master.fleet.plan import Member
-from twin_master.fleet.store import open_group
-from twin_master.mission.kept_knowledge import kept_knowledge
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
+from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, has_flown, open_group
+from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Estimated", "Outcomes", "attention", "fleet_groups", "fly_seeds", "group_figures"]
 
 Float = NDArray[np.float64]
 
@@ -83,20 +75,6 @@ class Outcomes:
             log_evidence=np.nanmean(kept["log_evidence"], axis=1),
             credible=kept["credible"],
         )
-
-    @classmethod
-    def flown(cls, knowledge: Knowledge, flights: Flights) -> "Outcomes":
-        """Return those of missions that are not stored.
-
-        Raises
-        ------
-        FleetError
-            One of them failed.
-        """
-        for sentence in filter(None, flights.failure):
-            raise FleetError(sentence)
-        members = [Member(row, str(row), row, {}) for row in range(len(flights.failure))]
-        return cls.of(outcomes_of(knowledge, flights, members))
 
     def within(self, steps: int) -> Estimated:
         """Return the share of the called-for fallbacks that came within some steps; NaN without any."""
@@ -259,36 +237,3 @@ def shown(figure: Estimated | int | None) -> str:
         return str(figure)
     error = f" ± {figure.error:.2g}" if np.isfinite(figure.error) else ""  # one twin has none
     return f"{figure.value:.4g}{error}"
-
-
-def fly_seeds(
-    scenario: Scenario, source: AssetSource, seeds: Sequence[int], *, calibration_seed: int | None = None
-) -> Outcomes:
-    """Fly a mission under many seeds in this process, without a store, whatever its source is.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    source : AssetSource
-        Already prepared; its asset is opened once, and brought back to its start for each mission.
-    seeds : sequence of int
-    calibration_seed : int, optional
-        Of the calibration, which all missions share; the first of the seeds by default.
-    """
-    seed = seeds[0] if calibration_seed is None else calibration_seed
-    knowledge = prepare_knowledge(scenario, source, seed)
-    truths, asset = [knowledge.truth(seed) for seed in seeds], source.open()
-    try:
-        if isinstance(asset, StatelessAsset) and scenario.learning is None and scenario.notice is None:
-            return Outcomes.flown(knowledge, fly_side_by_side(knowledge, truths, [asset] * len(truths)))
-        return Outcomes.flown(knowledge, fly_one_by_one(knowledge, truths, _again(asset, len(truths))))
-    finally:
-        asset.close()
-
-
-def _again(asset: Asset, count: int) -> Iterator[Asset]:
-    """Yield an asset at its start, again and again."""
-    start = asset.save_state()
-    for _ in range(count):
-        asset.restore_state(start)
-        yield asset

@@ -23,10 +23,9 @@ from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.outcome import ENDED, FAILED, has_flown
 from twin_master.fleet.reading import WITHIN, group_figures, last_turns, leaving, noticed, shown
 from twin_master.fleet.standing import STATE_NAME, FleetRecord
-from twin_master.fleet.store import DONE_NAME, open_group
+from twin_master.fleet.store import DONE_NAME, ENDED, FAILED, has_flown, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
 from twin_master.report.view import printed_factors
 from twin_master.run_folder import CONFIG_NAME

@@ -8,9 +8,9 @@ import pickle
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -27,17 +27,82 @@ from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.assets.resolution import located_scenario
 from twin_master.errors import FleetError
-from twin_master.fleet.outcome import outcomes_of
 from twin_master.fleet.plan import Member
-from twin_master.fleet.recorded import assimilated
-from twin_master.mission.kept_knowledge import kept_knowledge
-from twin_master.mission.preparation import Knowledge
+from twin_master.fleet.store import outcomes_of
+from twin_master.mission.loop import operate
+from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one, fly_side_by_side
-from twin_master.mission.truth import Truth
+from twin_master.mission.turns import History, Reading, Turn
+from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
+from twin_master.watch.feeds import Fed, file_feed
+from twin_master.watch.growing import Place
+from twin_master.watch.intake import Intake, LiveFeed, RejectedFile
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
+
+
+def read_recording(path: Path, scenario: Scenario) -> tuple[Fed, ...]:
+    """Return the messages of a recording.
+
+    Raises
+    ------
+    MissionInputError
+        It cannot be read, or is of another asset.
+    """
+    return tuple(file_feed(path, scenario).messages(None))
+
+
+class _Recorded(LiveFeed):
+    """Messages as a feed."""
+
+    def __init__(self, messages: Sequence[Fed]) -> None:
+        self._messages = messages
+
+    def messages(self, place: Place | None) -> Iterator[Fed]:
+        return iter(self._messages)
+
+
+def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Flights:
+    """Return what B twins conclude of B recordings: beliefs and controls are those of a watch of each."""
+    flights, most = Flights.empty(knowledge, len(recordings)), knowledge.scenario.mission.steps
+    for number, messages in enumerate(recordings):
+        try:
+            history = _history(knowledge, messages)
+        except IN_FLIGHT as error:
+            flights.failure[number] = str(error)
+            continue
+        turns = len(history.turns)
+        if not turns:
+            flights.failure[number] = "its recording has no turn yet."
+        elif turns > most:
+            flights.failure[number] = (
+                f"it has {turns} turns, and {most} at most are flown: set `steps` of the group."
+            )
+        else:
+            flights.put(number, history)
+    return flights
+
+
+def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
+    scenario = knowledge.scenario
+    twin = knowledge.twin(lag=scenario.watch.lag)
+    history = History(twin, scenario.observation.count)
+    intake, seen, late = Intake(scenario, _Recorded(messages), RejectedFile(None)), {}, False
+    lost: list[tuple[int, Notice]] = []
+    for turn in operate(twin, intake, history.add):
+        at = intake.observation_turn
+        seen[at] = turn.reading.observed, twin.control_of(at)
+        late |= turn.reading.revises is not None
+        lost += [(at, notice) for notice in intake.notices]
+    if late:
+        twin = knowledge.twin()
+        history = History(twin, scenario.observation.count)
+        for at in sorted(seen):
+            history.add(Turn(Reading(*seen[at]), twin.turn(*seen[at])))
+    history.notices += lost
+    return history
 
 
 @dataclass(frozen=True)
@@ -187,42 +252,47 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
 def _flown(kit: _Unpacked, members: Sequence[Member]) -> Flights:
     """Fly twins with their assets."""
     truths = [kit.knowledge.truth(member.seed) for member in members]
-    learns = kit.scenario.learning is not None or kit.scenario.notice is not None
-    fly = fly_one_by_one if learns else fly_side_by_side
+    alone = kit.scenario.learning is not None or kit.scenario.notice is not None
     if kit.flies_model:
-        return fly(kit.knowledge, truths, [kit.model(member.parameters) for member in members])
-    return _fly_each(kit, truths, members, fly)
+        models = [kit.model(member.parameters) for member in members]
+        if alone:
+            return fly_one_by_one(kit.knowledge, truths, lambda twin, _sound: models[twin])
+        return fly_side_by_side(kit.knowledge, truths, models)
+    with _Hangar(kit, members) as hangar:
+        if not alone:
+            with suppress(*IN_FLIGHT):  # which then happens to each of them
+                asset = hangar.asset(0, False)
+                if isinstance(asset, StatelessAsset) and hangar.alike:
+                    return fly_side_by_side(kit.knowledge, truths, [asset] * len(members))
+        return fly_one_by_one(kit.knowledge, truths, hangar.asset)
 
 
-def _fly_each(
-    kit: _Unpacked,
-    truths: Sequence[Truth],
-    members: Sequence[Member],
-    fly: Callable[[Knowledge, Sequence[Truth], Sequence[Asset]], Flights],
-) -> Flights:
-    """Fly assets that may have a memory one after the other; what fails is opened anew for the next."""
-    flown: list[Flights] = []
-    asset, start, opened = None, b"", None
-    with ExitStack() as closing:
-        for truth, member in zip(truths, members, strict=True):
-            wanted = kit.asset_of(member)
-            try:
-                if asset is None or opened != wanted:
-                    closing.close()
-                    asset = kit.source(*wanted).open()
-                    closing.callback(asset.close)
-                    start, opened = asset.save_state(), wanted
-                    if isinstance(asset, StatelessAsset) and all(kit.asset_of(m) == wanted for m in members):
-                        return fly(kit.knowledge, truths, [asset] * len(members))
-                else:
-                    asset.restore_state(start)
-                if kit.scenario.planner.inspections_a_turn is not None:
-                    raise FleetError(
-                        "`inspections_a_turn` needs assets without memory, which fly side by side"
-                    )
-                flown.append(fly(kit.knowledge, [truth], [asset]))
-            except IN_FLIGHT as error:
-                flown.append(replace(Flights.empty(kit.knowledge, 1), failure=(str(error),)))
-            if flown[-1].failure[0] or flown[-1].ended[0]:
-                asset = None
-    return Flights.joined(flown)
+class _Hangar(ExitStack):
+    """Assets that may have a memory, one open at a time; what failed is opened anew for the next twin."""
+
+    def __init__(self, kit: _Unpacked, members: Sequence[Member]) -> None:
+        super().__init__()
+        self._kit, self._wanted = kit, [kit.asset_of(member) for member in members]
+        self._asset: Asset | None = None
+        self._start, self._opened = b"", self._wanted[0]
+
+    @property
+    def alike(self) -> bool:
+        return all(wanted == self._wanted[0] for wanted in self._wanted)
+
+    def asset(self, twin: int, sound: bool) -> Asset:
+        """Return the asset of a twin at its start."""
+        wanted = self._wanted[twin]
+        if self._asset is not None and sound and wanted == self._opened:
+            self._asset.restore_state(self._start)
+        else:
+            self._asset = None
+            self.close()
+            self._asset = self._kit.source(*wanted).open()
+            self.callback(self._asset.close)
+            self._start, self._opened = self._asset.save_state(), wanted
+        if self._kit.scenario.planner.inspections_a_turn is not None and not (
+            self.alike and isinstance(self._asset, StatelessAsset)
+        ):
+            raise FleetError("`inspections_a_turn` needs assets without memory, which fly side by side")
+        return self._asset

@@ -10,8 +10,6 @@ from twin_master.errors import FleetError
 from twin_master.fleet.reading import attention
 from twin_master.watch.folder import Watch
 
-__all__ = ["STATE_NAME", "FleetRecord", "WatchedAsset"]
-
 STATE_NAME = "watched.json"
 """In the folder of a fleet that is watched: its assets as they stood a moment ago, for its view."""
 

@@ -13,7 +13,10 @@ from tornado.web import Application
 from reporting.errors import ReportingError
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.report import fleet_page, fleet_record
+from twin_master.fleet.report import (
+    fleet_page,
+    fleet_record,
+)
 from twin_master.fleet.standing import STATE_NAME
 from twin_master.fleet.store import DONE_NAME
 from twin_master.viewer.server import OWN_NAMES, handlers_of, serve_application, text_of

@@ -1,6 +1,5 @@
 """Real assets, many of them: each is watched as `uav-twin watch` watches one, and leaves the same folder."""
 
-import json
 import os
 import re
 import time
@@ -13,17 +12,15 @@ from typing import Any
 
 from reporting.errors import DiskFullError
 from reporting.files import atomic_write_text
-from reporting.folders import lock_folder
-from reporting.json_file import read_json
 from reporting.progress import SilentProgress
-from reporting.provenance import collect_provenance
 from twin_master.assets.resolution import portable_scenario
-from twin_master.errors import FleetError, RunFolderExistsError
+from twin_master.errors import FleetError
+from twin_master.fleet.flight import hold_folder, see_folder
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
 from twin_master.fleet.standing import STATE_NAME, FleetRecord, WatchedAsset
 from twin_master.fleet.store import written
 from twin_master.mission.side_by_side import IN_FLIGHT
-from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
+from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.broker import broker_of, is_broker
 from twin_master.watch.feeds import Fed, file_feed
@@ -33,8 +30,6 @@ from twin_master.watch.intake import Feed, LiveFeed
 from twin_master.watch.message import MessageReader
 from twin_master.watch.mqtt import Outbox, Session, placed
 from twin_master.watch.opening import begin_resolved, resume_watch
-
-__all__ = ["KIND", "FleetWatch"]
 
 KIND = "uav-twin fleet watch"
 TURNS_AT_ONCE = 64
@@ -264,29 +259,8 @@ def _held(fleet: Fleet, folder: Path) -> int:
     ]
     heading = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "groups": groups}
     config = {"kind": KIND, "format": 1, "fleet": heading}
-    path = folder / CONFIG_NAME
-    with written(folder):
-        taken = folder.exists() and not (folder.is_dir() and (path.is_file() or not any(folder.iterdir())))
-    if taken:
-        raise RunFolderExistsError(
-            f"{folder} holds something else than a watched fleet: choose another --out."
-        )
-    if path.is_file():
-        found = read_json(path, RunFolderExistsError)
-        if not isinstance(found, dict) or {key: found.get(key) for key in config} != json.loads(
-            to_json(config)
-        ):
-            raise RunFolderExistsError(f"{folder} holds another fleet or scenario: choose another --out.")
-        check_versions(folder, found, fleet.seed)
-    with written(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = lock_folder(folder)
-    if lock is None:
-        raise FleetError(f"another process watches the fleet in {folder}: wait for it to end.")
-    if not path.is_file():
-        provenance = collect_provenance(fleet.seed).as_dict()
-        atomic_write_text(path, to_json({**config, "provenance": provenance}))
-    return lock
+    see_folder(folder, config, fleet.seed)
+    return hold_folder(folder, config, fleet.seed)
 
 
 class _Files:

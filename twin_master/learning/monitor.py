@@ -26,7 +26,7 @@ from twin_master.learning.words import Words
 from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.scenario.notice import MOST_DRAWS, Noticing
+from twin_master.scenario.tables import MOST_DRAWS, Noticing
 
 __all__ = ["WatchfulEstimator", "Words"]
 

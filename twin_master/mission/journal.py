@@ -9,10 +9,10 @@ import math
 import os
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,47 +60,57 @@ def belief_record(turn: TwinTurn) -> dict[str, Any]:
 
 
 class JournalFile:
-    """A journal, open to be continued.
+    """The journal of a run folder that this process holds, open to be continued.
 
     Parameters
     ----------
-    path : Path
-        Of the file, which need not exist.
+    folder : Path
+        The run folder; the file need not exist.
     config_hash : str
         SHA-256 of the configuration that it belongs to.
     flush_seconds : float
         Seconds after which what was appended is flushed to the disk; 0 flushes after every line. A kill of
         the process loses nothing either way: only a machine that loses its power needs the flush.
 
+    Attributes
+    ----------
+    size : int
+        Bytes of its whole lines.
+
     Raises
     ------
     NotResumableError
         It was changed or is damaged, or belongs to another configuration.
+    FileNotWrittenError
+        The disk is full or the folder cannot be written.
     """
 
-    def __init__(self, path: Path, config_hash: str, flush_seconds: float = 0.0) -> None:
-        self._path = path
-        self._flush_seconds = flush_seconds
+    def __init__(self, folder: Path, config_hash: str, flush_seconds: float = 0.0) -> None:
+        self._path, self._flush_seconds = folder / JOURNAL_NAME, flush_seconds
         self._flushed = time.monotonic()
-        header = line_of({"config_hash": config_hash})
-        next(read_lines(path, config_hash), None)
-        size = next((end for _, _, end in records_backwards(path)), 0)
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-        self._size = size
-        os.truncate(self._descriptor, size)
-        if not size:
-            self.append_line(header)
-            self.flush()
-            synchronise_folder(path.parent)
+        try:
+            next(read_lines(self._path, config_hash), None)
+            self.size = next((end for _, _, end in records_backwards(self._path)), 0)
+            self._descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            os.truncate(self._descriptor, self.size)
+            if not self.size:
+                self.append({"config_hash": config_hash})
+                self.flush()
+                synchronise_folder(folder)
+        except OSError as error:
+            raise write_error(error, self._path) from error
 
-    @property
-    def size(self) -> int:
-        """Bytes of its whole lines."""
-        return self._size
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        with suppress(OSError):
+            os.fsync(self._descriptor)
+        os.close(self._descriptor)
 
     def truncate(self, size: int) -> None:
         """Drop what lies beyond a size in bytes, the end of some line."""
-        self._size = size
+        self.size = size
         os.truncate(self._descriptor, size)
 
     def append(self, record: Mapping[str, Any]) -> None:
@@ -111,54 +121,22 @@ class JournalFile:
         FileNotWrittenError
             The disk is full or the folder cannot be written; the lines before are still there.
         """
-        self.append_line(line_of(record))
-
-    def append_line(self, line: bytes) -> None:
-        """Add a line that has its hash, see `append`."""
+        line, written = line_of(record), 0
         try:
-            written = 0
             while written < len(line):
                 written += os.write(self._descriptor, line[written:])
             if time.monotonic() - self._flushed >= self._flush_seconds:
                 self.flush()
         except OSError as error:
             with suppress(OSError):
-                os.truncate(self._descriptor, self._size)
+                os.truncate(self._descriptor, self.size)
             raise write_error(error, self._path) from error
-        self._size += len(line)
+        self.size += len(line)
 
     def flush(self) -> None:
         """Flush what was appended to the disk."""
         os.fsync(self._descriptor)
         self._flushed = time.monotonic()
-
-    def close(self) -> None:
-        """Let go of the file."""
-        with suppress(OSError):
-            os.fsync(self._descriptor)
-        os.close(self._descriptor)
-
-
-@contextmanager
-def open_journal(folder: Path, config_hash: str, flush_seconds: float = 0.0) -> Iterator[JournalFile]:
-    """Open the journal of a run folder that this process holds, see `JournalFile`.
-
-    Raises
-    ------
-    NotResumableError
-        The journal was changed or is damaged, or belongs to another configuration.
-    FileNotWrittenError
-        The disk is full or the folder cannot be written.
-    """
-    path = folder / JOURNAL_NAME
-    try:
-        journal = JournalFile(path, config_hash, flush_seconds)
-    except OSError as error:
-        raise write_error(error, path) from error
-    try:
-        yield journal
-    finally:
-        journal.close()
 
 
 def line_of(record: Mapping[str, Any]) -> bytes:

@@ -1,66 +1,36 @@
-"""The loop of a twin: observe, assimilate, predict, decide, write down, whatever the observations come from.
+"""The one loop: a source gives observations, the twin decides; and a mission, resumable at any turn."""
 
-A mission is the loop with a simulated asset as its source, and at its end the history is smoothed. A watch
-(`twin_master.watch`) is the same loop with a real one.
-"""
-
+import base64
+import binascii
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from fmu_asset.errors import FmuEndedError
 from reporting.progress import Progress, SilentProgress
 from twin_master.errors import (
     ImpossibleObservation,
     InvalidObservationError,
-    MissionError,
     NotResumableError,
     TwinMasterError,
 )
-from twin_master.mission.checkpoint import Checkpoint, FlownTurn
-from twin_master.mission.plant import Plant, PlantRecord
-from twin_master.network.estimator import Carried, Notice, Suspicion
+from twin_master.mission.journal import (
+    JOURNAL_NAME,
+    JournalFile,
+    array_of,
+    belief_record,
+    damaged,
+    line_of,
+    plain,
+    read_records,
+)
+from twin_master.mission.truth import Plant
+from twin_master.mission.turns import Happened, History, Reading, Turn
+from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.scenario.schema import Scenario
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class TurnTiming:
-    """Wall-clock seconds of one turn."""
-
-    asset: float
-    twin: float
-    checkpoint: float
-
-
-@dataclass(frozen=True)
-class Reading:
-    """An observation that is to be assimilated.
-
-    Attributes
-    ----------
-    observed : (G,)
-        What the sensors say, SI; NaN where lost. Where modes are observed, a row with their covariance; see
-        `network.identified`.
-    control : int or None
-        Index of the control in force; None for the one that the twin proposed.
-    revises : int or None
-        The turn that it belongs to, if it came late; None for the next one.
-    unreadable : dict of int to str
-        What came in the place of a reading, of each sensor that has none, from 0.
-    """
-
-    observed: Float
-    control: int | None = None
-    revises: int | None = None
-    unreadable: Mapping[int, str] = field(default_factory=dict)
 
 
 class Source(Protocol):
@@ -73,19 +43,16 @@ class Source(Protocol):
         """Return what is assimilated in the place of one that no state allows, or that has no weight."""
 
 
-def operate(
-    twin: Twin, source: Source, keep: Callable[[Reading, TwinTurn], None] | None = None
-) -> Iterator[tuple[Reading, TwinTurn, TurnTiming]]:
+def operate(twin: Twin, source: Source, *sinks: Callable[[Turn], None]) -> Iterator[Turn]:
     """Let a twin assimilate and decide until its source ends; each turn is kept before it is given.
 
     Parameters
     ----------
     twin : Twin
-        Which need not be new.
     source : Source
-        Of its observations.
-    keep : callable, optional
-        Writes down a turn.
+        Asked for the next observation when the turn before it was taken in.
+    *sinks : callable
+        Told each turn, one after the other: a journal, a history.
     """
     while True:
         begin = time.perf_counter()
@@ -94,14 +61,16 @@ def operate(
             return
         received = time.perf_counter()
         try:
-            turn = _assimilated(twin, reading)
+            concluded = _assimilated(twin, reading)
         except (ImpossibleObservation, InvalidObservationError) as error:
             reading = source.impossible(reading, error)
-            turn = _assimilated(twin, reading)
+            concluded = _assimilated(twin, reading)
         decided = time.perf_counter()
-        if keep is not None:
-            keep(reading, turn)
-        yield reading, turn, TurnTiming(received - begin, decided - received, time.perf_counter() - decided)
+        turn = Turn(reading, concluded)
+        for sink in sinks:
+            sink(turn)
+        kept = time.perf_counter()
+        yield replace(turn, seconds=(received - begin, decided - received, kept - decided))
 
 
 def _assimilated(twin: Twin, reading: Reading) -> TwinTurn:
@@ -110,87 +79,12 @@ def _assimilated(twin: Twin, reading: Reading) -> TwinTurn:
     return twin.turn(reading.observed, reading.control)
 
 
-@dataclass(frozen=True)
-class Flight:
-    """A flown mission of T turns.
+class Checkpoint(NamedTuple):
+    """Where an earlier process stopped: what came and what was decided in each turn, and the asset."""
 
-    Attributes
-    ----------
-    observed : (T, G)
-        What the sensors said, SI; NaN where lost.
-    readings : (T, I)
-        What inspections read, SI; NaN where none was asked for.
-    control_index : (T,)
-        Control in force in each turn.
-    filtered : (T, S)
-        p(D_t | o_0..o_t).
-    log_evidence : (T,)
-        log p(o_t | o_0..o_{t-1}).
-    smoothed : (T, S)
-        p(D_t | o_0..o_{T-1}).
-    predicted : (T, H, S)
-        p(D_{t+h} | o_0..o_t), h = 1..H.
-    decision_probability : (T, U)
-        What the control of turn t + 1 was decided by: its mode is flown.
-    truth : PlantRecord or None
-        What really happened; None where nobody knows.
-    timing : tuple of TurnTiming
-        Of the turns flown by this process.
-    resumed_at : int
-        Turn at which this process took over; 0 for an uninterrupted mission.
-    first_turn : int
-        Number of the first of the T turns.
-    suspicion : tuple of Suspicion
-        How well the model explains the sensors in each turn; empty where that is not watched.
-    notices : tuple of (int, Notice)
-        Turns, and what the operator should know of them.
-    learnt_names : tuple of str
-        The N quantities that are learnt, as the estimator names them.
-    learnt : (T, N, 4)
-        Mean, standard deviation and bounds of the central 90 % interval of each after each turn.
-    carried : tuple of Carried
-        What the estimator that learns carried on from each turn; empty where nothing is learnt.
-    """
-
-    observed: Float
-    readings: Float
-    control_index: Index
-    filtered: Float
-    log_evidence: Float
-    smoothed: Float
-    predicted: Float
-    decision_probability: Float
-    truth: PlantRecord | None
-    timing: tuple[TurnTiming, ...]
-    resumed_at: int = 0
-    first_turn: int = 0
-    suspicion: tuple[Suspicion, ...] = ()
-    notices: tuple[tuple[int, Notice], ...] = ()
-    learnt_names: tuple[str, ...] = ()
-    learnt: Float = field(default_factory=lambda: np.empty((0, 0, 4)))
-    carried: tuple[Carried, ...] = ()
-
-    def behind(self, skipped: int) -> "Flight":
-        """Return the turns behind the first `skipped` of a watched asset; the notices stay those of all."""
-        by_turn = (
-            "observed", "readings", "control_index", "filtered", "log_evidence", "smoothed", "predicted",
-            "decision_probability", "suspicion", "learnt", "carried",
-        )  # fmt: skip
-        cut = {name: getattr(self, name)[skipped:] for name in by_turn}
-        return replace(self, **cut, first_turn=self.first_turn + skipped)
-
-    @property
-    def happened(self) -> PlantRecord:
-        """What really happened.
-
-        Raises
-        ------
-        MissionError
-            Nobody knows: a real asset was watched.
-        """
-        if self.truth is None:
-            raise MissionError("what really happened to a watched asset is not known.")
-        return self.truth
+    readings: Sequence[Reading]
+    decided: Sequence[int]
+    asset_state: bytes
 
 
 def fly(
@@ -199,69 +93,50 @@ def fly(
     plant: Plant,
     *,
     checkpoint: Checkpoint | None = None,
-    keep: Callable[[FlownTurn], None] | None = None,
+    keep: Callable[[Turn, bytes], None] | None = None,
     progress: Progress | None = None,
-) -> Flight:
+    history: History | None = None,
+) -> History:
     """Fly a mission, or the rest of one; an asset that ends its simulation ends the mission, and is a notice.
 
     Parameters
     ----------
     scenario : Scenario
-        Number of turns and first control.
     twin : Twin
-        A twin that has seen nothing yet.
+        Which has seen nothing yet.
     plant : Plant
-        The asset with its truth, before its first turn.
+        The asset and its truth, at their start.
     checkpoint : Checkpoint, optional
-        Where an interrupted mission stopped.
+        Where an earlier process stopped.
     keep : callable, optional
-        Called with what cannot be computed again after every turn.
+        Told each turn, and the state of the asset behind it.
     progress : Progress, optional
-        Shows the turns.
+    history : History, optional
+        Takes in the turns; what it has is there also where an error ends the flight.
 
     Raises
     ------
-    ImpossibleObservation, AssetOutputError, FmuError
-        The mission cannot go on; the last checkpoint is that of the turn before.
     NotResumableError
-        The decisions of the checkpoint do not follow from its observations.
+        The twin decides otherwise than an earlier process did.
+    MissionError, ImpossibleObservation, FmuError, FiniteElementError
+        The mission cannot be flown on.
     """
-    steps = scenario.mission.steps
-    beliefs = Beliefs(scenario.observation.count)
-    timing: list[TurnTiming] = []
+    history = history or History(twin, scenario.observation.count)
     if checkpoint is not None:
-        _replay(twin, checkpoint, beliefs)
-        plant.restore(checkpoint.plant, checkpoint.asset_state)
-    resumed_at = twin.turns
-
-    def kept(reading: Reading, turn: TwinTurn) -> None:
-        if keep is not None:
-            state, noise_free, monitors = plant.latest()
-            keep(
-                FlownTurn(
-                    control_index=turn.control_index,
-                    next_control=turn.next_control,
-                    observed=reading.observed,
-                    state=state,
-                    observation=noise_free,
-                    monitors=monitors,
-                    asset_state=plant.save_state(),
-                    concluded=turn,
-                )
-            )
-
+        _replay(history, checkpoint)
+        plant.restore(checkpoint.readings, checkpoint.asset_state)
+    history.resumed_at = twin.turns
+    sinks = [] if keep is None else [lambda turn: keep(turn, plant.save_state())]
     unit = f"{scenario.mission.step_name}s"
-    with (progress or SilentProgress()).stage("Flying", total=steps, unit=unit) as stage:
-        stage.advance(resumed_at)
-        source = _Flown(plant, scenario)
-        for reading, turn, seconds in operate(twin, source, kept):
-            beliefs.add(reading.observed, turn)
-            timing.append(seconds)
-            stage.advance(detail=scenario.control_names[turn.control_index])
-    if source.ended is not None:
-        sentence = ended_sentence(scenario, twin.turns, source.ended)
-        beliefs.notices.append((twin.turns - 1, Notice("ended", sentence)))
-    return beliefs.flight(twin, plant.record(), tuple(timing), resumed_at=resumed_at)
+    with (progress or SilentProgress()).stage("Flying", total=scenario.mission.steps, unit=unit) as stage:
+        stage.advance(twin.turns)
+        for turn in operate(twin, plant, *sinks):
+            history.add(turn)
+            stage.advance(detail=scenario.control_names[turn.concluded.control_index])
+    if plant.ended:
+        history.ended = ended_sentence(scenario, twin.turns, plant.ended)
+        history.notices.append((twin.turns - 1, Notice("ended", history.ended)))
+    return history
 
 
 def ended_sentence(scenario: Scenario, turns: int, how: str) -> str:
@@ -270,122 +145,97 @@ def ended_sentence(scenario: Scenario, turns: int, how: str) -> str:
     return f"The asset ended the mission after {turns} of {steps} {unit}s: {how}"
 
 
-def decided_to_end(scenario: Scenario, control_index: int) -> str:
-    """Return that an action has ended a mission, for `ended_sentence`."""
-    return f"the twin decided on `{scenario.control_names[control_index]}`."
-
-
-class _Flown:
-    """A simulated asset as a source: it is flown under the control that the twin proposed.
-
-    Attributes
-    ----------
-    ended : str or None
-        How the asset has ended its simulation before the mission was over, in a sentence.
-    """
-
-    ended: str | None = None
-
-    def __init__(self, plant: Plant, scenario: Scenario) -> None:
-        self._plant, self._scenario = plant, scenario
-
-    def read(self, twin: Twin) -> Reading | None:
-        if twin.turns == self._scenario.mission.steps:
-            return None
-        control = twin.proposed_control
-        before = twin.control_of(twin.turns - 1) if twin.turns else None
-        if before is not None and self._scenario.ends(before):
-            self.ended = decided_to_end(self._scenario, before)
-            return None
-        try:
-            return Reading(self._plant.turn(control, before), control)
-        except FmuEndedError as error:
-            if not twin.turns:
-                raise
-            self.ended = error.sentence
-            return None
-
-    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        raise error
-
-
-@dataclass
-class Beliefs:
-    """What is kept of each turn of a twin, for the store; `sensors` values of each row that is observed."""
-
-    sensors: int | None = None
-    observed: list[Float] = field(default_factory=list)
-    beside: list[Float] = field(default_factory=list)
-    control_index: list[int] = field(default_factory=list)
-    filtered: list[Float] = field(default_factory=list)
-    log_evidence: list[float] = field(default_factory=list)
-    predicted: list[Float] = field(default_factory=list)
-    decision_probability: list[Float] = field(default_factory=list)
-    suspicion: list[Suspicion] = field(default_factory=list)
-    notices: list[tuple[int, Notice]] = field(default_factory=list)
-    learnt_names: tuple[str, ...] = ()
-    learnt: list[Float] = field(default_factory=list)
-    residual: list[Float] = field(default_factory=list)
-
-    def add(self, observed: Float, turn: TwinTurn) -> None:
-        """Keep a turn."""
-        self.observed.append(observed[: self.sensors])
-        self.beside.append(observed[len(self.observed[-1]) :])
-        self.control_index.append(turn.control_index)
-        self.filtered.append(turn.filtered)
-        self.log_evidence.append(turn.log_evidence)
-        self.predicted.append(turn.prediction.predicted)
-        self.decision_probability.append(turn.decision_probability)
-        if turn.suspicion is not None:
-            self.suspicion.append(turn.suspicion)
-        self.notices += [(turn.turn, notice) for notice in turn.notices]
-        if turn.learnt:
-            self.learnt_names = tuple(turn.learnt)
-            self.learnt.append(np.array([learnt.figures for learnt in turn.learnt.values()]))
-        if turn.expected is not None:
-            mean, noise = turn.expected()
-            self.residual.append((self.observed[-1] - mean) / noise)
-
-    def flight(
-        self,
-        twin: Twin,
-        truth: PlantRecord | None,
-        timing: tuple[TurnTiming, ...] = (),
-        *,
-        resumed_at: int = 0,
-        first_turn: int = 0,
-    ) -> Flight:
-        """Return the turns as arrays, see `Flight`; the twin has kept all of them."""
-        count, width = len(self.observed), max(map(len, self.beside), default=0)
-        none = np.full(width, np.nan)  # a row without readings has none of them
-        return Flight(
-            observed=np.array(self.observed),
-            readings=np.array([[*row, *none[len(row) :]] for row in self.beside]).reshape(count, width),
-            control_index=np.array(self.control_index, dtype=np.int64),
-            filtered=np.array(self.filtered),
-            log_evidence=np.array(self.log_evidence),
-            smoothed=twin.smoothed()[-count:],
-            predicted=np.array(self.predicted),
-            decision_probability=np.array(self.decision_probability),
-            truth=truth,
-            timing=timing,
-            resumed_at=resumed_at,
-            first_turn=first_turn,
-            suspicion=tuple(self.suspicion),
-            notices=tuple(self.notices),
-            learnt_names=self.learnt_names,
-            learnt=np.array(self.learnt).reshape(len(self.learnt), len(self.learnt_names), 4),
-            carried=twin.carried[-count:] if self.learnt_names else (),
-        )
-
-
-def _replay(twin: Twin, checkpoint: Checkpoint, beliefs: Beliefs) -> None:
+def _replay(history: History, checkpoint: Checkpoint) -> None:
     """Let the twin see again what was observed, and check that it decides as it did."""
-    for step, observation in enumerate(checkpoint.observed):
-        turn = twin.turn(observation, int(checkpoint.control_index[step]))
-        if turn.next_control != checkpoint.control_index[step + 1]:
+    for step, (reading, decided) in enumerate(zip(checkpoint.readings, checkpoint.decided, strict=True)):
+        turn = Turn(reading, _assimilated(history.twin, reading))
+        if turn.concluded.next_control != decided:
             raise NotResumableError(
                 f"the journal decided otherwise after turn {step} than this version does: "
                 "fly the mission again with --replace."
             )
-        beliefs.add(observation, turn)
+        history.add(turn)
+
+
+STATE_ALLOWANCE = 64_000_000
+STATE_SHARE = 4_000
+"""Bytes of asset states that a checkpoint may hold, and how many more for each turn.
+
+States that need more are kept less often, so that the file grows with the turns and not with their square
+(an asset that is replayed keeps the inputs of all its steps); the turns after the last one are flown again.
+"""
+
+
+class CheckpointFile(JournalFile):
+    """The checkpoint of a run folder, open to be continued.
+
+    Attributes
+    ----------
+    checkpoint : Checkpoint or None
+        Where an earlier process stopped; None if no turn was finished.
+    turns : int
+        Turns in the file.
+    """
+
+    def __init__(self, folder: Path, config_hash: str) -> None:
+        path = folder / JOURNAL_NAME
+        readings: list[Reading] = []
+        decided: list[int] = []
+        whole, state, size, end = 0, "", 0, len(line_of({"config_hash": config_hash}))
+        self._state_bytes = 0
+        for record, behind in read_records(path, config_hash):
+            if record.get("turn") != len(readings):
+                raise damaged(path, len(readings) + 1, f"turn {len(readings)} was expected")
+            try:
+                readings.append(_reading(record))
+                decided.append(int(record["next_control"]))
+                size += len(record["asset_state"] or "")
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                raise damaged(path, len(readings), f"it has another layout, {error}") from error
+            if record["asset_state"] is not None:
+                whole, state, self._state_bytes, end = len(readings), record["asset_state"], size, behind
+        try:
+            content = zlib.decompress(base64.b64decode(state)) if whole else b""
+        except (TypeError, ValueError, zlib.error, binascii.Error) as error:
+            raise damaged(path, whole, f"it has another layout, {error}") from error
+        self.turns = whole
+        self.checkpoint = Checkpoint(readings[:whole], decided[:whole], content) if whole else None
+        super().__init__(folder, config_hash)
+        if whole < len(readings):  # without the state of the asset they are flown again
+            self.truncate(end)
+
+    def keep(self, turn: Turn, asset_state: bytes) -> None:
+        """Add a turn; it is on the disk when this returns.
+
+        Raises
+        ------
+        FileNotWrittenError
+            The disk is full or the folder cannot be written; the turns before are still there.
+        """
+        happened = turn.reading.happened
+        assert happened is not None  # of a simulated asset
+        self.turns += 1
+        state: str | None = base64.b64encode(zlib.compress(asset_state, 1)).decode("ascii")
+        if self._state_bytes + len(state or "") > STATE_ALLOWANCE + STATE_SHARE * self.turns:
+            state = None
+        self._state_bytes += len(state or "")
+        self.append(
+            {
+                "turn": self.turns - 1,
+                "control_index": turn.concluded.control_index,
+                "next_control": turn.concluded.next_control,
+                "observed": plain(turn.reading.observed),
+                "state": plain(happened.state),
+                "observation": plain(happened.observation),
+                "monitors": dict(zip(happened.monitors, plain([*happened.monitors.values()]), strict=True)),
+                "asset_state": state,
+                **belief_record(turn.concluded),
+            }
+        )
+
+
+def _reading(record: dict[str, Any]) -> Reading:
+    monitors = record["monitors"]
+    told = dict(zip(monitors, array_of(list(monitors.values())).tolist(), strict=True))
+    happened = Happened(array_of(record["state"]), array_of(record["observation"]), told)
+    return Reading(array_of(record["observed"]), int(record["control_index"]), happened=happened)

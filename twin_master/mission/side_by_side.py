@@ -4,27 +4,23 @@ What does not depend on the neighbours is the same for every size of a batch: su
 sensors and the draws of one twin, never over twins.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from operator import attrgetter
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from fe.runtime.errors import FiniteElementError
-from fmu_asset.errors import FmuEndedError, FmuError
+from fmu_asset.errors import FmuError
 from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
-from twin_master.mission.loop import Flight, decided_to_end, ended_sentence, fly
-from twin_master.mission.plant import Plant, checked_values
+from twin_master.mission.loop import ended_sentence, fly
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth
+from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth, checked_values, decided_to_end
+from twin_master.mission.turns import History
 from twin_master.network.estimator import Notice
 from twin_master.network.step_many import decide_many, filter_step_many, rationed
-
-__all__ = ["Flights", "fly_one_by_one", "fly_side_by_side"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -33,9 +29,9 @@ IN_FLIGHT = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OS
 """What may end the flight of one asset, and not that of the others."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Flights:
-    """B flown missions of T turns; a twin that failed or ended has NaN, and -1 as control, from there on.
+    """What is kept of B histories; a twin that failed or ended has NaN, and control -1, from there on.
 
     Attributes
     ----------
@@ -44,16 +40,16 @@ class Flights:
     control_index : (B, T)
         Control in force in each turn.
     state : (B, T, F)
-        True state, SI.
+        True state, SI; NaN of a real asset.
     filtered : (B, T, S)
         p(D_t | o_0..o_t).
     log_evidence : (B, T)
         log p(o_t | o_0..o_{t-1}).
-    failure : tuple of str
+    failure : list of str
         What ended the flight of each twin; empty for one that flew to its end.
-    ended : tuple of str
+    ended : list of str
         How the asset of each twin has ended its simulation before that, with what was flown; mostly empty.
-    notices : tuple of tuple
+    notices : list of list
         What each twin told its operator, each notice with its turn.
     """
 
@@ -62,9 +58,9 @@ class Flights:
     state: Float
     filtered: Float
     log_evidence: Float
-    failure: tuple[str, ...]
-    ended: tuple[str, ...]
-    notices: tuple[tuple[tuple[int, Notice], ...], ...]
+    failure: list[str]
+    ended: list[str]
+    notices: list[list[tuple[int, Notice]]]
 
     @classmethod
     def empty(cls, knowledge: Knowledge, count: int) -> "Flights":
@@ -77,75 +73,18 @@ class Flights:
             state=np.full((count, steps, factors), np.nan),
             filtered=np.full((count, steps, size), np.nan),
             log_evidence=np.full((count, steps), np.nan),
-            failure=("",) * count,
-            ended=("",) * count,
-            notices=((),) * count,
+            failure=[""] * count,
+            ended=[""] * count,
+            notices=[[] for _ in range(count)],
         )
 
-    @classmethod
-    def of(cls, knowledge: Knowledge, flight: Flight) -> "Flights":
-        """Return one mission that `fly` has flown."""
-        found = cls.empty(knowledge, 1)
-        for name in ("observed", "control_index", "filtered", "log_evidence"):
-            getattr(found, name)[0, : len(flight.observed)] = getattr(flight, name)
-        found.state[0, : len(flight.observed)] = flight.happened.state
-        ended = "".join(notice.sentence for _, notice in flight.notices if notice.kind == "ended")
-        return replace(found, ended=(ended,), notices=(flight.notices,))
-
-    @classmethod
-    def joined(cls, parts: "Sequence[Flights]") -> "Flights":
-        """Return the missions of several batches as one."""
-        names = ("observed", "control_index", "state", "filtered", "log_evidence")
-        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        failure, ended = (
-            tuple(text for part in parts for text in texts(part))
-            for texts in (attrgetter("failure"), attrgetter("ended"))
-        )
-        notices = tuple(told for part in parts for told in part.notices)
-        return cls(**arrays, failure=failure, ended=ended, notices=notices)
-
-
-class _Plants(Protocol):
-    """The assets of B twins with their truths."""
-
-    def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
-        """Return what is observed (B, G + I) and the true states (B, F), under the controls (B,)."""
-
-    failure: dict[int, str]
-    """What ended the flight of a twin."""
-    ended: dict[int, str]
-    """How an asset has ended its simulation."""
-
-
-class _Each:
-    """Assets of any kind, each driven by its own `Plant`."""
-
-    def __init__(self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]) -> None:
-        pairs = zip(truths, assets, strict=True)
-        self._plants: list[Plant] = [knowledge.plant(truth, asset) for truth, asset in pairs]
-        self._shape = len(self._plants), knowledge.scenario.row_width, len(knowledge.scenario.state)
-        self._before: Index | None = None
-        self._scenario = knowledge.scenario
-        self.failure: dict[int, str] = {}
-        self.ended: dict[int, str] = {}
-
-    def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
-        count, sensors, factors = self._shape
-        observed, state = np.full((count, sensors), np.nan), np.full((count, factors), np.nan)
-        for twin in np.flatnonzero(flying).tolist():
-            before = None if self._before is None else int(self._before[twin])
-            try:
-                observed[twin] = self._plants[twin].turn(int(control[twin]), before)
-                state[twin] = self._plants[twin].latest()[0]
-            except FmuEndedError as error:
-                if step:
-                    self.ended[twin] = ended_sentence(self._scenario, step, error.sentence)
-                else:
-                    self.failure[twin] = str(error)
-            except IN_FLIGHT as error:
-                self.failure[twin] = str(error)
-        self._before = control.copy()
-        return observed, state
+    def put(self, twin: int, history: History) -> None:
+        """Take in the turns of a twin."""
+        turns = len(history.turns)
+        names = ["observed", "control_index", "filtered", "log_evidence"] if turns else []
+        for name in names + ["state"] * history.simulated:
+            getattr(self, name)[twin, :turns] = getattr(history, name)
+        self.ended[twin], self.notices[twin] = history.ended, history.notices
 
 
 class _Stateless:
@@ -160,16 +99,14 @@ class _Stateless:
         self._growth = DamageGrowth(knowledge.true_model)
         self._noise = np.stack([truth.noise for truth in truths])
         self._uniform = np.stack([truth.uniform for truth in truths])
-        self._truths, self._truth = (
-            truths,
-            truths[0],
-        )  # script, drift and losses are the scenario's, the same for all
+        self._truths = truths
+        self._truth = truths[0]  # script, drift and losses are the scenario's, the same for all
         self._before: list[tuple[int | None, int | None]] = [(None, None)] * len(assets)
         self._seen: dict[tuple[int, int, bytes], Float | str] = {}
         self.failure: dict[int, str] = {}
-        self.ended: dict[int, str] = {}  # without memory there is no end
 
     def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
+        """Return what is observed (B, G + I) and the true states (B, F), under the controls (B,)."""
         place, state = self._grown(step, control)
         code = (self._asset * len(self._scenario.control) + control) * self._states.size + place
         _, first, inverse = np.unique(np.where(flying, code, -1), return_index=True, return_inverse=True)
@@ -212,7 +149,7 @@ class _Stateless:
 
 
 def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]) -> Flights:
-    """Fly B missions of one scenario in lock-step.
+    """Fly B missions of one scenario: in lock-step, or one by one where assets have a memory.
 
     Parameters
     ----------
@@ -223,27 +160,24 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
     assets : sequence of Asset
         One for each twin, at its start; one without memory may stand for several twins.
     """
-    scenario, model = knowledge.scenario, knowledge.model
-    count = len(truths)
-    flights = Flights.empty(knowledge, count)
-    stateless = all(isinstance(asset, StatelessAsset) for asset in assets)
-    plants: _Plants = (_Stateless if stateless else _Each)(knowledge, truths, assets)
+    if not all(isinstance(asset, StatelessAsset) for asset in assets):
+        return fly_one_by_one(knowledge, truths, lambda twin, _sound: assets[twin])
+    scenario, model, count = knowledge.scenario, knowledge.model, len(truths)
+    flights, plants = Flights.empty(knowledge, count), _Stateless(knowledge, truths, assets)
     control = np.full(count, scenario.control_names.index(scenario.mission.first_control))
     flying = np.ones(count, dtype=bool)
     ending = np.array([scenario.ends(index) for index in range(len(scenario.control))])
-    budget, inspecting = (
-        scenario.planner.inspections_a_turn,
-        sorted({place for place, *_ in scenario.readings}),
-    )
+    budget, on_belief = scenario.planner.inspections_a_turn, knowledge.plan.on_belief
+    inspecting = sorted({place for place, *_ in scenario.readings})
     before: tuple[Float | None, Index | None] = None, None
     for step in range(scenario.mission.steps):
         if before[1] is not None:
             for twin in np.flatnonzero(flying & ending[before[1]]).tolist():
                 how = decided_to_end(scenario, before[1][twin])
-                plants.ended[twin] = ended_sentence(scenario, step, how)
+                flights.ended[twin] = ended_sentence(scenario, step, how)
                 flying[twin] = False
         observed, state = plants.turn(step, control, flying)
-        flying[[*plants.failure, *plants.ended]] = False
+        flying[[*plants.failure]] = False
         observed[~flying] = np.nan
         likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, control)
         filtered, log_filtered, evidence, impossible = filter_step_many(model, *before, likelihood)
@@ -252,40 +186,48 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
             plants.failure[twin] = str(ImpossibleObservation(scenario.mission.name, step, worst))
         flying &= ~impossible
         log_filtered[impossible] = model.log_prior  # of a failed twin: anything that can be gone on with
-        kept = (
+        for array, row in (
             (flights.observed, observed[:, : scenario.observation.count]),
             (flights.control_index, control),
             (flights.state, state),
-        )
-        for array, row in (*kept, (flights.filtered, filtered), (flights.log_evidence, evidence)):
+            (flights.filtered, filtered),
+            (flights.log_evidence, evidence),
+        ):
             array[flying, step] = row[flying]
         before = log_filtered, control
-        flown, on_belief = control, knowledge.plan.on_belief
         control = decide_many(model, filtered, control, knowledge.plan, scenario.planner.decide_on)
         if budget is not None and on_belief is not None:
             some = np.flatnonzero(flying)
             control[some] = rationed(
-                model, filtered[some], flown[some], control[some], on_belief, inspecting, budget
+                model, filtered[some], before[1][some], control[some], on_belief, inspecting, budget
             )
-    failure, ended = (
-        tuple(told.get(twin, "") for twin in range(count)) for told in (plants.failure, plants.ended)
-    )
-    return replace(flights, failure=failure, ended=ended)
+    for twin, sentence in plants.failure.items():
+        flights.failure[twin] = sentence
+    return flights
 
 
-def fly_one_by_one(knowledge: Knowledge, truths: Sequence[Truth], assets: Iterable[Asset]) -> Flights:
-    """Fly B missions one after the other with `fly`: for twins that learn, or give notice.
+def fly_one_by_one(
+    knowledge: Knowledge, truths: Sequence[Truth], asset_of: Callable[[int, bool], Asset]
+) -> Flights:
+    """Fly B missions in turn with `fly`: for assets with a memory, and twins that learn or give notice.
 
     Parameters
     ----------
-    knowledge, truths, assets
-        As of `fly_side_by_side`; an asset is asked for when its twin begins.
+    knowledge, truths
+        As of `fly_side_by_side`.
+    asset_of : callable
+        Returns the asset of a twin at its start, once its flight begins; told whether the flight before it
+        went to its end.
     """
-    flown = []
-    for truth, asset in zip(truths, assets, strict=True):
+    flights, sound = Flights.empty(knowledge, len(truths)), True
+    for number, truth in enumerate(truths):
+        twin = knowledge.twin()
+        history = History(twin, knowledge.scenario.observation.count)
         try:
-            flight = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truth, asset))
-            flown.append(Flights.of(knowledge, flight))
+            asset = asset_of(number, sound)
+            fly(knowledge.scenario, twin, knowledge.plant(truth, asset), history=history)
         except IN_FLIGHT as error:
-            flown.append(replace(Flights.empty(knowledge, 1), failure=(str(error),)))
-    return Flights.joined(flown)
+            flights.failure[number] = str(error)
+        flights.put(number, history)
+        sound = not flights.failure[number] and not history.ended
+    return flights

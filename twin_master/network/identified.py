@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from twin_master.errors import InvalidObservationError
 from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.scenario.modes import row_width
+from twin_master.scenario.observation import row_width
 
 __all__ = ["IdentifiedSensorModel", "packed_row"]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from reporting import figures as style
 from reporting.words import between, number, rounded
 from twin_master.report.reading import Run
-from twin_master.store.learnt import LearntQuantity
+from twin_master.store.mission_result import LearntQuantity
 
 Float = NDArray[np.float64]
 

@@ -16,15 +16,27 @@ from twin_master.assets.asset_source import calibrated_with
 from twin_master.assets.structure_source import FIELD_NAME
 from twin_master.errors import RunFolderError
 from twin_master.report.belief import belief_figure, policy_figure
-from twin_master.report.calibration import believed, calibrated_rows, calibration_figure, measured, true_value
+from twin_master.report.calibration import (
+    believed,
+    calibrated_rows,
+    calibration_figure,
+    measured,
+    true_value,
+)
 from twin_master.report.check import PredictiveCheck, check_figure, predictive_check
-from twin_master.report.learnt import asset_rows, label_of, learnt_figure, sensor_rows, with_interval
+from twin_master.report.learnt import (
+    asset_rows,
+    label_of,
+    learnt_figure,
+    sensor_rows,
+    with_interval,
+)
 from twin_master.report.mission import choose_sensors, default_now, mission_figure
 from twin_master.report.opening import WORDS, opening_sentences
 from twin_master.report.reading import Run, read_run
 from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
-from twin_master.store.outcome import REPORT_NAME
 from twin_master.store.summary import another_truth
+from twin_master.store.writing import REPORT_NAME
 
 FIGURE_FOLDER = "figures"
 MAIN_FIGURE, NETWORK = "mission_now", "network"

@@ -19,7 +19,7 @@ from twin_master.report.view import PrintedFactor, PrintedSensors, printed_facto
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.learnt import MOMENTS, LearntQuantity, printed_learnt
+from twin_master.store.mission_result import MOMENTS, LearntQuantity, printed_learnt
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME
 from twin_master.store.writing import read_run as read_tree
 

@@ -1,19 +1,135 @@
-"""The table of a scenario that says what is observed, and how well."""
+"""The table of a scenario that says what is observed, and how well: sensors, or modes of a record."""
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal, Self
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import model_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from twin_master.scenario.modes import ROLE, ModesSection, row_width
 from twin_master.scenario.section import (
     Count,
     Name,
     NotNegative,
     PerSensor,
+    Positive,
     Section,
     check_one_or_each,
 )
+
+Float = NDArray[np.float64]
+
+
+ROLE = "modes"
+"""The role of an observation whose values are features of modes."""
+Feature = Literal["frequency", "damping_ratio", "shape"]
+
+
+def row_width(sensors: int) -> int:
+    """Return the length of a row of values and, behind them, the lower triangle of their covariance."""
+    return sensors + sensors * (sensors + 1) // 2
+
+
+class ModesSection(Section):
+    """Which modes are observed, and what of each.
+
+    A value is observed for each mode and each feature that has a standard deviation: frequency, damping
+    ratio, and the shape at each accelerometer behind the first, divided by that at the first.
+    """
+
+    accelerometers: Annotated[tuple[Name, ...], Field(min_length=1)]
+    """Acceleration outputs of the model, the first is the one that shapes are relative to."""
+    bands: Annotated[tuple[tuple[Positive, Positive], ...], Field(min_length=1)]
+    """Least and largest frequency of each mode [Hz]: what a record shows most of in it is the mode."""
+    numbers: tuple[Count, ...] = ()
+    """Number of each mode in the model, in rising order; 1, 2, ... without them."""
+    standard_deviation: dict[Feature, Positive]
+    """Of each feature [Hz, 1, 1], beside that with which it was identified: what changes between records,
+    and what the model is wrong by."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if any(high <= low for low, high in self.bands):
+            raise ValueError("each of `observation.modes.bands` is its least and then its largest frequency")
+        ordered = sorted(self.bands)
+        if any(after[0] < before[1] for before, after in pairwise(ordered)):
+            raise ValueError("`observation.modes.bands` overlap: a mode in both would be observed twice")
+        if self.numbers and len(self.numbers) != len(self.bands):
+            raise ValueError(
+                f"`observation.modes.numbers` gives {len(self.numbers)} modes, and there are "
+                f"{len(self.bands)} bands"
+            )
+        if not self.columns:
+            raise ValueError(
+                "`observation.modes.standard_deviation` names what is observed: one or more of frequency, "
+                "damping_ratio and, with two accelerometers or more, shape"
+            )
+        return self
+
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """Places of the modes in the model (M,), from 0."""
+        return np.array(self.numbers or range(1, len(self.bands) + 1)) - 1
+
+    @property
+    def columns(self) -> list[int]:
+        """Which of frequency, damping ratio and relative shape at each further accelerometer are observed."""
+        found = [
+            place
+            for place, name in enumerate(("frequency", "damping_ratio"))
+            if name in self.standard_deviation
+        ]
+        if "shape" in self.standard_deviation:
+            found += range(2, 1 + len(self.accelerometers))
+        return found
+
+    def filled(self) -> dict[str, Any]:
+        """Return the keys of `[observation]` that follow: count, titles, unit, standard_deviation."""
+        features = ["frequency", "damping_ratio", *self.accelerometers[1:]]
+        kinds: list[Feature] = ["frequency", "damping_ratio"]
+        kinds += ["shape" for _ in self.accelerometers[1:]]
+        each = [
+            (f"{features[column]}_{number + 1}", kinds[column])
+            for number in self.places
+            for column in self.columns
+        ]
+        return {
+            "count": len(each),
+            "titles": tuple(title for title, _ in each),
+            "unit": tuple("Hz" if kind == "frequency" else "1" for _, kind in each),
+            "standard_deviation": tuple(self.standard_deviation[kind] for _, kind in each),
+        }
+
+    def observed(self, values: Float) -> Float:
+        """Return what is observed (..., G) of all values (..., M, 1 + A) of the modes."""
+        return values[..., self.columns].reshape(*values.shape[:-2], -1)
+
+    def covariance(self, of_modes: Float) -> Float:
+        """Return the covariance of what is observed (G, G), of those of the modes (M, 1 + A, 1 + A)."""
+        size = len(self.columns)
+        found = np.zeros((len(of_modes) * size,) * 2)
+        for mode, block in enumerate(of_modes):
+            rows = slice(mode * size, (mode + 1) * size)
+            found[rows, rows] = block[np.ix_(self.columns, self.columns)]
+        return found
+
+
+class RecordSection(Section):
+    """How the record of each turn comes about, for a simulated asset."""
+
+    kind: Literal["ambient", "decay"]
+    """`ambient`: the input is shaken by white noise; `decay`: it is let go."""
+    input: Name
+    """Control input that is shaken or let go."""
+    amplitude: Positive
+    """Root mean square of the shaking, or what is let go, in the unit of the input."""
+    duration: Positive
+    """[s]"""
+    sampling_rate: Positive
+    """[Hz]"""
+    noise: NotNegative = 0.0
+    """Standard deviation of the noise of the accelerometers [m/s^2]."""
 
 
 class ObservationSection(Section):

@@ -1,7 +1,6 @@
 """Reading scenario files: TOML in, a checked `Scenario` out, and one clear sentence for whatever is wrong."""
 
 import hashlib
-import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
@@ -14,11 +13,47 @@ from reporting.section import shown
 from reporting.toml_file import read_toml
 from scenarios import scenario_files
 from twin_master.errors import ScenarioError, UnknownScenarioError
-from twin_master.scenario.asset import KindSection
-from twin_master.scenario.format import from_format_1
-from twin_master.scenario.notice import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
+from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Section
+from twin_master.scenario.tables import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
+
+_OF_SEVERAL = ("component", "connection", "algorithm", "iterations", "tolerance")
+_OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")
+
+
+def from_format_1(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table of format 1 as one of format 2; what is wrong with it stays wrong."""
+    given = table.get("asset")
+    if not isinstance(given, Mapping):
+        return {**table, "format": 2}
+    asset = {key: value for key, value in given.items() if value not in (None, [], (), {})}
+    believed, library = asset.pop("observation_model", None), asset.pop("library", None)
+    design, effects = asset.pop("design", None), asset.pop("model_patch", None)
+    kind = asset.pop("kind", "fmu")
+    flown: dict[str, Any] = {}
+    if kind == "fmu":
+        kind = "fmu" if "file" in asset else "script" if "script" in asset else "design"
+        flown = _of_design(design) if kind == "design" else {}
+    elif kind == "coupled" and "file" in asset:
+        kind = "ssp"
+    if kind not in ("coupled", "ssp"):
+        asset = {key: value for key, value in asset.items() if key not in _OF_SEVERAL}
+    if kind == "strain_library":
+        asset = {key: value for key, value in asset.items() if key not in _OF_FMUS}
+    belief: dict[str, Any] = {"kind": "asset"}
+    if library is not None or believed == "library":
+        belief = {"kind": "library", "file": library, "design": design}
+    elif believed == "design" or (design is not None and believed is None):
+        belief = _of_design(design)
+    if effects is not None:
+        belief["patch"] = effects
+    return {**table, "format": 2, "asset": {"kind": kind} | asset | flown, "belief": belief}
+
+
+def _of_design(design: object) -> dict[str, Any]:
+    if design == CALIBRATED_DESIGN_NAME:
+        return {"kind": "calibration"}
+    return {"kind": "design"} | ({} if design is None else {"design": design})
 
 
 @dataclass(frozen=True)
@@ -107,25 +142,23 @@ def parse_scenario(table: Mapping[str, Any], source: str) -> Scenario:
     except ValidationError as error:
         errors = error.errors(include_url=False, include_context=True)
         # A misspelt key shows up twice, as unknown and as missing: the unknown one tells more.
-        first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
+        first = next((e for e in errors if e["type"] == "unknown_key"), errors[0])
         raise ScenarioError(f"{source}: {_sentence(first, table)}") from None
 
 
 def _sentence(error: Mapping[str, Any], table: Mapping[str, Any]) -> str:
-    location = tuple(error["loc"])
-    kind = error["type"]
-    if kind == "extra_forbidden":
-        keys = _known_keys(location[:-1], table)
-        return f"unknown key `{_written(location, table)}`; the keys known there are {', '.join(keys)}."
+    kind, location = error["type"], tuple(error["loc"])
+    where, value = _written(location, table)
+    if kind == "unknown_key":
+        return f"unknown key `{where}`; the keys known there are {error['ctx']['told']}."
     if kind == "missing":
-        name = _with_unit(_section_at(location[:-1], table), str(location[-1]))
-        return f"`{_written(location, table).removesuffix(str(location[-1]))}{name}` is missing."
+        return f"`{where}` is missing."
+    if kind == "missing_key":  # which may carry a unit
+        return f"`{where.removesuffix(str(location[-1]))}{error['ctx']['told']}` is missing."
     if kind == "value_error":
-        where = _written(location, table)
-        message = str(error["ctx"]["error"])
-        return f"{message}{f' (in `{where}`)' if where else ''}."
+        return f"{error['ctx']['error']}{f' (in `{where}`)' if where else ''}."
     expected = str(error["msg"]).replace("Input should", "should", 1)
-    return f"`{_written(location, table)}` {expected}, and {shown(_value(location, table, error))} came."
+    return f"`{where}` {expected}, and {shown(error['input'] if value is table else value)} came."
 
 
 def _step(node: Any, part: int | str) -> tuple[bool, Any, str]:
@@ -146,59 +179,14 @@ def _step(node: Any, part: int | str) -> tuple[bool, Any, str]:
     return False, None, str(part)
 
 
-def _written(location: tuple[int | str, ...], table: Mapping[str, Any]) -> str:
-    """Return a location as the file has it: keys with their units, entries of arrays counted from 1."""
+def _written(location: tuple[int | str, ...], table: Mapping[str, Any]) -> tuple[str, Any]:
+    """Return a location as the file has it, and what stands there: keys with units, entries from 1."""
     node: Any = table
     text = ""
     for index, part in enumerate(location):
         found, next_node, key = _step(node, part)
-        if not found and index < len(location) - 1:
-            continue  # the name of a branch of a union, which the file does not have
-        if not found and (not isinstance(node, Mapping) or isinstance(part, int)):
-            continue
-        text += key if key.startswith("[") or not text else f".{key}"
-        node = next_node
-    return text
-
-
-def _value(location: tuple[int | str, ...], table: Mapping[str, Any], error: Mapping[str, Any]) -> object:
-    node: Any = table
-    for part in location:
-        found, next_node, _ = _step(node, part)
-        if found:
-            node = next_node
-    return error["input"] if node is table else node
-
-
-def _section_in(annotation: Any) -> type[Section] | None:
-    if isinstance(annotation, type) and issubclass(annotation, Section):
-        return annotation
-    for argument in typing.get_args(annotation):
-        section = _section_in(argument)
-        if section is not None:
-            return section
-    return None
-
-
-def _section_at(location: tuple[int | str, ...], table: Mapping[str, Any]) -> type[Section]:
-    section: type[Section] = Scenario
-    node: Any = table
-    for part in location:
-        field = section.model_fields.get(str(part))
-        inner = None if field is None else _section_in(field.annotation)
-        section = inner if inner is not None else section
-        found, next_node, _ = _step(node, part)
+        # Else the name of a branch of a union, which the file does not have.
+        if found or (index == len(location) - 1 and isinstance(node, Mapping) and isinstance(part, str)):
+            text += key if key.startswith("[") or not text else f".{key}"
         node = next_node if found else node
-        if issubclass(section, KindSection) and section.own_kind() is None and isinstance(node, Mapping):
-            section = section.kinds().get(str(node.get("kind")), section)
-    return section
-
-
-def _known_keys(location: tuple[int | str, ...], table: Mapping[str, Any]) -> list[str]:
-    section = _section_at(location, table)
-    return [_with_unit(section, key) for key in section.model_fields]
-
-
-def _with_unit(section: type[Section], key: str) -> str:
-    """Return a key with the unit that its name may carry, in brackets."""
-    return f"{key}[_{section.units[key]}]" if key in section.units else key
+    return text, node

@@ -11,10 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
-from twin_master.scenario.action import Action, Planner, with_actions
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
-from twin_master.scenario.learning import Learning
-from twin_master.scenario.notice import NoticingOrNot
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
     Count,
@@ -30,9 +27,17 @@ from twin_master.scenario.section import (
     check_same,
     short,
 )
-from twin_master.scenario.transition import ROW_SUM_TOLERANCE, Transition
-from twin_master.scenario.truth import TruthSection
-from twin_master.scenario.watch import WatchSection
+from twin_master.scenario.tables import (
+    ROW_SUM_TOLERANCE,
+    Action,
+    Learning,
+    NoticingOrNot,
+    Planner,
+    Transition,
+    TruthSection,
+    WatchSection,
+    with_actions,
+)
 
 LARGEST_STRAIN_NOISE = 0.1
 """Standard deviation of a strain gauge beyond which a unit was forgotten [1]."""

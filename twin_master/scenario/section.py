@@ -1,9 +1,10 @@
 """A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from reporting.section import shown
 
@@ -65,6 +66,14 @@ def check_one_or_each(key: str, value: object, count: int) -> None:
         )
 
 
+def _wrong_key(
+    kind: Literal["unknown_key", "missing_key"], key: str, told: str, came: object
+) -> InitErrorDetails:
+    sentence = "unknown key, those known there are {told}" if kind == "unknown_key" else "{told} is missing"
+    error = PydanticCustomError(kind, sentence, {"told": told})
+    return InitErrorDetails(type=error, loc=(key,), input=came)
+
+
 class Section(BaseModel):
     """A table of the file: unknown keys are refused, and a unit in a key's name is honoured."""
 
@@ -77,9 +86,25 @@ class Section(BaseModel):
     def _convert_units(cls, table: object) -> object:
         if not isinstance(table, Mapping):
             return table
+        known = {
+            name: f"{name}[_{cls.units[name]}]" if name in cls.units else name for name in cls.model_fields
+        }
+        given = {str(key): cls.split_unit(str(key)) for key in table}
+        bases = {base for base, _ in given.values()}
+        listed = ", ".join(known.values())
+        wrong = [
+            _wrong_key("unknown_key", key, listed, table.get(key))
+            for key, (base, _) in given.items()
+            if base not in known
+        ]
+        required = [name for name in cls.units if cls.model_fields[name].is_required()]
+        wrong += [
+            _wrong_key("missing_key", name, known[name], table) for name in required if name not in bases
+        ]
+        if wrong:
+            raise ValidationError.from_exception_data(cls.__name__, wrong)
         converted: dict[object, object] = {}
-        for key, value in table.items():
-            base, unit = cls.split_unit(str(key))
+        for (key, (base, unit)), value in zip(given.items(), table.values(), strict=True):
             if base in table and unit:
                 raise ValueError(f"`{base}` and `{key}` were both given: keep one of them")
             if unit == "percent":

@@ -1,27 +1,181 @@
-"""Everything that a mission made, before it is stored."""
+"""Everything that a mission made, before it is stored, and what its twin has learnt."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.words import parameter_title
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.setup import learning_filter
-from twin_master.mission.loop import Flight
+from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import Truth
-from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.planner import PlannedPolicy
-from twin_master.network.rewards import RewardModel
-from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.mission.turns import History
+from twin_master.network.estimator import Learnt
 from twin_master.scenario.schema import Scenario
-from twin_master.store.learnt import LearntQuantity, learnt_quantities
-
-__all__ = ["SEVERAL_UNITS", "MissionResult"]
 
 Float = NDArray[np.float64]
+
+
+MOMENTS = ("mean", "standard_deviation", "lower", "upper")
+"""What is kept of each posterior; the last two bound the central 90 % interval."""
+
+_OF_A_SENSOR = re.compile(r"(\w+)\[(\d+)\]")
+_TITLES = {
+    "noise_scale": "factor on the assumed noise of each sensor",
+    "gauge_gain": "relative gain error of each sensor",
+    "gauge_offset": "offset of each sensor",
+    "transition_factor": "factor on the probabilities to leave a state",
+}
+
+
+@dataclass(frozen=True)
+class LearntQuantity:
+    """A quantity that is learnt, of the whole asset or of each of its G sensors.
+
+    Attributes
+    ----------
+    name, title, unit : str
+        In `run.nc`, for people, and of all numbers.
+    course : (T, 4) or (T, G, 4)
+        The figures of `MOMENTS` after each turn; NaN for sensors of which it is not learnt.
+    prior : (4,) or (G, 4)
+        Before the first turn.
+    truth : () or (G,), or None
+        Of a simulated asset, as far as the scenario tells it; NaN for sensors of which it does not.
+    """
+
+    name: str
+    title: str
+    unit: str
+    course: Float
+    prior: Float
+    truth: Float | None
+
+    @property
+    def of_sensors(self) -> bool:
+        """Whether each sensor has its own."""
+        return self.course.ndim == 3
+
+    @property
+    def words(self) -> dict[str, str]:
+        """What names it in the schema of `run.nc`."""
+        of = "sensor" if self.of_sensors else ""
+        return {"quantity": self.name, "title": self.title, "unit": self.unit, "of": of}
+
+
+def learnt_quantities(
+    scenario: Scenario,
+    names: Sequence[str],
+    values: Float,
+    prior: Mapping[str, Learnt],
+    units: Mapping[str, str],
+    *,
+    simulated: bool,
+) -> tuple[LearntQuantity, ...]:
+    """Return what was learnt in T turns.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What was flown.
+    names : (N,)
+        As the estimator gives them: `young_modulus_factor`, or `noise_scale[3]` of sensor 3.
+    values : (T, N, 4)
+        The figures of `MOMENTS`.
+    prior : dict of str to Learnt
+        Before the first turn, by the same names.
+    units : dict of str to str
+        Units of quantities that are not dimensionless.
+    simulated : bool
+        Whether the scenario tells what really happened.
+    """
+    parts: dict[str, list[tuple[int | None, int]]] = {}
+    for place, name in enumerate(names):
+        match = _OF_A_SENSOR.fullmatch(name)
+        base, sensor = (name, None) if match is None else (match[1], int(match[2]) - 1)
+        parts.setdefault(base, []).append((sensor, place))
+    found = []
+    for name, places in parts.items():
+        before = np.array([prior[names[place]].figures for _, place in places])
+        course = values[:, [place for _, place in places]]
+        if places[0][0] is None:
+            course, before = course[:, 0], before[0]
+        else:
+            sensors, count = (
+                [sensor for sensor, _ in places if sensor is not None],
+                scenario.observation.count,
+            )
+            whole, first = np.full((len(values), count, 4), np.nan), np.full((count, 4), np.nan)
+            whole[:, sensors], first[sensors] = course, before
+            course, before = whole, first
+        truth = _truth(scenario, name) if simulated else None
+        title = _TITLES.get(name, parameter_title(name))
+        found.append(LearntQuantity(name, title, units.get(name, "1"), course, before, truth))
+    return tuple(found)
+
+
+def _truth(scenario: Scenario, name: str) -> Float | None:
+    """Return what the scenario tells of a quantity that the twin learns."""
+    truth, observation, known = scenario.truth, scenario.observation, scenario.asset.true_parameters.get(name)
+    if known is not None:
+        return np.asarray(known, dtype=np.float64)
+    if name == "transition_factor" and truth.kind == "random_growth":
+        return np.asarray(1.0)
+    if truth.kind == "asset" or name not in ("noise_scale", "gauge_gain", "gauge_offset"):
+        return None
+    if name == "noise_scale":
+        if np.any(np.asarray(observation.model_error) > 0.0):
+            return None  # noise and model error have one scale, and the error is no noise
+        scale = np.asarray(truth.noise.standard_deviation) / np.asarray(observation.standard_deviation)
+        return np.broadcast_to(scale, (observation.count,)).copy()
+    if scenario.another_model:
+        return None
+    healthy = np.zeros(observation.count)
+    for fault in truth.sensor_faults:
+        if fault.kind == "drift":
+            sensors = range(1, observation.count + 1) if fault.sensors == "all" else fault.sensors
+            healthy[[sensor - 1 for sensor in sensors]] = np.nan
+    return healthy
+
+
+def printed_learnt(name: str, unit: str) -> tuple[float, str]:
+    """Return the factor from the stored unit of a learnt quantity to the printed one, and its name."""
+    if name == "gauge_gain":
+        return 100.0, "%"
+    if name == "gauge_offset" and unit == "1":
+        return 1e6, "microstrain"
+    return 1.0, "" if unit == "1" else unit
+
+
+def learnt_record(quantities: Sequence[LearntQuantity]) -> dict[str, Any]:
+    """Return what was learnt for the summary, a list where each sensor has its own; nothing without any."""
+    if not quantities:
+        return {}
+
+    def plain(values: Float) -> Any:
+        numbers = np.array(values, dtype=object)
+        numbers[~np.isfinite(values)] = None
+        return numbers.tolist()
+
+    return {
+        "learnt": {
+            quantity.name: {
+                "title": quantity.title,
+                "unit": quantity.unit,
+                "prior": {name: plain(quantity.prior[..., k]) for k, name in enumerate(MOMENTS)},
+                "posterior": {name: plain(quantity.course[-1, ..., k]) for k, name in enumerate(MOMENTS)},
+                "truth": None if quantity.truth is None else plain(quantity.truth),
+            }
+            for quantity in quantities
+        }
+    }
+
 
 SEVERAL_UNITS = "see sensor_unit"
 """Unit of a variable over sensors of different units."""
@@ -35,32 +189,20 @@ class MissionResult:
     ----------
     scenario : Scenario
         What was flown.
-    model : GraphicalModel
-        S states, U controls.
-    sensor_model : GaussianSensorModel
-        The twin's predicted observations for each draw of the parameter, and their noise.
-    draws : (E,)
-        Draws of the uncertain parameter.
-    rewards : RewardModel
-        Rewards by state and control.
-    plan : PlannedPolicy
-        Value iteration.
+    knowledge : Knowledge
+        What the twin knew before.
+    flight : History
+        The turns.
     truth : Truth or None
         What the sensors really did; None where nobody knows.
-    flight : Flight
-        The mission.
     units : dict of str to str
         Units of control inputs, monitors and parameters; those that are missing are dimensionless.
     """
 
     scenario: Scenario
-    model: GraphicalModel
-    sensor_model: GaussianSensorModel
-    draws: Float
-    rewards: RewardModel
-    plan: PlannedPolicy
-    truth: Truth | None
-    flight: Flight
+    knowledge: Knowledge
+    flight: History
+    truth: Truth | None = None
     units: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -84,14 +226,15 @@ class MissionResult:
         """What learnt; None where nothing is."""
         if not self.flight.learnt_names:
             return None
-        return learning_filter(self.scenario, self.model, self.sensor_model, self.draws)
+        known = self.knowledge
+        return learning_filter(self.scenario, known.model, known.sensor_model, known.draws.values)
 
     @cached_property
     def expectation(self) -> LearntExpectation | None:
         """What is expected of sensors and rewards by what was learnt; None where nothing is."""
         if self.learning is None:
             return None
-        return LearntExpectation(self.learning, self.rewards, self.plan.policy)
+        return LearntExpectation(self.learning, self.knowledge.rewards, self.knowledge.plan.policy)
 
     @cached_property
     def learnt(self) -> tuple[LearntQuantity, ...]:

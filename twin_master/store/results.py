@@ -1,6 +1,10 @@
-"""A flown mission as labelled arrays: what was observed, believed, predicted, decided, and true."""
+"""A flown mission as labelled arrays, and as tables for people."""
 
-from collections.abc import Mapping
+import csv
+import io
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,341 +15,320 @@ from twin_master.learning.expectation import Expected
 from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.network.inference import known_control
 from twin_master.network.rewards import REWARD_NAMES
-from twin_master.store.learnt import MOMENTS
-from twin_master.store.mission_result import SEVERAL_UNITS, MissionResult
+from twin_master.store.mission_result import MOMENTS, SEVERAL_UNITS, MissionResult
 
 Float = NDArray[np.float64]
 
 
-def groups_of(result: MissionResult) -> dict[str, Group]:
-    """Return the groups of `run.nc` for a mission; every variable carries its unit and a description."""
-    labels = _Labels(result)
-    groups = {
-        "observed": _observed(result, labels),
-        "filtered": _filtered(result, labels),
-        "smoothed": _smoothed(result, labels),
-        "predicted": _predicted(result, labels),
-        "policy": _policy(result, labels),
-        "calibration": labels.group(
-            {
-                "draw_value": (
-                    ("draw",),
-                    result.draws,
-                    result.parameter_unit,
-                    "draws of the uncertain parameter, equally weighted",
-                )
-            },
-            {"parameter": result.scenario.calibration.parameter},
-        ),
-    }
-    if result.learnt:
-        groups["learnt"] = _learnt(result, labels)
-    if result.flight.suspicion:
-        groups["notice"] = _notice(result, labels)
-    if result.truth is not None:
-        groups["truth"] = _truth(result, labels, result.truth)
-    return groups
+SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
+    Path(__file__).with_name("run.toml").read_text(encoding="utf-8")
+)
+"""Axes, unit and meaning of every variable, by its group."""
 
-
-Described = tuple[tuple[str, ...], NDArray[Any], str, str]
-"""Axes, values, unit and description."""
-
-
-class _Labels:
-    """Coordinates of every dimension, and groups that carry those which they use."""
-
-    def __init__(self, result: MissionResult) -> None:
-        scenario, model = result.scenario, result.model
-        names = scenario.state_names
-        self.coordinates: dict[str, Variable] = {
-            "step": Variable(
-                ("step",),
-                result.flight.first_turn + np.arange(len(result.flight.observed)),
-                {"long_name": "step", "units": "1"},
-            ),
-            "sensor": Variable(
-                ("sensor",),
-                np.arange(1, scenario.observation.count + 1),
-                {"long_name": "sensor", "units": "1"},
-            ),
-            "region": Variable(("region",), np.array(names), {"long_name": "factor of the state"}),
-            "control": Variable(("control",), np.array(scenario.control_names), {"long_name": "control"}),
-            "horizon": Variable(
-                ("horizon",),
-                np.arange(1, scenario.mission.prediction_steps + 1),
-                {"long_name": "steps ahead", "units": "1"},
-            ),
-            "reward": Variable(("reward",), np.array(REWARD_NAMES), {"long_name": "reward"}),
-            "draw": Variable(
-                ("draw",), np.arange(len(result.draws)), {"long_name": "draw of the parameter", "units": "1"}
-            ),
-        }
-        observation = scenario.observation
-        self.sensors: dict[str, Variable] = {}
-        if result.observation_unit == SEVERAL_UNITS:
-            unit = np.array(observation.sensor_units)
-            self.sensors["sensor_unit"] = Variable(("sensor",), unit, {"long_name": "unit of each sensor"})
-        if observation.titles:
-            title = np.array(observation.titles)
-            self.sensors["sensor_title"] = Variable(("sensor",), title, {"long_name": "name of each sensor"})
-        self.states = {
-            factor.name: Variable(
-                ("state",),
-                model.states.coordinates[:, index],
-                {"long_name": factor.name, "units": factor.unit},
-            )
-            for index, factor in enumerate(scenario.state)
-        }
-
-    def group(self, variables: Mapping[str, Described], attrs: Mapping[str, str] | None = None) -> Group:
-        dimensions = {name for variable in variables.values() for name in variable[0]}
-        coordinates: dict[str, Variable] = {
-            name: variable for name, variable in self.coordinates.items() if name in dimensions
-        }
-        if "state" in dimensions:
-            coordinates |= self.states
-        if "sensor" in dimensions:
-            coordinates |= self.sensors
-        return Group(
-            {
-                name: Variable(dims, np.asarray(values), {"units": unit, "long_name": text})
-                for name, (dims, values, unit, text) in variables.items()
-            },
-            coordinates,
-            attrs or {},
-        )
-
-
-def _observed(result: MissionResult, labels: _Labels) -> Group:
-    flight, scenario = result.flight, result.scenario
-    role, unit = scenario.observation.role, result.observation_unit
-    variables: dict[str, Described] = {
-        role: (("step", "sensor"), flight.observed, unit, f"{role} as received; NaN where a sensor is lost"),
-        "control_index": (("step",), flight.control_index, "1", "control in force"),
-    }
-    for place, (_, state, name, _) in enumerate(scenario.readings[: flight.readings.shape[1]]):
-        read, text = flight.readings[:, place], "reading of an inspection; NaN where none was asked for"
-        variables[name] = (("step",), read, scenario.state[state].unit, text)
-    for name in sorted(scenario.control[0].values):  # config.json does not keep their order
-        values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
-        variables[name] = (("step",), values, result.units.get(name, "1"), f"{name} in force")
-    return labels.group(variables)
-
-
-def _expected(result: MissionResult, joint: Float, observed: Float | None) -> Expected:
-    """Return what beliefs (..., S, U) say of sensors and rewards where nothing is learnt."""
-    mean, deviation = result.sensor_model.moments(joint)
-    quantiles = result.sensor_model.quantiles(joint, (0.025, 0.975))
-    rewards = result.rewards.expectation(joint, observed)
-    return Expected(
-        mean, deviation, quantiles[..., 0, :], quantiles[..., 1, :], result.sensor_model.noise(joint),
-        rewards.mean, rewards.standard_deviation,
-    )  # fmt: skip
-
-
-def _belief(
-    result: MissionResult, lead: tuple[str, ...], probability: Float, expected: Expected, given: str
-) -> dict[str, Described]:
-    """Return belief, moments, quantities of interest and rewards; `given` says what the belief is given."""
-    states = result.model.states
-    role, unit = result.scenario.observation.role, result.observation_unit
-    sensor = (*lead, "sensor")
-    return {
-        "probability": ((*lead, "state"), probability, "1", f"p(state | {given})"),
-        "mean": (
-            (*lead, "region"),
-            states.mean(probability),
-            result.state_unit,
-            f"mean of each factor given {given}",
-        ),
-        "standard_deviation": (
-            (*lead, "region"),
-            states.standard_deviation(probability),
-            result.state_unit,
-            f"standard deviation of each factor given {given}",
-        ),
-        "quantity_mean": (sensor, expected.mean, unit, f"mean of the noise-free {role} given {given}"),
-        "quantity_standard_deviation": (
-            sensor,
-            expected.standard_deviation,
-            unit,
-            f"standard deviation of the noise-free {role} given {given}",
-        ),
-        "quantity_lower": (sensor, expected.lower, unit, f"2.5 % quantile of the noise-free {role}"),
-        "quantity_upper": (sensor, expected.upper, unit, f"97.5 % quantile of the noise-free {role}"),
-        "reward_mean": ((*lead, "reward"), expected.reward_mean, "1", "mean of each reward, eqs. (9)-(11)"),
-        "reward_standard_deviation": (
-            (*lead, "reward"),
-            expected.reward_standard_deviation,
-            "1",
-            "standard deviation of each reward",
-        ),
-    }
-
+Entry = tuple[str, NDArray[Any], Mapping[str, str]]
+"""A name in the schema, the values, and the words that stand in its braces."""
 
 _DECIDED_ON = {
     "filtered": "the filtered belief of the step",
     "predicted": "the belief predicted for the next step",
 }
+_MOMENT_TITLES = ("mean", "standard deviation", "5 % quantile", "95 % quantile")
 
 
-def _filtered(result: MissionResult, labels: _Labels) -> Group:
-    flight = result.flight
-    if result.expectation is None:
-        joint = known_control(flight.filtered, flight.control_index, len(result.model.controls))
-        expected, how = _expected(result, joint, flight.observed), "that the twin assumes"
-    else:
-        expected = result.expectation.filtered(flight.carried, flight.observed)
-        how = "that the twin has learnt"
-    variables = _belief(result, ("step",), flight.filtered, expected, "observations up to the step")
-    if result.expectation is not None:
-        variables["noise_standard_deviation"] = (
-            ("step", "sensor"),
-            expected.noise,
-            result.observation_unit,
-            "standard deviation of noise and model error of each sensor as learnt",
-        )
-    variables |= {
-        "decision_probability": (
-            ("step", "control"),
-            flight.decision_probability,
-            "1",
-            f"policy averaged over {_DECIDED_ON[result.scenario.planner.decide_on]}; "
-            "its mode is the control of the next step",
-        ),
-        "log_evidence": (("step",), flight.log_evidence, "1", "log p(observation | earlier observations)"),
-        "residual": (
-            ("step", "sensor"),
-            (flight.observed - expected.mean) / expected.noise,
-            "1",
-            f"observation less its filtered mean, in the standard deviations {how}",
-        ),
-        "sensors_received": (
-            ("step",),
-            np.isfinite(flight.observed).sum(axis=1),
-            "1",
-            "sensors received; with none the belief follows the dynamics",
+def groups_of(result: MissionResult) -> dict[str, Group]:
+    """Return the groups of `run.nc` for a mission; every variable carries its unit and a description."""
+    made, plan = _Groups(result), result.knowledge.plan
+    policy = {"control_index": plan.control_index, "action_value": plan.action_value, "value": plan.value}
+    groups = {
+        "observed": made.group("observed", _observed(result)),
+        "filtered": _filtered(result, made),
+        "smoothed": _smoothed(result, made),
+        "predicted": _predicted(result, made),
+        "policy": made.group("policy", _plain(policy)),
+        "calibration": made.group(
+            "calibration",
+            _plain({"draw_value": result.knowledge.draws.values}),
+            attrs={"parameter": result.scenario.calibration.parameter},
         ),
     }
-    return labels.group(variables)
+    if result.learnt:
+        groups["learnt"] = made.group("learnt", _learnt(result))
+    if turns := result.flight.suspicion:
+        told = {name: np.array([getattr(turn, name) for turn in turns]) for name in SCHEMA["notice"]}
+        told["left_out"] = told["left_out"].astype(np.int8)
+        groups["notice"] = made.group("notice", _plain(told))
+    if result.truth is not None:
+        groups["truth"] = made.group("truth", _truth(result, result.truth))
+    return groups
 
 
-def _smoothed(result: MissionResult, labels: _Labels) -> Group:
-    flight = result.flight
-    if result.expectation is None:
-        joint = known_control(flight.smoothed, flight.control_index, len(result.model.controls))
-        expected = _expected(result, joint, flight.observed)
+def _plain(values: Mapping[str, Any]) -> list[Entry]:
+    return [(name, np.asarray(array), {}) for name, array in values.items()]
+
+
+class _Groups:
+    """Makes groups by the schema, each with the coordinates of its axes."""
+
+    def __init__(self, result: MissionResult) -> None:
+        scenario, flight = result.scenario, result.flight
+        observation = scenario.observation
+        self._words = {
+            "role": observation.role,
+            "sensor_unit": result.observation_unit,
+            "state_unit": result.state_unit,
+            "parameter_unit": result.parameter_unit,
+        }
+        labels: dict[str, Any] = {
+            "step": flight.first_turn + np.arange(len(flight.turns)),
+            "sensor": np.arange(1, observation.count + 1),
+            "region": scenario.state_names,
+            "control": scenario.control_names,
+            "horizon": np.arange(1, scenario.mission.prediction_steps + 1),
+            "reward": REWARD_NAMES,
+            "draw": np.arange(len(result.knowledge.draws.values)),
+        }
+        if result.observation_unit == SEVERAL_UNITS:
+            labels["sensor_unit"] = observation.sensor_units
+        if observation.titles:
+            labels["sensor_title"] = observation.titles
+        entries = _plain(labels)
+        for values, factor in zip(result.knowledge.model.states.coordinates.T, scenario.state, strict=True):
+            entries.append(("{factor}", values, {"factor": factor.name, "factor_unit": factor.unit}))
+        self._coordinates = dict(self._variables("coordinates", entries, {}))
+
+    def _variables(
+        self, group: str, entries: Iterable[Entry], words: Mapping[str, str]
+    ) -> Iterator[tuple[str, Variable]]:
+        known = SCHEMA["belief"] | SCHEMA[group] if "given" in words else SCHEMA[group]
+        for name, values, own in entries:
+            told = {**self._words, **words, **own}
+            axes, unit, text = (part.format(**told) for part in known[name])
+            attrs = {"units": unit, "long_name": text} if unit else {"long_name": text}
+            yield name.format(**told), Variable(tuple(axes.split()), values, attrs)
+
+    def group(
+        self, name: str, entries: Iterable[Entry], *, attrs: Mapping[str, str] | None = None, **words: str
+    ) -> Group:
+        """Return a group of the schema; `words` stand in braces of all its entries."""
+        variables = dict(self._variables(name, entries, words))
+        axes = {axis for variable in variables.values() for axis in variable.dims}
+        coordinates = {
+            name: label for name, label in self._coordinates.items() if axes.issuperset(label.dims)
+        }
+        return Group(variables, coordinates, attrs or {})
+
+
+def _observed(result: MissionResult) -> Iterator[Entry]:
+    flight, scenario = result.flight, result.scenario
+    yield "{role}", flight.observed, {}
+    yield "control_index", flight.control_index, {}
+    for place, (_, state, name, _) in enumerate(scenario.readings):
+        words = {"reading": name, "unit": scenario.state[state].unit}
+        yield "{reading}", flight.readings[:, place], words
+    for name in sorted(scenario.control[0].values):  # config.json does not keep their order
+        values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
+        yield "{input}", values, {"input": name, "unit": result.units.get(name, "1")}
+
+
+def _expected(result: MissionResult, belief: Float, observed: Float | None, flown: bool = True) -> Expected:
+    """Return what beliefs (..., S) say of sensors and rewards where nothing is learnt."""
+    known = result.knowledge
+    if flown:
+        joint = known_control(belief, result.flight.control_index, len(known.model.controls))
     else:
-        expected = result.expectation.smoothed(flight.carried, flight.observed)
-    return labels.group(_belief(result, ("step",), flight.smoothed, expected, "all observations"))
+        joint = belief[..., :, None] * known.plan.policy  # (T, H, S, U), eqs. (37)-(39)
+    mean, deviation = known.sensor_model.moments(joint)
+    quantiles = known.sensor_model.quantiles(joint, (0.025, 0.975))
+    rewards = known.rewards.expectation(joint, observed)
+    return Expected(
+        mean, deviation, quantiles[..., 0, :], quantiles[..., 1, :], known.sensor_model.noise(joint),
+        rewards.mean, rewards.standard_deviation,
+    )  # fmt: skip
 
 
-def _predicted(result: MissionResult, labels: _Labels) -> Group:
-    flight = result.flight
-    lead = ("step", "horizon")
-    joint = flight.predicted[..., :, None] * result.plan.policy  # (T, H, S, U), eqs. (37)-(39)
-    given = "observations up to the step, through the policy"
-    if result.expectation is None:
-        expected = _expected(result, joint, None)
-    else:
-        expected = result.expectation.predicted(flight.carried, flight.predicted.shape[1])
-    variables = _belief(result, lead, flight.predicted, expected, given)
-    variables["control_probability"] = (
-        (*lead, "control"),
-        joint.sum(axis=-2),
-        "1",
-        "p(control | observations up to the step): what the policy asks for in the state predicted",
-    )
-    return labels.group(variables)
-
-
-def _policy(result: MissionResult, labels: _Labels) -> Group:
-    plan = result.plan
-    return labels.group(
+def _belief(result: MissionResult, probability: Float, expected: Expected) -> list[Entry]:
+    """Return belief, moments, quantities of interest and rewards."""
+    states = result.knowledge.model.states
+    return _plain(
         {
-            "control_index": (("state",), plan.control_index, "1", "control of the policy in each state"),
-            "action_value": (("state", "control"), plan.action_value, "1", "Q of value iteration, eq. (36)"),
-            "value": (("state",), plan.value, "1", "value of each state"),
+            "probability": probability,
+            "mean": states.mean(probability),
+            "standard_deviation": states.standard_deviation(probability),
+            "quantity_mean": expected.mean,
+            "quantity_standard_deviation": expected.standard_deviation,
+            "quantity_lower": expected.lower,
+            "quantity_upper": expected.upper,
+            "reward_mean": expected.reward_mean,
+            "reward_standard_deviation": expected.reward_standard_deviation,
         }
     )
 
 
-_MOMENT_TITLES = dict(
-    zip(MOMENTS, ("mean", "standard deviation", "5 % quantile", "95 % quantile"), strict=True)
-)
+def _filtered(result: MissionResult, made: _Groups) -> Group:
+    flight, learns = result.flight, result.expectation
+    observed, filtered = flight.observed, flight.filtered
+    if learns is None:
+        expected, how = _expected(result, filtered, observed), "that the twin assumes"
+    else:
+        expected, how = learns.filtered(flight.carried, observed), "that the twin has learnt"
+    beside = {
+        "decision_probability": flight.decision_probability,
+        "log_evidence": flight.log_evidence,
+        "residual": (observed - expected.mean) / expected.noise,
+        "sensors_received": np.isfinite(observed).sum(axis=1),
+    }
+    if learns is not None:
+        beside = {"noise_standard_deviation": expected.noise, **beside}
+    return made.group(
+        "filtered",
+        _belief(result, filtered, expected) + _plain(beside),
+        lead="step",
+        given="observations up to the step",
+        decided_on=_DECIDED_ON[result.scenario.planner.decide_on],
+        how=how,
+    )
 
 
-def _learnt(result: MissionResult, labels: _Labels) -> Group:
-    variables: dict[str, Described] = {}
+def _smoothed(result: MissionResult, made: _Groups) -> Group:
+    flight, learns = result.flight, result.expectation
+    if learns is None:
+        expected = _expected(result, flight.smoothed, flight.observed)
+    else:
+        expected = learns.smoothed(flight.carried, flight.observed)
+    entries = _belief(result, flight.smoothed, expected)
+    return made.group("smoothed", entries, lead="step", given="all observations")
+
+
+def _predicted(result: MissionResult, made: _Groups) -> Group:
+    flight, learns, predicted = result.flight, result.expectation, result.flight.predicted
+    if learns is None:
+        expected = _expected(result, predicted, None, flown=False)
+    else:
+        expected = learns.predicted(flight.carried, predicted.shape[1])
+    controls = {"control_probability": predicted @ result.knowledge.plan.policy}
+    return made.group(
+        "predicted",
+        _belief(result, predicted, expected) + _plain(controls),
+        lead="step horizon",
+        given="observations up to the step, through the policy",
+    )
+
+
+def _learnt(result: MissionResult) -> Iterator[Entry]:
     for quantity in result.learnt:
-        sensor = ("sensor",) if quantity.of_sensors else ()
-        for index, (moment, text) in enumerate(_MOMENT_TITLES.items()):
-            variables[f"{quantity.name}_{moment}"] = (
-                ("step", *sensor),
-                quantity.course[..., index],
-                quantity.unit,
-                f"{quantity.title}: {text} given observations up to the step",
-            )
-            variables[f"{quantity.name}_prior_{moment}"] = (
-                sensor,
-                quantity.prior[..., index],
-                quantity.unit,
-                f"{quantity.title}: {text} before the first step",
-            )
-    return labels.group(variables)
+        for index, (moment, title) in enumerate(zip(MOMENTS, _MOMENT_TITLES, strict=True)):
+            words = {**quantity.words, "moment": moment, "moment_title": title}
+            yield "{quantity}_{moment}", quantity.course[..., index], words
+            yield "{quantity}_prior_{moment}", quantity.prior[..., index], words
 
 
-def _notice(result: MissionResult, labels: _Labels) -> Group:
-    turns = result.flight.suspicion
-    described = {
-        "none_of_these": "p(no state of the model explains the sensors | observations up to the step)",
-        "gauge_off": "p(a single sensor does not show what is there | observations up to the step)",
-        "log_evidence_none": "log e-value of the first: evidence for it over that for the model",
-        "log_evidence_any_gauge": "log e-value of the second",
-        "log_evidence_gauge": "log e-value of each sensor",
-        "left_out": "1 where the readings of a sensor are absurd and left out",
-    }
-    variables: dict[str, Described] = {}
-    for name, text in described.items():
-        values = np.array([getattr(turn, name) for turn in turns])
-        values = values.astype(np.int8) if values.dtype == bool else values
-        variables[name] = (("step", "sensor")[: values.ndim], values, "1", text)
-    return labels.group(variables)
-
-
-def _truth(result: MissionResult, labels: _Labels, truth: Truth) -> Group:
-    record, role = result.flight.happened, result.scenario.observation.role
-    status = truth.status[: len(record.state)]  # the asset may have ended the mission
+def _truth(result: MissionResult, truth: Truth) -> Iterator[Entry]:
+    flight = result.flight
+    status = truth.status[: len(flight.turns)]  # the asset may have ended the mission
     if truth.in_asset:
-        status = np.where(np.isnan(result.flight.observed), SensorStatus.LOST, status).astype(status.dtype)
-    variables: dict[str, Described] = {
-        "state": (
-            ("step", "region"),
-            record.state,
-            result.state_unit,
-            "true value of each factor of the state",
-        ),
-        role: (
-            ("step", "sensor"),
-            record.observation,
-            result.observation_unit,
-            f"true {role}, without noise and faults",
-        ),
-        "sensor_status": (
-            ("step", "sensor"),
-            status,
-            "1",
-            "what each sensor really does: 0 healthy, 1 lost, 2 drifting",
-        ),
-    }
+        status = np.where(np.isnan(flight.observed), SensorStatus.LOST, status).astype(status.dtype)
+    yield "state", flight.state, {}
+    yield "{role}", flight.observation, {}
+    yield "sensor_status", status, {}
     for quantity in result.learnt:
         if quantity.truth is not None:
-            variables[quantity.name] = (
-                ("sensor",) if quantity.of_sensors else (),
-                quantity.truth,
-                quantity.unit,
-                f"true {quantity.title}",
-            )
-    for name, values in sorted(record.monitors.items()):  # a checkpoint does not keep their order
-        variables[name] = (("step",), values, result.units.get(name, "1"), f"{name}, as the asset reports it")
-    return labels.group(variables)
+            yield "{quantity}", quantity.truth, quantity.words
+    for name, values in sorted(flight.monitors.items()):  # a journal does not keep their order
+        yield "{monitor}", values, {"monitor": name, "unit": result.units.get(name, "1")}
+
+
+MICROSTRAIN = 1.0e6
+PERCENT = 100.0
+
+Columns = dict[str, Any]
+"""Numbers or texts of each column, by its heading."""
+
+
+def tables_of(groups: Mapping[str, Group], role: str) -> dict[str, str]:
+    """Return the text of each CSV file by its name.
+
+    Parameters
+    ----------
+    groups
+        As `groups_of` returns them.
+    role
+        What is observed.
+    """
+    steps = {"step": [str(step) for step in groups["observed"]["step"].values]}
+    tables = {
+        "observed": steps | _observations(groups["observed"], role, role),
+        "estimated": steps | _observations(groups["filtered"], "quantity_mean", role),
+        **({"true": steps | _observations(groups["truth"], role, role)} if "truth" in groups else {}),
+        "health": steps | _health(groups),
+        "decisions": steps | _decisions(groups),
+        "policy": _policy(groups),
+    }
+    return {name: _csv(columns) for name, columns in tables.items()}
+
+
+def _observations(group: Group, variable: str, role: str) -> Columns:
+    values, sensors = group[variable].values, group["sensor"].values
+    units = [group[variable].attrs["units"]] * len(sensors)
+    if "sensor_unit" in group.coords:
+        units = [str(unit) for unit in group["sensor_unit"].values]
+    columns = {}
+    for place, (sensor, unit) in enumerate(zip(sensors, units, strict=True)):
+        factor, name = _edge(unit, MICROSTRAIN, "microstrain") if role == "strain" else (1.0, unit)
+        columns[f"{role}_{sensor}_{name}"] = factor * values[:, place]
+    return columns
+
+
+def _health(groups: Mapping[str, Group]) -> Columns:
+    columns = {}
+    for place, region in enumerate(groups["filtered"]["region"].values):
+        factor, unit = _edge(groups["policy"][region].attrs["units"], PERCENT, "percent")
+        if "truth" in groups:
+            columns[f"{region}_true_{unit}"] = factor * groups["truth"]["state"].values[:, place]
+        for kind in ("filtered", "smoothed"):
+            for name in ("mean", "standard_deviation"):
+                columns[f"{region}_{kind}_{name}_{unit}"] = factor * groups[kind][name].values[:, place]
+    return columns
+
+
+def _decisions(groups: Mapping[str, Group]) -> Columns:
+    controls, filtered = groups["policy"]["control"].values, groups["filtered"]
+    asked = filtered["decision_probability"].values
+    rewards = zip(filtered["reward"].values, filtered["reward_mean"].values.T, strict=True)
+    return {
+        "control": controls[groups["observed"]["control_index"].values],
+        **{f"{name}_reward": values for name, values in rewards},
+        **{f"decision_probability_{n}": values for n, values in zip(controls, asked.T, strict=True)},
+        "next_control": controls[asked.argmax(axis=1)],
+    }
+
+
+def _policy(groups: Mapping[str, Group]) -> Columns:
+    policy, columns = groups["policy"], {}
+    for region in groups["filtered"]["region"].values:
+        factor, unit = _edge(policy[region].attrs["units"], PERCENT, "percent")
+        columns[f"{region}_{unit}"] = factor * policy[region].values
+    controls = policy["control"].values
+    columns["control"] = controls[policy["control_index"].values]
+    values = zip(controls, policy["action_value"].values.T, strict=True)
+    return columns | {f"action_value_{name}": action for name, action in values}
+
+
+def _edge(unit: str, factor: float, name: str) -> tuple[float, str]:
+    """Return factor and name of the printed unit of a stored one."""
+    return (factor, name) if unit == "1" else (1.0, unit)
+
+
+def _csv(columns: Columns) -> str:
+    """Return columns as text for people; a cell is empty where nothing was received."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*map(_cells, columns.values()), strict=True))
+    return buffer.getvalue()
+
+
+def _cells(values: Any) -> list[str]:
+    """Return the cells of a column."""
+    if isinstance(values[0], str):
+        return [str(value) for value in values]
+    return ["" if np.isnan(value) else f"{value:.6g}" for value in values]

@@ -1,7 +1,7 @@
 """The figures of a mission, each beside the one that the scenario gives as its reference."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,14 +9,10 @@ from numpy.typing import NDArray
 
 from reporting.words import parameter_title
 from twin_master.assets.mismatch import Misfit
-from twin_master.assets.parameter import ParameterDraws
-from twin_master.mission.loop import Flight
-from twin_master.mission.plant import PlantRecord
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
 from twin_master.network.rewards import REWARD_NAMES
-from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, NOTICE_FIGURES, Reference
-from twin_master.store.learnt import printed_learnt
-from twin_master.store.mission_result import MissionResult
+from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, NOTICE_FIGURES, Scenario
+from twin_master.store.mission_result import MissionResult, printed_learnt
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -63,22 +59,22 @@ class Fallback:
     Attributes
     ----------
     switch_state : str or None
-        The state factor on which alone the policy depends; None if it depends on several or none.
+        The state factor on which the policy alone depends; None if it depends on several or on none.
     switch_level : float or None
-        Level of that factor from which the policy leaves the control of the first turn, SI.
+        Its level, SI, from which on the policy leaves the first control.
     called_for_step : int or None
-        First step at which the truth reaches that level.
+        First step in which the true state reaches that level.
     fallback_step : int or None
-        First step from `called_for_step` on at which another control than that of the first turn is in force.
+        First step from then on that is flown with another control.
     early_step : int or None
-        First step before `called_for_step` with another control.
+        First step before that, if any, that is flown with another control.
     """
 
-    switch_state: str | None
-    switch_level: float | None
-    called_for_step: int | None
-    fallback_step: int | None
-    early_step: int | None
+    switch_state: str | None = None
+    switch_level: float | None = None
+    called_for_step: int | None = None
+    fallback_step: int | None = None
+    early_step: int | None = None
 
     @property
     def delay(self) -> int | None:
@@ -95,12 +91,12 @@ def find_fallback(
 
     Parameters
     ----------
-    states : StateSpace
-        S states of F factors.
+    states
+        The state space.
     policy_index : (S,)
         Control of the policy in each state.
-    first_control : int
-        Control of the first turn.
+    first_control
+        Index of the control of the first step.
     control_index : (T,)
         Controls flown.
     true_state : (T, F)
@@ -108,47 +104,31 @@ def find_fallback(
     """
     switch = policy_switch(states, policy_index, first_control)
     if switch is None:
-        return Fallback(None, None, None, None, None)
+        return Fallback()
     axis, level = switch
-    return _fallback_of(states.factors[axis].name, level, first_control, control_index, true_state[:, axis])
+    called = _first(true_state[:, axis] >= level - _TOLERANCE)
+    left = control_index != first_control
+    before = np.arange(len(left)) < (len(left) if called is None else called)
+    return Fallback(states.factors[axis].name, level, called, _first(left & ~before), _first(left & before))
+
+
+def _first(where: NDArray[np.bool_]) -> int | None:
+    return int(np.argmax(where)) if where.any() else None
 
 
 def policy_switch(states: StateSpace, policy_index: Index, first_control: int) -> tuple[int, float] | None:
     """Return the factor on which alone a policy depends, and the level from which on it leaves a control.
 
-    Parameters
-    ----------
-    states, policy_index, first_control
-        As of `find_fallback`.
-
-    Returns
-    -------
-    (int, float) or None
-        None where the policy depends on several factors or none, or returns to the control. The level is SI.
+    None where it depends on several factors or on none, or comes back to that control at a higher level.
     """
     table = (policy_index != first_control).reshape(states.shape)
     for axis, factor in enumerate(states.factors):
         others = tuple(index for index in range(table.ndim) if index != axis)
         any_of, all_of = table.any(axis=others), table.all(axis=others)
-        switched = np.flatnonzero(all_of)
-        if np.array_equal(any_of, all_of) and len(switched) and all_of[switched[0] :].all():
-            return axis, float(factor.levels[switched[0]])
+        first = _first(all_of)
+        if np.array_equal(any_of, all_of) and first is not None and all_of[first:].all():
+            return axis, float(factor.levels[first])
     return None
-
-
-def _fallback_of(name: str, level: float, first_control: int, control_index: Index, truth: Float) -> Fallback:
-    reached = np.flatnonzero(truth >= level - _TOLERANCE)
-    other = np.flatnonzero(control_index != first_control)
-    called = int(reached[0]) if len(reached) else None
-    before = other[other < called] if called is not None else other
-    after = other[other >= called] if called is not None else other[:0]
-    return Fallback(
-        switch_state=name,
-        switch_level=level,
-        called_for_step=called,
-        fallback_step=int(after[0]) if len(after) else None,
-        early_step=int(before[0]) if len(before) else None,
-    )
 
 
 def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float) -> Float:
@@ -157,71 +137,77 @@ def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float
     return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
 
-def summarise(
-    result: MissionResult, draws: ParameterDraws, reward_mean: Float, misfit: Misfit | None = None
-) -> tuple[Figure, ...]:
+def summarise(result: MissionResult, reward_mean: Float, misfit: Misfit | None = None) -> tuple[Figure, ...]:
     """Return the figures of a mission; all of them are the same for the same seed.
 
     Parameters
     ----------
     result
         The mission.
-    draws
-        The calibrated parameter.
     reward_mean : (T, R)
         Mean rewards under the filtered belief.
     misfit
         Of the twin's model, where the asset is known to be another one.
     """
     scenario, flight = result.scenario, result.flight
-    figures = _scored(result, flight.truth) if flight.truth is not None else _watched(result)
-    for index, name in enumerate(REWARD_NAMES):
-        known = reward_mean[np.isfinite(reward_mean[:, index]), index]
+    step = scenario.mission.step_name
+    figures = _scored(result) if flight.simulated else _watched(result)
+    for name, rewards in zip(REWARD_NAMES, reward_mean.T, strict=True):
+        known = rewards[np.isfinite(rewards)]
         mean = float(known.mean()) if len(known) else None
         figures.append(Figure(f"mean_reward_{name}", f"mean reward for {name}", mean))
-    figures += _parameter_figures(result, draws)
-    figures.append(
-        Figure("log_evidence", "log evidence of all observations", float(flight.log_evidence.sum()))
-    )
+    figures += _parameter_figures(result)
+    evidence = float(flight.log_evidence.sum())
+    figures.append(Figure("log_evidence", "log evidence of all observations", evidence))
     figures += _learnt_figures(result)
-    figures += _sensor_figures(flight.observed, scenario.mission.step_name)
+    figures += _sensor_figures(flight.observed, step)
     if misfit is not None:
-        figures += _misfit_figures(misfit)
-    bound = None if flight.truth is None else flight.truth.monitors.get("strain_error_bound")
+        value, sensor = misfit.largest
+        rms = "misfit of the twin's model, rms over sensors and states"
+        shares = (rms, misfit.rms), (f"largest misfit, at sensor {sensor + 1}", value)
+        for key, (title, share) in zip(MISFIT_FIGURES, shares, strict=True):
+            figures.append(Figure(key, title, 100.0 * share, "%"))
+    bound = flight.monitors.get("strain_error_bound")
     if bound is not None and set(scenario.observation.sensor_units) == {"1"}:
-        figures.append(
-            Figure(
-                "strain_error_bound", "worst certified strain error", 1e6 * float(bound.max()), "microstrain"
-            )
-        )
+        worst = 1e6 * float(bound.max())
+        figures.append(Figure("strain_error_bound", "worst certified strain error", worst, "microstrain"))
     if flight.suspicion:
-        figures += _notice_figures(flight, scenario.mission.step_name)
+        last = flight.suspicion[-1]
+        first = next((turn for turn, notice in flight.notices if notice.kind == "alarm"), None)
+        told: tuple[tuple[str, float | str | None], ...] = (
+            (f"{step} of the first alarm", first),
+            ("probability that no state explains the sensors", last.none_of_these),
+            ("probability that a single sensor is off", last.gauge_off),
+            ("the last control is decided by", last.decided_by),
+        )
+        figures += [Figure(key, *one) for key, one in zip(NOTICE_FIGURES, told, strict=True)]
     references = {entry.figure: entry for entry in scenario.reference}
-    return tuple(_beside(figure, references.get(figure.key)) for figure in figures)
+    return tuple(
+        replace(figure, reference=found.value, reference_source=found.source)
+        if (found := references.get(figure.key))
+        else figure
+        for figure in figures
+    )
 
 
-def _parameter_figures(result: MissionResult, draws: ParameterDraws) -> list[Figure]:
+def _parameter_figures(result: MissionResult) -> list[Figure]:
     """Return what is known of the calibrated parameter before the flight, and after it where it is learnt."""
+    draws = result.knowledge.draws
     name, label = draws.name, parameter_title(draws.name)
+    before = {"mean": draws.mean, "standard_deviation": draws.standard_deviation}
     own = next((quantity for quantity in result.learnt if quantity.name == name), None)
     if own is None:
         measured = result.scenario.calibration.source in ("static_test", "file")
         whose, of = "posterior " if measured else "", label if " " not in label else f"the {label}"
-        mean, deviation = f"{whose}mean of {of}", f"{whose}standard deviation of {of}"
         return [
-            Figure(f"{name}_mean", mean, draws.mean),
-            Figure(f"{name}_standard_deviation", deviation, draws.standard_deviation),
+            Figure(f"{name}_{moment}", f"{whose}{moment.replace('_', ' ')} of {of}", value)
+            for moment, value in before.items()
         ]
-    mean, deviation = own.course[-1, :2].tolist()
+    after = dict(zip(before, own.course[-1, :2].tolist(), strict=True))
     figures = [
-        Figure(f"{name}_mean", f"{label} learnt, mean", mean),
-        Figure(f"{name}_standard_deviation", f"{label} learnt, standard deviation", deviation),
-        Figure(f"{name}_prior_mean", f"{label} before the first turn, mean", draws.mean),
-        Figure(
-            f"{name}_prior_standard_deviation",
-            f"{label} before the first turn, standard deviation",
-            draws.standard_deviation,
-        ),
+        Figure(f"{name}_{key}{moment}", f"{label} {when}, {moment.replace('_', ' ')}", value)
+        for key, when, moments in (("", "learnt", after), ("prior_", "before the first turn", before))
+        for moment, value in moments.items()
     ]
     if own.truth is not None:
         figures.append(Figure(f"{name}_true", f"{label}, true", float(own.truth)))
@@ -267,59 +253,38 @@ def noticed(result: MissionResult) -> dict[str, Any]:
     return {"notices": [{"turn": turn} | vars(notice) for turn, notice in result.flight.notices]}
 
 
-def _notice_figures(flight: Flight, step_name: str) -> list[Figure]:
-    """Return when the first alarm came, and what is left of the model at the end."""
-    alarm, none, gauge, decided = NOTICE_FIGURES
-    last = flight.suspicion[-1]
-    first = next((turn for turn, notice in flight.notices if notice.kind == "alarm"), None)
-    return [
-        Figure(alarm, f"{step_name} of the first alarm", first),
-        Figure(none, "probability that no state explains the sensors", last.none_of_these),
-        Figure(gauge, "probability that a single sensor is off", last.gauge_off),
-        Figure(decided, "the last control is decided by", last.decided_by),
-    ]
+def _printed(unit: str, percent: str = "%") -> tuple[float, str]:
+    """Return the factor from a stored unit of a state to the printed one, and its name."""
+    return (100.0, percent) if unit == "1" else (1.0, unit)
 
 
-def _scored(result: MissionResult, truth: PlantRecord) -> list[Figure]:
+def _scored(result: MissionResult) -> list[Figure]:
     """Return the figures that need the truth: how the control fell back, and errors of the estimate."""
-    scenario, flight, model = result.scenario, result.flight, result.model
-    first = scenario.control_names.index(scenario.mission.first_control)
-    policy = result.plan.control_index
-    fallback = find_fallback(model.states, policy, first, flight.control_index, truth.state)
-    units = {factor.name: factor.unit for factor in scenario.state}
-    figures = _fallback_figures(fallback, units, scenario.mission.step_name)
-    errors = filtered_rms_error(model, flight.filtered, truth.state)
-    for factor, error in zip(scenario.state, errors, strict=True):
-        name, fraction = factor.name, factor.unit == "1"
-        figures.append(
-            Figure(
-                f"filtered_rms_error_{name}",
-                f"filtered rms error of {name}",
-                (100.0 if fraction else 1.0) * float(error),
-                "points" if fraction else factor.unit,
-            )
-        )
+    scenario, flight, known = result.scenario, result.flight, result.knowledge
+    first, step = scenario.control_names.index(scenario.mission.first_control), scenario.mission.step_name
+    policy, states = known.plan.control_index, known.model.states
+    figures = _fallback_figures(
+        find_fallback(states, policy, first, flight.control_index, flight.state), scenario, step
+    )
+    errors = filtered_rms_error(known.model, flight.filtered, flight.state)
+    for factor, error in zip(scenario.state, errors.tolist(), strict=True):
+        scale, unit = _printed(factor.unit, "points")
+        key, title = f"filtered_rms_error_{factor.name}", f"filtered rms error of {factor.name}"
+        figures.append(Figure(key, title, scale * error, unit))
     return figures
 
 
 def _watched(result: MissionResult) -> list[Figure]:
     """Return the figures of a watched asset: what is believed of it now."""
-    states, belief = result.model.states, result.flight.filtered[-1]
+    states, belief = result.knowledge.model.states, result.flight.filtered[-1]
+    moments = {"mean": states.mean(belief), "standard_deviation": states.standard_deviation(belief)}
     figures = []
     for index, factor in enumerate(result.scenario.state):
-        fraction = factor.unit == "1"
-        for moment, value in (
-            ("mean", states.mean(belief)[index]),
-            ("standard_deviation", states.standard_deviation(belief)[index]),
-        ):
-            figures.append(
-                Figure(
-                    f"last_{moment}_{factor.name}",
-                    f"last {moment.replace('_', ' ')} of {factor.name}",
-                    (100.0 if fraction else 1.0) * float(value),
-                    "%" if fraction else factor.unit,
-                )
-            )
+        scale, unit = _printed(factor.unit)
+        for moment, values in moments.items():
+            title = f"last {moment.replace('_', ' ')} of {factor.name}"
+            key = f"last_{moment}_{factor.name}"
+            figures.append(Figure(key, title, scale * float(values[index]), unit))
     return figures
 
 
@@ -351,68 +316,34 @@ def control_changes(
     return ", ".join(changes) + (f", and {more} more change{'s' if more > 1 else ''}" if more else "")
 
 
-def _beside(figure: Figure, reference: Reference | None) -> Figure:
-    if reference is None:
-        return figure
-    return replace(figure, reference=reference.value, reference_source=reference.source)
-
-
-def _fallback_figures(fallback: Fallback, units: Mapping[str, str], step_name: str) -> list[Figure]:
-    level, name = fallback.switch_level, fallback.switch_state
-    unit = units.get(name or "", "")
-    if level is not None and unit == "1":
-        level, unit = 100.0 * level, "%"
-    switch_damage, damage_step, fallback_step, fallback_delay, early_step = FALLBACK_FIGURES
-    if fallback.early_step is not None and fallback.delay == 0:  # in force since before the damage
+def _fallback_figures(fallback: Fallback, scenario: Scenario, step: str) -> list[Figure]:
+    name, level = fallback.switch_state, fallback.switch_level
+    if name is None or level is None:
+        title = "policy leaves the first control"
+        return [Figure(FALLBACK_FIGURES[0], title, "nowhere, or by several states")]
+    scale, unit = _printed(scenario.state[scenario.state_names.index(name)].unit)
+    delay = fallback.delay
+    if fallback.early_step is not None and delay == 0:  # in force since before the damage
         fallback = replace(fallback, fallback_step=None)
-    one = fallback.delay == 1
-    switch = Figure(
-        switch_damage,
-        f"policy leaves the first control from {name}" if name else "policy leaves the first control",
-        level if level is not None else "nowhere, or by several states",
-        unit,
+    told: tuple[tuple[str, float | None, str], ...] = (
+        (f"policy leaves the first control from {name}", scale * level, unit),
+        (f"{step} of the damage that calls for it", fallback.called_for_step, ""),
+        (f"{step} of the fallback", fallback.fallback_step, ""),
+        ("delay of the fallback", delay, step if delay == 1 else f"{step}s"),
+        (f"{step} of a fallback before the damage", fallback.early_step, ""),
     )
-    if name is None:
-        return [switch]
-    return [
-        switch,
-        Figure(damage_step, f"{step_name} of the damage that calls for it", fallback.called_for_step),
-        Figure(fallback_step, f"{step_name} of the fallback", fallback.fallback_step),
-        Figure(
-            fallback_delay, "delay of the fallback", fallback.delay, step_name if one else f"{step_name}s"
-        ),
-        Figure(early_step, f"{step_name} of a fallback before the damage", fallback.early_step),
-    ]
+    return [Figure(key, *one) for key, one in zip(FALLBACK_FIGURES, told, strict=True)]
 
 
 def _sensor_figures(observed: Float, step_name: str) -> list[Figure]:
     received = np.isfinite(observed)
-    blind = np.flatnonzero(~received.any(axis=1))
     if received.all():
         return []
     figures = [Figure("lost_observations", "observations lost", 100.0 * float(1.0 - received.mean()), "%")]
-    if len(blind):
-        steps = ", ".join(str(step) for step in blind)
-        figures.append(
-            Figure(
-                "blind_steps", f"{step_name}s without any observation (belief follows the dynamics)", steps
-            )
-        )
+    if blind := np.flatnonzero(~received.any(axis=1)).tolist():
+        title = f"{step_name}s without any observation (belief follows the dynamics)"
+        figures.append(Figure("blind_steps", title, ", ".join(map(str, blind))))
     return figures
-
-
-def _misfit_figures(misfit: Misfit) -> list[Figure]:
-    rms, largest = MISFIT_FIGURES
-    value, sensor = misfit.largest
-    return [
-        Figure(rms, "misfit of the twin's model, rms over sensors and states", 100 * misfit.rms, "%"),
-        Figure(largest, f"largest misfit, at sensor {sensor + 1}", 100.0 * value, "%"),
-    ]
-
-
-def to_record(figures: Sequence[Figure], heading: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of `summary.json`: the heading, and each figure beside its reference."""
-    return {**heading, "figures": [asdict(figure) for figure in figures]}
 
 
 def another_truth(parameter: str, truth: float, mean: float, deviation: float) -> str | None:

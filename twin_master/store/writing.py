@@ -1,21 +1,28 @@
 """The run store: NetCDF for programs, CSV for people, a summary; every file whole or not there."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text
 from reporting.groups import Group, write_groups
+from reporting.json_file import read_json
 from reporting.netcdf import read_groups
-from twin_master.run_folder import FIELD_NAME, to_json
-from twin_master.store.mission_result import MissionResult
-from twin_master.store.results import groups_of
-from twin_master.store.summary import Figure, to_record
-from twin_master.store.tables import tables_of
+from reporting.provenance import hash_record
+from twin_master.assets.asset_source import FlownAndBelieved
+from twin_master.assets.mismatch import Misfit
+from twin_master.errors import NotResumableError
+from twin_master.run_folder import FIELD_NAME, read_config, to_json
+from twin_master.store.mission_result import MissionResult, learnt_record
+from twin_master.store.results import groups_of, tables_of
+from twin_master.store.summary import Figure, control_changes, noticed, summarise
 
 if TYPE_CHECKING:
     from xarray import DataTree
+
 
 RUN_NAME = "run.nc"
 SUMMARY_NAME = "summary.json"
@@ -60,13 +67,9 @@ def read_run(folder: Path) -> "DataTree":
 
 
 def write_summary(folder: Path, figures: Sequence[Figure], heading: Mapping[str, Any]) -> Path:
-    """Write `summary.json`: each figure beside its reference."""
-    return atomic_write_text(folder / SUMMARY_NAME, to_json(to_record(figures, heading)))
-
-
-def write_timing(folder: Path, timing: Mapping[str, Any]) -> Path:
-    """Write `timing.json`, the only file with wall-clock figures."""
-    return atomic_write_text(folder / TIMING_NAME, to_json(timing))
+    """Write `summary.json`: the heading, and each figure beside its reference."""
+    record = {**heading, "figures": [asdict(figure) for figure in figures]}
+    return atomic_write_text(folder / SUMMARY_NAME, to_json(record))
 
 
 def store_mission(
@@ -95,3 +98,138 @@ def store_mission(
     if write_field is not None:
         write_field(folder / FIELD_NAME)
     return groups
+
+
+def store_flight(
+    folder: Path,
+    config: Mapping[str, Any],
+    result: MissionResult,
+    origin: FlownAndBelieved,
+    *,
+    steps: int,
+    figures: Sequence[Figure] = (),
+    attributes: Mapping[str, Any] | None = None,
+    misfit: Misfit | None = None,
+    write_field: Callable[[Path], object] | None = None,
+) -> None:
+    """Write all that a run or a watch leaves beside its report.
+
+    Parameters
+    ----------
+    folder, result, write_field
+        As of `store_mission`.
+    config
+        Content of `config.json`.
+    origin
+        What was flown, and what the twin believed.
+    steps
+        Turns flown in all, or planned.
+    figures
+        Of the summary, before those of every mission.
+    attributes
+        Further ones of the root of `run.nc`.
+    misfit
+        Of the twin's model, where the asset is known to be another one.
+    """
+    provenance, mission, draws = config["provenance"], result.scenario.mission, result.knowledge.draws
+    flown = {"asset": origin.asset, "twin_model": origin.model}
+    told = {
+        "title": mission.title or mission.name,
+        "scenario": mission.name,
+        "seed": mission.seed,
+        "config_hash": hash_record(config),
+        "versions": json.dumps(provenance["versions"], sort_keys=True),
+        "source_hashes": json.dumps(provenance["source_hashes"], sort_keys=True),
+        "input_hashes": json.dumps(config["inputs"], sort_keys=True),
+        "observed_quantity": result.scenario.observation.role,
+        "parameter": draws.name,
+        "parameter_source": draws.source,
+        **flown,
+        **(attributes or {}),
+    }
+    groups = store_mission(folder, result, told, write_field)
+    flown_controls = result.flight.control_index
+    heading = {
+        "scenario": mission.name,
+        "title": mission.title,
+        "seed": mission.seed,
+        "steps": steps,
+        "control": control_changes(result.scenario.control_names, flown_controls, mission.step_name),
+        **flown,
+        "asset_and_model_differ": origin.differ,
+        **learnt_record(result.learnt),
+        **noticed(result),
+    }
+    rewards = groups["filtered"]["reward_mean"].values
+    write_summary(folder, [*figures, *summarise(result, rewards, misfit)], heading)
+
+
+REPORT_NAME = "report.html"
+"""In the run folder: the report."""
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """A finished run.
+
+    Attributes
+    ----------
+    folder : Path
+        The run folder.
+    report : Path or None
+        The report in it; None where none was asked for.
+    figures : tuple of Figure
+        The summary.
+    timing : dict
+        Content of `timing.json`.
+    origin : FlownAndBelieved
+        What was flown and what the twin believed, in words.
+    step_name : str
+        What a step is called.
+    control : str
+        When which control was left for which, in words.
+    notices : tuple of str
+        What the operator should know, a sentence each.
+    """
+
+    folder: Path
+    report: Path | None
+    figures: tuple[Figure, ...]
+    timing: Mapping[str, Any]
+    origin: FlownAndBelieved
+    step_name: str
+    control: str
+    notices: tuple[str, ...] = ()
+
+
+def read_outcome(folder: Path) -> RunOutcome:
+    """Return what came of the run in a folder.
+
+    Raises
+    ------
+    KeyError, TypeError, DamagedFileError, NotResumableError
+        A result is missing or damaged.
+    """
+    report = folder / REPORT_NAME
+    timing, summary = (read_json(folder / name, DamagedFileError) for name in (TIMING_NAME, SUMMARY_NAME))
+    return RunOutcome(
+        folder,
+        report if report.is_file() else None,
+        tuple(Figure(**figure) for figure in summary["figures"]),
+        timing,
+        FlownAndBelieved(
+            str(summary["asset"]), str(summary["twin_model"]), bool(summary["asset_and_model_differ"])
+        ),
+        str(read_config(folder)["scenario"]["mission"]["step_name"]),
+        str(summary["control"]),
+        tuple(str(notice["sentence"]) for notice in summary.get("notices", ())),
+    )
+
+
+def finished_run(folder: Path) -> RunOutcome | None:
+    """Return the outcome of a run that is finished; None where its results are missing or damaged."""
+    try:
+        read_run(folder)
+        return read_outcome(folder)
+    except (KeyError, TypeError, DamagedFileError, NotResumableError):
+        return None

@@ -22,8 +22,7 @@ from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import Expected, LearntExpectation
 from twin_master.learning.setup import learning_filter
 from twin_master.mission.journal import JOURNAL_NAME, array_of, damaged, whole_record
-from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, kept_knowledge
-from twin_master.mission.preparation import Knowledge
+from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
 from twin_master.network.estimator import Learnt, Notice
 from twin_master.network.inference import known_control, predict
 from twin_master.run_folder import PICTURE, VERDICT, read_config

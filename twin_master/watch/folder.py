@@ -1,6 +1,5 @@
 """A watch: its folder, begun or taken up again, its loop, and what it leaves."""
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -9,38 +8,43 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from reporting.files import atomic_write_bytes, atomic_write_text
+from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
-from twin_master.assets.asset_source import calibrated_with
+from twin_master.assets.asset_source import FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
     last_turn,
-    open_journal,
     read_lines,
     records_backwards,
 )
-from twin_master.mission.kept_knowledge import keep_knowledge, share_knowledge
 from twin_master.mission.loop import Source, operate
-from twin_master.mission.preparation import prepare_knowledge
+from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
-from twin_master.run_folder import PICTURE, TEACHING, VERDICT, tidy, with_inputs
+from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
-from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.summary import Figure, control_changes, noticed, summarise
-from twin_master.store.writing import store_mission, write_summary
-from twin_master.watch.decision import journalled_decision
-from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
+from twin_master.store.summary import Figure
+from twin_master.store.writing import store_flight
+from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping
 from twin_master.watch.keeping import Keeper, Standing
-from twin_master.watch.replay import BelievedModel, replay
-from twin_master.watch.stopping import Stopping
-from twin_master.watch.teaching import Search, Teaching, Tutor, both_patches, check_teachable, notice_of
-from twin_master.watch.trial import Judge, Outcome, Trial, judged, patched_model
+from twin_master.watch.replay import BelievedModel, journalled_decision, replay
+from twin_master.watch.teaching import (
+    LEAST_GAIN,
+    TRIAL_TURNS,
+    Search,
+    Teaching,
+    both_patches,
+    check_teachable,
+    notice_of,
+    trial_sentence,
+    verdict_of,
+)
+from twin_master.watch.trial import CANNOT, Judge, Outcome, Trial, judged, patched_model
 
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
@@ -148,12 +152,20 @@ class Watch:
         """
         with self.begun(feed, patched) as (journal, keep):
             source = Stopping(keep.intake, turns, lambda: self.quiet(decide))
-            tutor = self._tutor(journal, keep, search, source, wait=feed.replayable) if search else None
+            tutor = Tutor(self, journal, search, source, wait=feed.replayable) if search else None
             with source.listening():
                 try:
                     if untold is not None:
                         decide(untold)
-                    self._operate(source, keep, decide, tutor)
+                    taught = True
+                    while taught:  # with one twin after the other: where it is taught, another one goes on
+                        taught = False
+                        if tutor is not None:
+                            tutor.act()
+                        for decision in self.decisions(source, keep):
+                            decide(decision)
+                            if taught := tutor is not None and tutor.due:
+                                break
                 finally:
                     if tutor is not None:
                         tutor.end()
@@ -164,18 +176,18 @@ class Watch:
         """Give the open journal, and what keeps the turns of the twin as it stands after it; see `run`."""
         rejected = RejectedFile(self.folder / REJECTED_NAME)
         intake = Intake(self.scenario, feed, rejected)
-        with open_journal(self.folder, self._hash, FLUSH_SECONDS if feed.replayable else 0.0) as journal:
+        with JournalFile(self.folder, self._hash, FLUSH_SECONDS if feed.replayable else 0.0) as journal:
             self._take_up()
             if patched is not None:
                 self._patch(journal, patched)
-            found = replay(self._path, self.models, self.scenario.watch.lag)
-            intake.restore(None if found.last is None else found.last["intake"])
-            if found.last is not None:
+            found, last = replay(self._path, self.models, self.scenario.watch.lag)
+            intake.restore(None if last is None else last["intake"])
+            if last is not None:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
             self.keep = Keeper(journal, intake, found.twin, self.standing)
-            self.keep.quiet = "quiet" in (found.last or {})
+            self.keep.quiet = "quiet" in (last or {})
             yield journal, self.keep
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
@@ -206,34 +218,6 @@ class Watch:
         keep.write({"notices": decision["notices"], "quiet": decision})
         keep.quiet = True
         decide(decision)
-
-    def _operate(
-        self, source: Stopping, keep: Keeper, decide: Callable[[Mapping[str, Any]], None], tutor: Tutor | None
-    ) -> None:
-        """Watch with one twin after the other: where it is taught, another one goes on."""
-        while True:
-            if tutor is not None:
-                tutor.act()
-            for decision in self.decisions(source, keep):
-                decide(decision)
-                if tutor is not None and tutor.due:
-                    break
-            else:
-                return
-
-    def _tutor(
-        self, journal: JournalFile, keep: Keeper, search: Search, source: Stopping, *, wait: bool
-    ) -> Tutor:
-        check_teachable(self.scenario)
-        keep.taught = True
-
-        def adopt(outcome: Outcome, notice: Mapping[str, Any]) -> None:
-            keep.twin = self.adopt(journal, outcome, notice)
-
-        return Tutor(
-            self.standing.teaching, search, Judge(wait=wait), keep.write, partial(self.trial, journal), adopt,
-            self.scenario.mission.step_name, wait=wait, asked_to_end=lambda: source.asked,
-        )  # fmt: skip
 
     def trial(
         self, journal: JournalFile, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)
@@ -305,58 +289,27 @@ class Watch:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
         first = max(0, turns - last)
-        found = replay(self._path, self.models, None, first_turn=first)
-        flight = found.beliefs.flight(found.twin, None, first_turn=found.first_turn)
-        flight = replace(flight, notices=self.told(first))
-        knowledge, mission = self.models[-1].knowledge, self.scenario.mission
-        result = MissionResult(
-            scenario=self.scenario, model=knowledge.model, sensor_model=knowledge.sensor_model,
-            draws=knowledge.draws.values, rewards=knowledge.rewards, plan=knowledge.plan, truth=None,
-            flight=flight.behind(first - found.first_turn),
-        )  # fmt: skip
-        provenance, origin = self._config["provenance"], self._source.origin
-        attributes = {
-            "title": mission.title or mission.name,
-            "scenario": mission.name,
-            "seed": mission.seed,
-            "config_hash": self._hash,
-            "versions": json.dumps(provenance["versions"], sort_keys=True),
-            "source_hashes": json.dumps(provenance["source_hashes"], sort_keys=True),
-            "input_hashes": json.dumps(self._config["inputs"], sort_keys=True),
-            "observed_quantity": self.scenario.observation.role,
-            "parameter": knowledge.draws.name,
-            "parameter_source": knowledge.draws.source,
-            "asset": WATCHED,
-            "twin_model": origin.model,
-        }
+        found, _ = replay(self._path, self.models, None, first_turn=first)
+        flight = replace(found.behind(first - found.first_turn), notices=self.told(first))
+        result, attributes = MissionResult(self.scenario, self.models[-1].knowledge, flight), {}
         if self.standing.adopted:
-            attributes |= {
-                "model_patch": self.standing.adopted[-1]["patch"],
-                "model_patch_from_step": self.standing.adopted[-1]["from_turn"],
-            }
-        if knowledge.draws.record is not None:
-            text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
-            atomic_write_text(self.folder / "calibration.json", text + "\n")
-        with self._progress.stage("Storing"):
-            groups = store_mission(self.folder, result, attributes)
-            figures = self._figures(counts, turns)
-            figures += summarise(result, knowledge.draws, groups["filtered"]["reward_mean"].values)
-            heading = {
-                "scenario": mission.name, "title": mission.title, "seed": mission.seed, "steps": turns,
-                "control": control_changes(
-                    self.scenario.control_names, result.flight.control_index, mission.step_name
-                ),
-                "asset": WATCHED, "twin_model": origin.model, "asset_and_model_differ": False,
-                **learnt_record(result.learnt), **noticed(result),
+            adopted = self.standing.adopted[-1]
+            attributes = {
+                "model_patch": adopted["patch"], "model_patch_from_step": adopted["from_turn"]
             }  # fmt: skip
-            write_summary(self.folder, figures, heading)
+        origin = FlownAndBelieved(WATCHED, self._source.origin.model)
+        with self._progress.stage("Storing"):
+            store_flight(
+                self.folder, self._config, result, origin, steps=turns,
+                figures=self._figures(counts, turns), attributes=attributes,
+            )  # fmt: skip
         if report:
             from twin_master.report.page import write_report
 
             with self._progress.stage("Writing the report"):
                 write_report(self.folder)
 
-    def told(self, first: int) -> tuple[tuple[int, Notice], ...]:
+    def told(self, first: int) -> list[tuple[int, Notice]]:
         """Return what the operator was told in the turns from `first` on, each sentence once.
 
         What was told before the first turn counts to it.
@@ -367,28 +320,103 @@ class Watch:
             for notice in record["notices"]:
                 found = {**notice, "sensors": tuple(notice["sensors"])}
                 told.setdefault(notice["sentence"], (max(record["turn"], 0), Notice(**found)))
-        return tuple(told.values())
+        return [*told.values()]
 
     def _figures(self, counts: Counts, turns: int) -> tuple[Figure, ...]:
-        steps = f"{self.scenario.mission.step_name}s"
-        figures = [
-            Figure("turns", f"{steps} watched", turns),
-            Figure("missing", f"{steps} predicted through, nothing was received", counts.missing),
-            Figure("late", "messages put in their place late", counts.late),
-            Figure("duplicates", "messages that said nothing new", counts.duplicates),
-            Figure("rejected", f"messages refused ({REJECTED_NAME})", counts.rejected),
-        ]
+        step = self.scenario.mission.step_name
+        told = {
+            "turns": (f"{step}s watched", turns),
+            "missing": (f"{step}s predicted through, nothing was received", counts.missing),
+            "late": ("messages put in their place late", counts.late),
+            "duplicates": ("messages that said nothing new", counts.duplicates),
+            "rejected": (f"messages refused ({REJECTED_NAME})", counts.rejected),
+        }
         for model in self.standing.adopted:
+            first = model["from_turn"]
             for when in ("before", "after"):
-                figures.append(
-                    Figure(
-                        f"gap_{when}_patch_{model['from_turn']}",
-                        f"rms residual {when} the patch of {self.scenario.mission.step_name} "
-                        f"{model['from_turn']}",
-                        model[when]["rms_residual"],
-                    )
-                )
-        return tuple(figures)
+                title = f"rms residual {when} the patch of {step} {first}"
+                told[f"gap_{when}_patch_{first}"] = title, model[when]["rms_residual"]
+        return tuple(Figure(key, title, value) for key, (title, value) in told.items())
 
 
 WATCHED = "watched asset"
+
+
+class Tutor:
+    """Asks, tries and adopts between two turns of a watch.
+
+    Parameters
+    ----------
+    watch : Watch
+        With its turns kept, see `Watch.begun`.
+    journal : JournalFile
+        Of the watch.
+    search : Search
+        Looks for causes.
+    source : Stopping
+        Says whether the watch was asked to end.
+    wait : bool
+        Whether the next turn waits for an answer, as those of a recording do.
+
+    Raises
+    ------
+    MissionInputError
+        Nothing could look into the alarms of the scenario.
+    """
+
+    def __init__(
+        self, watch: Watch, journal: JournalFile, search: Search, source: Stopping, *, wait: bool
+    ) -> None:
+        check_teachable(watch.scenario)
+        watch.keep.taught = True
+        self._watch, self._journal, self._search, self._source = watch, journal, search, source
+        self._teaching, self._judge, self._wait = watch.standing.teaching, Judge(wait=wait), wait
+
+    @property
+    def _over(self) -> bool:
+        """Whether a trial has all of its turns."""
+        trial = self._teaching.trial
+        return trial is not None and self._teaching.turn >= trial["turn"] + TRIAL_TURNS
+
+    @property
+    def due(self) -> bool:
+        """Whether something may have to be done before the next turn."""
+        return self._teaching.question is not None or self._over
+
+    def act(self) -> None:
+        """Do what is due."""
+        watch, teaching, step = self._watch, self._teaching, self._watch.scenario.mission.step_name
+        if (question := teaching.question) is not None:
+            found: Path | TwinMasterError | None
+            try:
+                found = self._search.answer(
+                    question, wait=self._wait, asked_to_end=lambda: self._source.asked
+                )
+            except TwinMasterError as error:
+                found = error
+            if found is not None:
+                verdict = verdict_of(watch.folder, question, found, teaching.turn, step)
+                watch.keep.write({"verdict": verdict})
+        if (trial := teaching.trial) is None or not self._over:
+            return
+        file, compared = watch.folder / trial["folder"] / PATCH, (trial["turn"] + 1, TRIAL_TURNS)
+        try:
+            outcome = self._judge.outcome(
+                partial(watch.trial, self._journal, file, trial["from_turn"], compared)
+            )
+        except CANNOT as error:
+            outcome, sentence = None, f"The patch cannot be believed by this twin: {error}"
+        else:
+            if outcome is None:
+                return
+            sentence = trial_sentence(trial, outcome, step)
+        notice = notice_of("trial", sentence)
+        if outcome is not None and outcome.gained >= LEAST_GAIN:
+            watch.keep.twin = watch.adopt(self._journal, outcome, notice)
+        else:
+            watch.keep.write({"verdict": {**trial, "tried": False, "notice": notice}})
+
+    def end(self) -> None:
+        """End what is under way."""
+        self._search.errand.end()
+        self._judge.end()

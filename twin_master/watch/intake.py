@@ -1,10 +1,15 @@
 """From messages to readings: turns in order, gaps predicted through, late ones in their place."""
 
 import json
+import signal
+import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import FrameType
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +18,7 @@ from numpy.typing import NDArray
 from reporting.files import atomic_write_text, write_error
 from twin_master.errors import TwinMasterError
 from twin_master.learning.setup import words_of
-from twin_master.mission.loop import Reading
+from twin_master.mission.turns import Reading
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
@@ -22,6 +27,7 @@ from twin_master.watch.growing import Place
 from twin_master.watch.message import Message, Refused
 
 Float = NDArray[np.float64]
+
 
 REJECTED_NAME = "rejected.jsonl"
 REJECTED_KEPT = 10_000
@@ -342,3 +348,76 @@ class Intake:
         self._before = before
         merged = np.where(np.isnan(before), message.observed, before)
         self._pending.append((turn, Reading(merged, control, turn, message.unreadable), given))
+
+
+POLL_SECONDS = 0.05
+"""Between two looks at a feed that may go on."""
+
+
+class Stopping:
+    """A source that ends when SIGINT or SIGTERM ask for it: between two turns, never within one.
+
+    Parameters
+    ----------
+    intake : Intake
+        Of the readings.
+    turns : int or None
+        In all, after which it ends.
+    look : callable
+        Called now and then while nothing comes, and behind messages from which no reading comes.
+    """
+
+    def __init__(self, intake: Intake, turns: int | None, look: Callable[[], None]) -> None:
+        self._intake, self._turns, self._look = intake, turns, look
+        intake.look = self._looked
+        self.asked = self._waiting = False
+
+    def read(self, twin: Twin) -> Reading | None:
+        """Return the next reading; None once the watch is to end."""
+        if self.asked or (self._turns is not None and twin.turns >= self._turns):
+            return None
+        try:
+            while not self.asked:
+                self._waiting, begin = True, time.monotonic()
+                if (reading := self._intake.read(twin)) is not None or self._intake.ended:
+                    return reading
+                time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
+                self._looked()
+        except _Asked:
+            pass
+        finally:
+            self._waiting = False
+        return None
+
+    def _looked(self) -> None:
+        self._waiting = False
+        self._look()
+        self._waiting = True
+        if self.asked:
+            raise _Asked
+
+    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
+        """Return what is assimilated in the place of an observation that no state allows."""
+        return self._intake.impossible(reading, error)
+
+    def _ask(self, _signal: int, _frame: FrameType | None) -> None:
+        self.asked = True
+        if self._waiting:
+            raise _Asked
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Listen to the signals."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+class _Asked(BaseException):
+    """Somebody asked the watch to end while it waited."""

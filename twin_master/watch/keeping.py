@@ -19,8 +19,8 @@ from twin_master.mission.journal import (
     read_lines,
     records_backwards,
 )
-from twin_master.mission.loop import Reading
-from twin_master.network.twin import Twin, TwinTurn
+from twin_master.mission.turns import Turn
+from twin_master.network.twin import Twin
 from twin_master.watch.intake import Intake
 from twin_master.watch.teaching import Teaching, notice_of
 
@@ -126,27 +126,28 @@ class Keeper:
         """How long no turn has come [s]."""
         return time.monotonic() - self._heard
 
-    def __call__(self, reading: Reading, turn: TwinTurn) -> None:
+    def __call__(self, turn: Turn) -> None:
         """Write down a reading and what became of it."""
-        at, self.filtered = self.intake.observation_turn, turn.filtered
+        reading, concluded, at = turn.reading, turn.concluded, self.intake.observation_turn
+        number, self.filtered = concluded.turn, concluded.filtered
         record: dict[str, Any] = {
-            "turn": turn.turn,
+            "turn": number,
             "observation_turn": at,
             "observed": plain(reading.observed),
             "control_index": self.twin.control_of(at),
-            "next_control": turn.next_control,
+            "next_control": concluded.next_control,
             "intake": self.intake.state(),
         }
         if reading.revises is not None:
-            record["control_in_force"] = turn.control_index
-        if turn.turn % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1 and reading.revises is None:
+            record["control_in_force"] = concluded.control_index
+        elif number % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1:
             record |= self._standing.snapshot(self.twin, self._journal.size)
-        record |= belief_record(turn)
-        known = {(notice.kind, notice.sensors) for notice in turn.notices}
+        record |= belief_record(concluded)
+        known = {(notice.kind, notice.sensors) for notice in concluded.notices}
         told = [vars(n) for n in self.intake.notices if (n.kind, n.sensors) not in known]
         told += self._standing.teaching.untold if self.taught else []
         if self.quiet:
-            sentence = f"Turn {turn.turn}: observations come again, after {self.silence:.0f} s."
+            sentence = f"Turn {number}: observations come again, after {self.silence:.0f} s."
             told.append(notice_of("heard", sentence))
         if told:
             record["notices"] = record.get("notices", []) + told

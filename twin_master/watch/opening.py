@@ -1,31 +1,41 @@
-"""A watch begun, or taken up again: its folder, and what holds it."""
+"""A watch from its sources to its report, begun or taken up again, and as it stood after a turn."""
 
+import math
 import os
-from collections.abc import Mapping
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
-from reporting.progress import Progress
-from reporting.provenance import collect_provenance
+from reporting.errors import DamagedFileError
+from reporting.json_file import read_json
+from reporting.progress import Progress, SilentProgress
 from twin_master.assets.resolution import (
     Overrides,
     believed_source,
+    given_overrides,
     located_scenario,
-    portable_scenario,
     resolve_scenario,
 )
-from twin_master.errors import NotResumableError
-from twin_master.run_folder import (
-    CONFIG_NAME,
-    KIND,
-    check_versions,
-    create_run_folder,
-    lock_run_folder,
-    read_config,
-)
-from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.mission.journal import JOURNAL_NAME, last_turn
+from twin_master.mission.opening import begin_folder, file_record, released, resume_folder
+from twin_master.report import reading
+from twin_master.run_folder import CONFIG_NAME, check_versions, read_config
+from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.folder import Watch
-from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX
+from twin_master.store.writing import SUMMARY_NAME
+from twin_master.watch.broker import broker_of, is_broker
+from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, check_file, file_feed
+from twin_master.watch.folder import STORED_TURNS, Patched, Watch
+from twin_master.watch.intake import Counts, Feed
+from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX, MqttFeed
+from twin_master.watch.teaching import Search, check_teachable
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def begin_watch(
@@ -46,37 +56,21 @@ def begin_watch(
     return begin_resolved(resolved, file_record(loaded), folder, progress, replace_run=replace_run)
 
 
-def file_record(loaded: LoadedScenario) -> dict[str, str]:
-    """Return name and hash of the file of a scenario, by which a watch of it is known."""
-    return {"name": loaded.path.name, "sha256": loaded.content_hash}
-
-
 def begin_resolved(
     resolved: Scenario, file: Mapping[str, str], folder: Path, progress: Progress, *,
     replace_run: bool = False, like: Watch | None = None,
 ) -> tuple[Watch, int]:  # fmt: skip
     """Make the folder of a watch of a resolved scenario, see `begin_watch` and `Watch`."""
-    source = believed_source(resolved)
-    source.check()
-    config = {
-        "kind": KIND,
-        "format": 1,
-        "watched": True,
-        "scenario": portable_scenario(resolved).to_dict(),
-        "scenario_file": dict(file),
-        "provenance": collect_provenance(resolved.mission.seed).as_dict(),
-    }
     # A watch that takes the place of another ends its session at the broker: it comes under the same name.
-    files = dict(source.files())
-    for path in folder.glob(f"*{CLIENT_SUFFIX}"):
-        files[path.name] = path.read_bytes().partition(b"\n")[0] + f"\n{BEGIN_ANEW}\n".encode()
-    lock = create_run_folder(folder, config, files, replace=replace_run)
-    try:
-        located = located_scenario(portable_scenario(resolved), folder)
+    files = {
+        path.name: path.read_bytes().partition(b"\n")[0] + f"\n{BEGIN_ANEW}\n".encode()
+        for path in folder.glob(f"*{CLIENT_SUFFIX}")
+    }
+    config, located, lock = begin_folder(
+        resolved, file, folder, believed_source(resolved), files, replace=replace_run, watched=True
+    )
+    with released(lock):
         return Watch(folder, config, located, progress, like), lock
-    except BaseException:
-        os.close(lock)
-        raise
 
 
 def resume_watch(
@@ -89,26 +83,295 @@ def resume_watch(
     NotResumableError
         The folder holds no watch, or one of another scenario or version.
     """
-    config = read_config(folder)
-    if not config.get("watched"):
+    if not read_config(folder).get("watched"):
         raise NotResumableError(
             f"{folder} holds a run, no watch: continue it with `uav-twin run --resume {folder}`."
         )
-    file = config["scenario_file"]
-    if loaded is not None and file.get("sha256") != loaded.content_hash:
-        raise NotResumableError(f"{folder} watches another scenario ({file.get('name')}) than {loaded.path}.")
-    scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
-    lock = lock_run_folder(folder)
+    config, scenario, lock = resume_folder(folder, loaded)
+    with released(lock):
+        try:
+            check_versions(folder, config, scenario.mission.seed)
+            return Watch(folder, config, scenario, progress, like), lock
+        except NotResumableError as error:
+            error.add_note(
+                "--replace would remove what was observed; another watch, in another folder, takes it in "
+                f"with `--observations {folder}`."
+            )
+            raise
+
+
+@contextmanager
+def flown(folder: Path, first: int | None, last: int | None, progress: Progress) -> Iterator[Path]:
+    """Give the run folder of a flight up to a turn: of a watch, which may go on, a copy that ended there.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a run, which is given as it is, or of a watch, which is only read.
+    first, last : int or None
+        The first turn that is wanted, and the last one; None for all that are in the journal.
+    progress : Progress
+        Shows stages.
+
+    Raises
+    ------
+    NotResumableError
+        The journal was changed or is damaged.
+    MissionInputError
+        There is no turn from the first one on.
+    """
+    config = _config(folder)
+    if config is None:
+        yield folder
+        return
+    turn, end = last_turn(folder / JOURNAL_NAME, math.inf if last is None else last)
+    if first is not None and turn < first:
+        known = f"the turns 0 to {turn}" if turn >= 0 else "no turn"
+        limit = "" if last is None else f" up to turn {last}"
+        raise MissionInputError(f"{folder} has {known}{limit}, and none from {first} on.")
+    with TemporaryDirectory(prefix="uav_twin_") as place:
+        copy = Path(place) / folder.resolve().name
+        copy.mkdir()
+        shutil.copy(folder / CONFIG_NAME, copy)
+        shutil.copytree(folder / "asset", copy / "asset")
+        with (folder / JOURNAL_NAME).open("rb") as journal:
+            (copy / JOURNAL_NAME).write_bytes(journal.read(end))
+        scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
+        Watch(copy, config, located_scenario(scenario, copy), progress).store(Counts(), report=False)
+        yield copy
+
+
+def open_run(folder: Path | str) -> "xr.DataTree":
+    """Return everything that a run or a watch left, `run.nc`, as labelled arrays in memory.
+
+    A watch that goes on, or was killed, is read as it would be had it ended after the last turn of its
+    journal, and is not touched.
+
+    Returns
+    -------
+    xarray.DataTree
+        The groups `observed`, `filtered`, `smoothed`, `predicted`, `policy`, `calibration` and `truth`; each
+        variable has its unit in `.attrs["units"]`. See `docs/run_folder.md`.
+
+    Raises
+    ------
+    RunFolderError
+        There is no ``run.nc``, or it is damaged; or nothing was observed yet.
+    NotResumableError
+        The journal of a watch was changed or is damaged.
+    """
+    if _config(Path(folder)) is None or stored(Path(folder)):
+        return reading.open_run(folder)
+    with flown(Path(folder), None, None, SilentProgress()) as ended:
+        return reading.open_run(ended)
+
+
+def stored(folder: Path) -> bool:
+    """Return whether the files of a watch have the last turn of its journal."""
     try:
-        check_versions(folder, config, scenario.mission.seed)
-        return Watch(folder, config, located_scenario(scenario, folder), progress, like), lock
-    except NotResumableError as error:
-        os.close(lock)
+        ended = read_json(folder / SUMMARY_NAME, DamagedFileError)["steps"]
+    except (DamagedFileError, KeyError, TypeError):
+        return False
+    return bool(ended == last_turn(folder / JOURNAL_NAME)[0] + 1)
+
+
+def _config(folder: Path) -> dict[str, Any] | None:
+    """Return the configuration of a watch; None where the folder holds something else."""
+    config = read_json(folder / CONFIG_NAME, NotResumableError) if (folder / CONFIG_NAME).is_file() else None
+    return config if isinstance(config, dict) and config.get("watched") else None
+
+
+Decide = Callable[[Mapping[str, Any]], object]
+Observations = Iterable[Mapping[str, Any]] | str | Path
+STANDARD_INPUT = "-"
+
+
+def watch(
+    scenario: LoadedScenario | str | Path | None = None,
+    observations: Observations | None = None,
+    folder: Path | str | None = None,
+    overrides: Overrides | Mapping[str, Any] | None = None,
+    *,
+    decide: Decide = lambda _decision: None,
+    resume: bool = False,
+    follow: bool = False,
+    turns: int | None = None,
+    model_patch: Path | str | None = None,
+    from_turn: int | None = None,
+    teach: bool = False,
+    allow_unknown: bool = False,
+    ca_file: Path | str | None = None,
+    replace: bool = False,
+    last: int = STORED_TURNS,
+    report: bool = True,
+    otherwise: str | None = None,
+    begun: Callable[[Watch], object] = lambda _watch: None,
+    progress: Progress | None = None,
+) -> Path:
+    """Watch a real asset until its observations end; return the folder, which `open_run` reads.
+
+    Parameters
+    ----------
+    scenario
+        The scenario, its shipped name, or its file; it may be left out where a watch is resumed.
+    observations
+        Messages as they come, mappings of the keys that `docs/watch.md` lists; a recording: a CSV or NetCDF
+        file, or the folder of another watch or run; ``mqtt://[USER@]HOST[:PORT]/TOPIC`` or ``mqtts://``,
+        where the decisions are published, too; ``-``: JSON lines on standard input. The recording of the
+        scenario if left out.
+    folder
+        The folder to make; ``runs/NAME`` by default.
+    overrides
+        What differs from the file: ``seed``, ``calibration``, ``library``, ``learnt``.
+    decide
+        Told the decision of each turn, once the turn is written down; first the last one again where a kill
+        may have left it untold.
+    resume
+        Take up the watch in the folder.
+    follow
+        Wait at the end of a CSV file for more.
+    turns
+        Turns in all after which to end.
+    model_patch, from_turn
+        A patch, such as `patch.json` of `discrepancy run`, and the turn from which on it is believed; with
+        `resume`.
+    teach
+        Look for the cause of an alarm, and believe what is named and proved on later turns.
+    allow_unknown
+        Pass over keys and columns that are no sensor.
+    ca_file
+        Certificate of the authority of an ``mqtts://`` broker.
+    replace
+        Take the place of an existing folder.
+    last
+        Turns, the last ones, in `run.nc` and report.
+    report
+        Draw the report.
+    otherwise
+        Observations where neither they nor a scenario with a recording are given.
+    begun
+        Told the watch once its folder is held, before anything is read.
+    progress
+        Shows the stages, and tells of brokers.
+
+    Raises
+    ------
+    RunFolderExistsError, NotResumableError
+        The folder exists, or holds no such watch.
+    MissionInputError
+        There are no observations, they cannot be read, what is asked does not go together, or `teach` is
+        asked of an asset that cannot be taught.
+    TwinMasterError, FiniteElementError, CalibrationError
+        With one clear sentence; what was observed is kept.
+    """
+    loaded = scenario if isinstance(scenario, LoadedScenario | None) else load_scenario(scenario)
+    given, progress = given_overrides(overrides), progress or SilentProgress()
+    authority = None if ca_file is None else Path(ca_file)
+    patch = None if model_patch is None or from_turn is None else Patched(Path(model_patch), from_turn)
+    if (model_patch, from_turn) != (None, None) and (patch is None or not resume):
+        raise MissionInputError("--model-patch and --from-turn go together, with --resume.")
+    if loaded is not None:
+        if teach:
+            check_teachable(loaded.scenario)
+        observations = _source(observations, loaded.scenario.moved(loaded.path.parent), otherwise)
+    if isinstance(observations, str | Path):
+        own = None if loaded is None else _allowing(loaded.scenario, allow_unknown)
+        _check_source(str(observations), own, follow, authority)
+    watched, lock = _opened(loaded, observations, folder, given, progress, resume=resume, replace=replace)
+    try:
+        begun(watched)
+        known = _allowing(watched.scenario, allow_unknown)
+        source = _source(observations, known, otherwise)
+        feed, publish, close = _feed(source, watched, known, follow, authority, progress)
+
+        def tell(decision: Mapping[str, Any]) -> None:
+            decide(decision)
+            publish(decision)
+
+        try:
+            # A kill may have left the last decision untold.
+            untold = None if stored(watched.folder) else watched.last_decision()
+            search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
+            counts = watched.run(feed, tell, turns=turns, patched=patch, search=search, untold=untold)
+        finally:
+            close()
+        watched.store(counts, last=last, report=report)
+    except Exception as error:
         error.add_note(
-            "--replace would remove what was observed; another watch, in another folder, takes it in with "
-            f"`--observations {folder}`."
+            f"What was observed is kept: go on with `uav-twin watch --resume --out {watched.folder}`."
         )
         raise
-    except BaseException:
+    finally:
         os.close(lock)
-        raise
+    return watched.folder
+
+
+def _source(observations: Observations | None, scenario: Scenario, otherwise: str | None) -> Observations:
+    """Return where observations come from: what is given, else the recording of the scenario."""
+    for source in (observations, scenario.watch.recording, otherwise):
+        if source is not None:
+            return source
+    raise MissionInputError(
+        f"{scenario.mission.name} names no recording: give the observations that are to be watched."
+    )
+
+
+def _allowing(scenario: Scenario, unknown: bool) -> Scenario:
+    """Return a scenario that passes over keys and columns that are no sensor, if that is asked."""
+    section = scenario.watch.model_copy(update={"allow_unknown": scenario.watch.allow_unknown or unknown})
+    return scenario.model_copy(update={"watch": section})
+
+
+def _check_source(observations: str, scenario: Scenario | None, follow: bool, authority: Path | None) -> None:
+    """Find slips of the pen before a model is built and a folder made."""
+    if is_broker(observations):
+        broker_of(observations, authority)
+    elif observations != STANDARD_INPUT and scenario is not None:
+        file_feed(Path(observations), scenario, follow=follow)
+    elif observations != STANDARD_INPUT:
+        check_file(Path(observations), follow=follow)
+    elif follow:
+        raise MissionInputError("--follow belongs to a CSV file; standard input is read to its end anyway.")
+
+
+def _opened(
+    loaded: LoadedScenario | None, observations: Observations | None, out: Path | str | None,
+    overrides: Overrides, progress: Progress, *, resume: bool, replace: bool,
+) -> tuple[Watch, int]:  # fmt: skip
+    """Return the watch, begun or taken up, and what holds its folder."""
+    if resume and (replace or overrides != Overrides()):
+        raise MissionInputError(
+            "a watch is taken up with what its folder holds: give nothing beside --resume that changes it."
+        )
+    if out is None and loaded is not None:
+        out = Path("runs") / loaded.scenario.mission.name
+    if out is None or (loaded is None and not resume):
+        raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
+    folder = Path(out)
+    if resume or loaded is None:
+        return resume_watch(folder, loaded, progress)
+    source = Path(observations).resolve() if isinstance(observations, str | Path) else None
+    if replace and source is not None and folder.resolve() in (source, *source.parents):
+        raise MissionInputError(
+            f"--replace would remove the observations in {observations} before they are read: choose another "
+            "--out."
+        )
+    return begin_watch(loaded, folder, overrides, progress, replace_run=replace)
+
+
+def _feed(
+    observations: Observations, watched: Watch, scenario: Scenario, follow: bool, authority: Path | None,
+    progress: Progress,
+) -> tuple[Feed, Decide, Callable[[], None]]:  # fmt: skip
+    """Return where observations come from, who else is told the decisions, and what ends both."""
+    if isinstance(observations, str) and is_broker(observations):
+        mqtt = MqttFeed(broker_of(observations, authority), watched, progress.note, scenario)
+        return mqtt, mqtt.decide, mqtt.close
+    feed: Feed
+    if not isinstance(observations, str | Path):
+        feed = MappingFeed(observations, scenario)
+    elif str(observations) == STANDARD_INPUT:
+        feed = JsonLinesFeed(scenario)
+    else:
+        feed = file_feed(Path(observations), scenario, follow=follow)
+    return feed, lambda _decision: None, lambda: None

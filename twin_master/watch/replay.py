@@ -1,4 +1,4 @@
-"""The journal of a watch, read back: the twin as it was, to the last bit, and the turns that are stored."""
+"""The journal of a watch, read back: what was told, the twin as it was, the turns that are stored."""
 
 import base64
 import zlib
@@ -12,11 +12,70 @@ from numpy.typing import NDArray
 
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal import array_of, damaged, read_lines, records_backwards
-from twin_master.mission.loop import Beliefs
 from twin_master.mission.preparation import Knowledge
-from twin_master.network.twin import Twin
+from twin_master.mission.turns import History, Reading, Turn
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.inference import known_control
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
+
+
+_SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
+"""What is told of a suspicion."""
+
+
+def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
+    """Return what the operator is told with a line of a journal: never a control without its certainty.
+
+    Nothing where it tells no decision.
+    """
+    if "quiet" in line:
+        return dict(line["quiet"])
+    if "filtered" not in line:
+        return {}
+    filtered = array_of(line["filtered"])
+    mean, deviation = model.states.mean(filtered), model.states.standard_deviation(filtered)
+    controls, coming = scenario.control_names, line["next_control"]
+    record = {
+        "turn": line["turn"],
+        "control": controls[line.get("control_in_force", line["control_index"])],
+        "health": {
+            factor.name: {"mean": mean[index], "standard_deviation": deviation[index], "unit": factor.unit}
+            for index, factor in enumerate(scenario.state)
+        },
+        "next_control": controls[coming],
+        "probability": min(float(line["decision_probability"][coming]), 1.0),
+        "lost_sensors": line["observed"][: scenario.observation.count].count(None),
+        "log_evidence": line["log_evidence"],
+        "notices": line.get("notices", []),
+    }
+    if "suspicion" in line:
+        record |= {name: line["suspicion"][name] for name in _SUSPECTED}
+    if "control_in_force" in line:
+        record["revised_by_turn"] = line["observation_turn"]
+    if "learnt" in line:
+        record["learnt"] = line["learnt"]
+    return record
+
+
+def gap_of(history: History, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:
+    """Return root mean square residual and log evidence of the turns behind `skipped`; None without any.
+
+    The residuals are in standard deviations of the noise that is assumed, or learnt where the twin learns.
+    """
+    left = history.behind(skipped)
+    if not left.turns or np.isnan(left.observed).all():
+        return {"rms_residual": None, "log_evidence": None}
+    residual = left.residual()
+    if not len(residual):
+        joint = known_control(left.filtered, left.control_index, sensors.control_count)
+        residual = (left.observed - sensors.moments(joint)[0]) / sensors.noise(joint)
+    return {
+        "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
+        "log_evidence": float(np.sum(left.log_evidence)),
+    }
 
 
 @dataclass(frozen=True)
@@ -35,32 +94,14 @@ class BelievedModel:
     knowledge: Knowledge
 
 
-@dataclass
-class Replayed:
-    """A watch, filtered again from a snapshot.
-
-    Attributes
-    ----------
-    twin : Twin
-        After the last turn.
-    beliefs : Beliefs
-        Of the turns that were filtered again.
-    first_turn : int
-        Of these.
-    last : dict or None
-        The last line of the journal; None before the first turn.
-    """
-
-    twin: Twin
-    beliefs: Beliefs
-    first_turn: int = 0
-    last: dict[str, Any] | None = None
+Seen = Mapping[int, tuple[Float, int]]
+"""What was observed in a turn, and the control in force."""
 
 
 def replay(
     path: Path, models: Sequence[BelievedModel], lag: int | None, *, first_turn: int | None = None,
     end: int | None = None, question: BelievedModel | None = None,
-) -> Replayed:  # fmt: skip
+) -> tuple[History, dict[str, Any] | None]:  # fmt: skip
     """Filter the end of a watch again, what came late in its place.
 
     The journal is read from its end to the last state of the twin that lies before what is wanted.
@@ -110,19 +151,17 @@ def replay(
             number = sum(after <= begin for _, after in read_lines(path, None))
             raise damaged(path, number, f"it has another layout, {error}") from error
     found = _filtered(settled, seen, [*models, *([question] if question else [])], lag)
-    found.last = last
     if last is not None and question is None and last["next_control"] != found.twin.proposed_control:
         raise NotResumableError(
             f"the journal decided otherwise after turn {last['turn']} than this version does: begin "
             f"another watch, in another folder, with `--observations {path.parent}`."
         )
-    return found
+    return found, last
 
 
 def _filtered(
-    settled: tuple[int, bytes], seen: Mapping[int, tuple[Float, int]], given: Sequence[BelievedModel],
-    lag: int | None,
-) -> Replayed:  # fmt: skip
+    settled: tuple[int, bytes], seen: Seen, given: Sequence[BelievedModel], lag: int | None
+) -> History:
     # A model that was adopted from an earlier turn on than one before it takes its place altogether.
     models = [
         model
@@ -135,14 +174,13 @@ def _filtered(
     twin = models[at].knowledge.twin(lag=lag)
     if settled[1]:
         twin.restore_state(settled[1])
-    sensors = models[at].knowledge.scenario.observation.count
-    found = Replayed(twin, Beliefs(sensors), first_turn=twin.turns)
+    found = History(twin, models[at].knowledge.scenario.observation.count)
     while twin.turns in seen:
         if at + 1 < len(models) and models[at + 1].from_turn <= twin.turns:
             at += 1
-            following = models[at].knowledge.twin(lag=lag)
-            following.restore_state(twin.save_state())
-            twin = found.twin = following
-        observed, control = seen[twin.turns]
-        found.beliefs.add(observed, twin.turn(observed, control))
+            state, twin = twin.save_state(), models[at].knowledge.twin(lag=lag)
+            twin.restore_state(state)
+            found.twin = twin
+        reading = Reading(*seen[twin.turns])
+        found.add(Turn(reading, twin.turn(reading.observed, reading.control)))
     return found

@@ -8,12 +8,10 @@ turn in which it came.
 
 import json
 import math
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +20,7 @@ from reporting.json_file import read_json
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.trial import CANNOT, Judge, Outcome, Trial, beside, last_words
+from twin_master.watch.trial import Errand, Outcome
 
 SETTLE_TURNS = 10
 """Turns that an alarm must hold before its cause is looked for; they also show what it is."""
@@ -174,7 +172,7 @@ class Search:
     watch: Path
     seed: int
     command: Sequence[str] = (sys.executable, "-m", "uav_twin", "discrepancy", "run")
-    _process: "subprocess.Popen[bytes] | None" = None
+    errand: Errand = field(default_factory=Errand)
 
     def words(self, question: Question) -> list[str]:
         """Return the options of the command that answers a question."""
@@ -191,33 +189,13 @@ class Search:
             The search ended without a verdict; the sentence is the last one that it said.
         """
         folder = question.folder(self.watch)
-        while not (folder / VERDICT).is_file():
-            if self._process is None:
-                self._begin(question, waited_for=wait)
-            elif (code := self._process.poll()) is not None and not (folder / VERDICT).is_file():
-                self._process = None
-                raise TwinMasterError(last_words(self._log(question), code))
+        log, words = folder.with_name(folder.name + ".log"), [*self.command, *self.words(question)]
+        log.parent.mkdir(exist_ok=True)
+        while not self.errand.answered(folder / VERDICT, log, words, waited_for=wait):
             if not wait or asked_to_end():
                 return None
             time.sleep(_LOOK_AGAIN)
-        self.end()
         return folder
-
-    def _log(self, question: Question) -> Path:
-        folder = question.folder(self.watch)
-        return folder.with_name(folder.name + ".log")
-
-    def _begin(self, question: Question, *, waited_for: bool) -> None:
-        log = self._log(question)
-        log.parent.mkdir(exist_ok=True)
-        self._process = beside([*self.command, *self.words(question)], log, waited_for=waited_for)
-
-    def end(self) -> None:
-        """End the process, if there is one; a watch that is taken up again asks again."""
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
-            self._process.wait()
-        self._process = None
 
 
 def verdict_of(
@@ -288,83 +266,3 @@ def both_patches(before: Path | None, found: Path) -> bytes:
     effects, channels = old["effects"] + new["effects"], old.get("channels", {}) | new.get("channels", {})
     text = json.dumps({"schema": new["schema"], "effects": effects, "channels": channels}, indent=1)
     return (text + "\n").encode()
-
-
-class Tutor:
-    """Asks, tries and adopts between two turns of a watch.
-
-    Parameters
-    ----------
-    teaching : Teaching
-        After all lines of the journal.
-    search : Search
-    judge : Judge
-    write : callable
-        Adds a line to the journal.
-    trial : callable
-        Returns the trial of a patch, by its file, the turn from which on it is believed, the first turn whose
-        evidence is compared, and how many.
-    adopt : callable
-        Believes a patch.
-    step : str
-        What a turn is called.
-    wait : bool
-        Whether the turns can wait for a verdict, as those of a recorded file do: the watch then repeats bit
-        for bit.
-    asked_to_end : callable
-        Whether the watch is to end.
-    """
-
-    def __init__(
-        self, teaching: Teaching, search: Search, judge: Judge, write: Callable[[Mapping[str, Any]], None],
-        trial: Callable[[Path, int, tuple[int, int]], Trial],
-        adopt: Callable[[Outcome, Mapping[str, Any]], None], step: str, *, wait: bool,
-        asked_to_end: Callable[[], bool],
-    ) -> None:  # fmt: skip
-        self.teaching, self._search, self._judge, self._step = teaching, search, judge, step
-        self._write, self._trial, self._adopt = write, trial, adopt
-        self._wait, self._asked_to_end = wait, asked_to_end
-
-    @property
-    def due(self) -> bool:
-        """Whether something may have to be done before the next turn."""
-        trial = self.teaching.trial
-        over = trial is not None and self.teaching.turn >= trial["turn"] + TRIAL_TURNS
-        return self.teaching.question is not None or over
-
-    def act(self) -> bool:
-        """Do what is due; return whether the model has changed."""
-        teaching, question = self.teaching, self.teaching.question
-        if question is not None:
-            found: Path | TwinMasterError | None
-            try:
-                found = self._search.answer(question, wait=self._wait, asked_to_end=self._asked_to_end)
-            except TwinMasterError as error:
-                found = error
-            if found is not None:
-                watch, turn = self._search.watch, teaching.turn
-                self._write({"verdict": verdict_of(watch, question, found, turn, self._step)})
-        trial = teaching.trial
-        if trial is None or teaching.turn < trial["turn"] + TRIAL_TURNS:
-            return False
-        file = self._search.watch / trial["folder"] / PATCH
-        try:
-            compared = trial["turn"] + 1, TRIAL_TURNS
-            outcome = self._judge.outcome(partial(self._trial, file, trial["from_turn"], compared))
-        except CANNOT as error:
-            sentence = f"The patch cannot be believed by this twin: {error}"
-            self._write({"verdict": {**trial, "tried": False, "notice": notice_of("trial", sentence)}})
-            return False
-        if outcome is None:
-            return False
-        notice = notice_of("trial", trial_sentence(trial, outcome, self._step))
-        if outcome.gained >= LEAST_GAIN:
-            self._adopt(outcome, notice)
-            return True
-        self._write({"verdict": {**trial, "tried": False, "notice": notice}})
-        return False
-
-    def end(self) -> None:
-        """End what is under way."""
-        self._search.end()
-        self._judge.end()

@@ -32,8 +32,7 @@ from twin_master.network.twin import Twin
 from twin_master.report.view import printed_state
 from twin_master.scenario.schema import Scenario
 from twin_master.store.summary import policy_switch
-from twin_master.watch.decision import gap_of
-from twin_master.watch.replay import BelievedModel, replay
+from twin_master.watch.replay import BelievedModel, gap_of, replay
 
 COURTESY = 10
 """Niceness of what is worked out beside a watch: the watch comes first."""
@@ -157,20 +156,21 @@ def judged(trial: Trial, progress: Progress | None = None) -> Outcome:
         replay(
             trial.journal, trial.models, trial.scenario.watch.lag, first_turn=wanted, end=trial.end,
             question=question,
-        )
+        )[0]
         for question in (None, model)
     )  # fmt: skip
-    evidence = [
-        sum(found.beliefs.log_evidence[begin - found.first_turn :][:count]) for found in (before, after)
-    ]
     known = trial.models[-1].knowledge
+    compared = [
+        sum(turn.concluded.log_evidence for turn in found.turns[begin - found.first_turn :][:count])
+        for found in (before, after)
+    ]
     return Outcome(
         trial=trial,
         model=model,
-        gained=float(evidence[1] - evidence[0]),
-        before=gap_of(before.beliefs, first - before.first_turn, known.sensor_model),
-        after=gap_of(after.beliefs, first - after.first_turn, model.knowledge.sensor_model),
-        alarms=tuple(n for turn, n in after.beliefs.notices if turn >= first and n.kind == "alarm"),
+        gained=float(compared[1] - compared[0]),
+        before=gap_of(before, first - before.first_turn, known.sensor_model),
+        after=gap_of(after, first - after.first_turn, model.knowledge.sensor_model),
+        alarms=tuple(n for turn, n in after.notices if turn >= first and n.kind == "alarm"),
         policy_change=policy_change(known, model.knowledge),
         state=after.twin.save_state(),
     )
@@ -209,19 +209,72 @@ def policy_change(before: Knowledge, after: Knowledge) -> str:
     )
 
 
+class Errand:
+    """A process beside a watch, that no key of its terminal ends, and that leaves a file as its answer."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def answered(self, answer: Path, log: Path, command: Sequence[str], *, waited_for: bool = False) -> bool:
+        """Return whether the answer is there; begin the process where it is neither there nor under way.
+
+        Parameters
+        ----------
+        answer, log
+            The file that the process leaves, and where what it says goes.
+        command
+            Its words.
+        waited_for
+            Whether it has the priority of the watch.
+
+        Raises
+        ------
+        TwinMasterError
+            It ended without an answer: the last line that it said, or else its exit code.
+        """
+        if answer.is_file():
+            self.end()
+            return True
+        if self._process is None:
+            with log.open("wb") as file:
+                self._process = subprocess.Popen(
+                    [*command], stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
+                )
+            if not waited_for:
+                with suppress(ProcessLookupError):
+                    os.setpriority(os.PRIO_PROCESS, self._process.pid, COURTESY)
+        elif (code := self._process.poll()) is not None and not answer.is_file():
+            self._process = None
+            lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
+            said = (line.strip() for line in reversed(lines) if line.strip())
+            raise TwinMasterError(next(said, f"exit code {code}"))
+        return False
+
+    @property
+    def over(self) -> bool:
+        """Whether no process is under way."""
+        return self._process is None
+
+    def end(self) -> None:
+        """End the process, if there is one; a watch that is taken up again begins it anew."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+            self._process.wait()
+        self._process = None
+
+
 class Judge:
     """Works out what comes of a patch: at once, or in a process of low priority beside a live watch.
 
     Parameters
     ----------
     wait : bool
-        Whether the turns can wait for it.
+        Whether turns wait for it, as those of a recording do.
     """
 
     def __init__(self, *, wait: bool) -> None:
-        self._wait = wait
+        self._wait, self._errand = wait, Errand()
         self._folder: Path | None = None
-        self._process: subprocess.Popen[bytes] | None = None
 
     def outcome(self, asked: Callable[[], Trial]) -> Outcome | None:
         """Return what came of the patch; None while it is worked out, of what was asked first.
@@ -229,24 +282,22 @@ class Judge:
         Raises
         ------
         TwinMasterError, FmuError, FiniteElementError
-            The twin cannot believe it, or the process ended without an answer.
+            This twin cannot believe it, see `CANNOT`.
         """
         if self._wait:
             return judged(asked())
-        if self._folder is None or self._process is None:
+        if self._folder is None:
             self._folder = Path(mkdtemp(prefix="uav_twin_"))
             (self._folder / _ASKED).write_bytes(pickle.dumps(asked()))
-            command = [sys.executable, "-c", f"from {__name__} import work; work()", str(self._folder)]
-            self._process = beside(command, self._folder / _LOG)
-        code = self._process.poll()
-        if not self.answered and code is None:
-            return None
-        found: Outcome | str
-        if self.answered:
-            found = pickle.loads((self._folder / _ANSWER).read_bytes())
-        else:
-            found = last_words(self._folder / _LOG, code)
-        self.end()
+        folder = self._folder
+        command = [sys.executable, "-c", f"from {__name__} import work; work()", str(folder)]
+        try:
+            if not self._errand.answered(folder / _ANSWER, folder / _LOG, command):
+                return None
+            found: Outcome | str = pickle.loads((folder / _ANSWER).read_bytes())
+        finally:
+            if self._errand.over:
+                self.end()
         if isinstance(found, str):
             raise TwinMasterError(found)
         return found
@@ -257,33 +308,11 @@ class Judge:
         return self._folder is not None and (self._folder / _ANSWER).is_file()
 
     def end(self) -> None:
-        """End the process, if there is one; a watch that is taken up again begins it anew."""
-        if self._process is not None and self._folder is not None:
-            self._process.terminate()
-            self._process.wait()
+        """End what is under way."""
+        self._errand.end()
+        if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
-        self._process = self._folder = None
-
-
-def beside(command: Sequence[str], log: Path, *, waited_for: bool = False) -> "subprocess.Popen[bytes]":
-    """Begin a process that no key of this terminal ends; what it says goes to a file.
-
-    Its priority is low unless it is `waited_for`.
-    """
-    with log.open("wb") as file:
-        process = subprocess.Popen(
-            [*command], stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
-        )
-    if not waited_for:
-        with suppress(ProcessLookupError):
-            os.setpriority(os.PRIO_PROCESS, process.pid, COURTESY)
-    return process
-
-
-def last_words(log: Path, code: int | None) -> str:
-    """Return the last line that a process has said, or else its exit code."""
-    lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
-    return next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {code}")
+        self._folder = None
 
 
 def work() -> None:

@@ -23,8 +23,7 @@ from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, ScenarioError
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble
-from twin_master.mission.plant import Plant
-from twin_master.mission.truth import Truth
+from twin_master.mission.truth import Plant, Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.workflow import new_run, resume_run

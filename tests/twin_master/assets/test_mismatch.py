@@ -16,6 +16,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.seeds import fly_seeds
 from calibration.result.file import load_calibration, save_calibration
 from calibration.result.record import Calibration
 from fe.reduction.model_cache import reduced_model
@@ -31,8 +32,8 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError
-from twin_master.fleet.outcome import in_credible_set
-from twin_master.fleet.reading import Outcomes, fly_seeds
+from twin_master.fleet.reading import Outcomes
+from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model

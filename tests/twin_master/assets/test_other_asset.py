@@ -15,7 +15,7 @@ import xarray as xr
 from fmu_asset.errors import FmuError, FmuFileError
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides
-from twin_master.mission.checkpoint import open_checkpoint
+from twin_master.mission.loop import CheckpointFile
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario
 from twin_master.workflow import new_run, resume_run
@@ -106,7 +106,7 @@ def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(asset_folder: Path
     with pytest.raises(FmuError, match=r"not finite.*outlet"):
         new_run(load_scenario(path), tmp_path / "run")
     config = read_config(tmp_path / "run")
-    with open_checkpoint(tmp_path / "run", workflow.hash_record(config)) as kept:
+    with CheckpointFile(tmp_path / "run", workflow.hash_record(config)) as kept:
         assert kept.turns == 16
     with pytest.raises(FmuError, match=r"not finite.*outlet"):
         resume_run(tmp_path / "run")

@@ -30,7 +30,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.scenario.reading import load_scenario
-from twin_master.store.outcome import RunOutcome
+from twin_master.store.writing import RunOutcome
 from twin_master.workflow import new_run, resume_run
 from uav_twin import cli
 

@@ -19,8 +19,8 @@ from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet, seed_range
 from twin_master.fleet.reading import Estimated, fleet_groups, group_figures
 from twin_master.fleet.store import FleetStore
-from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.mission.loop import fly
+from twin_master.mission.preparation import kept_knowledge
 from twin_master.workflow import new_run
 from uav_twin.cli import app
 
@@ -254,7 +254,7 @@ def test_figures_are_those_of_the_flights(library_file: Path, tmp_path: Path) ->
     evidence = figures["log evidence of a step"]
     assert isinstance(evidence, Estimated)
     assert evidence.value == pytest.approx(np.mean([f.log_evidence.mean() for f in flights]), rel=1e-6)
-    error = [knowledge.model.states.mean(f.filtered) - f.happened.state for f in flights]
+    error = [knowledge.model.states.mean(f.filtered) - f.state for f in flights]
     rms = figures["filtered rms error of z2"]
     assert isinstance(rms, Estimated)
     assert rms.value == pytest.approx(float(np.sqrt(np.mean(np.square(error)[:, :, 1]))), rel=1e-5)

@@ -15,11 +15,20 @@ from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
-from twin_master.fleet.population import population
-from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, points_of, refined, shared
+from twin_master.fleet.posterior import (
+    HIGHEST,
+    LOWEST,
+    Grid,
+    logistic,
+    logit,
+    points_of,
+    population,
+    refined,
+    shared,
+)
 from twin_master.fleet.reading import attention, fleet_groups
 from twin_master.fleet.report import write_fleet_report
-from twin_master.mission.kept_knowledge import kept_knowledge
+from twin_master.mission.preparation import kept_knowledge
 from twin_master.network.inference import filter_sequence
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model

@@ -36,7 +36,7 @@ from twin_master.fleet.standing import WatchedAsset
 from twin_master.fleet.view import fleet_view, serve_fleet
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.kept_knowledge import kept_knowledge
+from twin_master.mission.preparation import kept_knowledge
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed

@@ -15,14 +15,14 @@ from typer.testing import CliRunner
 
 from scenarios import scenario_files
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.loop import Beliefs
 from twin_master.mission.preparation import prepare_twin
+from twin_master.mission.turns import History, Reading, Turn
 from twin_master.report.learnt import asset_rows, learnt_figure, sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.reading import load_scenario
 from twin_master.viewer.flight import Flight
-from twin_master.watch.decision import gap_of
+from twin_master.watch.replay import gap_of
 from twin_master.workflow import resume_run
 from uav_twin.cli import app
 
@@ -190,11 +190,11 @@ def test_the_view_shows_what_was_learnt(folder: Path, run: xr.DataTree) -> None:
 
 def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario: Path, run: xr.DataTree) -> None:
     knowledge = prepare_twin(str(scenario))
-    twin, beliefs = knowledge.twin(), Beliefs()
+    history = History(twin := knowledge.twin(), 24)
     observed = run["observed"].to_dataset()
     for row, control in zip(observed["strain"].values, observed["control_index"].values, strict=True):
-        beliefs.add(row, twin.turn(row, int(control)))
-    gap = gap_of(beliefs, 4, knowledge.sensor_model)
+        history.add(Turn(Reading(row), twin.turn(row, int(control))))
+    gap = gap_of(history, 4, knowledge.sensor_model)
     residual = run["filtered"]["residual"].values[4:]
     assert gap["rms_residual"] == pytest.approx(np.sqrt(np.mean(residual**2)))
 

@@ -22,8 +22,8 @@ from twin_master.network.estimator import Carried, Estimate, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import Twin, TwinTurn
-from twin_master.scenario.notice import Noticing
 from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.tables import Noticing
 
 Float = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from twin_master.errors import TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.report.page import render_page
 from twin_master.report.reading import open_run, read_run
-from twin_master.scenario.notice import Noticing
 from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.tables import Noticing
 from twin_master.workflow import resume_run
 from uav_twin.cli import app
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import norm
+from twin_master.scenario.notice import Noticing
 
 import uav_twin
 from fe.reduction.model_cache import reduced_model
@@ -24,7 +25,6 @@ from twin_master.errors import FleetError, PlanningError, ScenarioError
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
 from twin_master.learning.monitor import WatchfulEstimator
-from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
     decision_problem,
@@ -34,14 +34,19 @@ from twin_master.mission.planning import (
     risk_of,
     write_policy,
 )
-from twin_master.mission.preparation import Knowledge, knowledge_of, prepare_knowledge
+from twin_master.mission.preparation import (
+    Knowledge,
+    keep_knowledge,
+    kept_knowledge,
+    knowledge_of,
+    prepare_knowledge,
+)
 from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.network.estimator import Carried, Estimator, ExactFilter
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.step_many import rationed
 from twin_master.network.transition import TransitionModel
 from twin_master.report.reading import open_run
-from twin_master.scenario.notice import Noticing
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 
@@ -326,7 +331,7 @@ def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path: Path) -
         names = known.scenario.control_names
         for turn in range(15):
             before = names.index(controls[-2]) if turn else None
-            row = plant.turn(names.index(controls[-1]), before)
+            row = plant.turn(names.index(controls[-1]), before).observed
             rows.append(row)
             read = {
                 f"{name}_percent": 100.0 * value

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import signal
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,34 +11,40 @@ import pytest
 
 from reporting.errors import DiskFullError
 from twin_master.errors import NotResumableError
-from twin_master.mission import checkpoint
-from twin_master.mission.checkpoint import Checkpoint, FlownTurn, open_checkpoint
+from twin_master.mission import loop as checkpoint
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.loop import Checkpoint, CheckpointFile
+from twin_master.mission.turns import Happened, Reading, Turn
+from twin_master.network.inference import Predicted
+from twin_master.network.twin import TwinTurn
 
 STATE = b"state\x00\xff"
 
 
-def flown(count: int) -> list[FlownTurn]:
+def flown(count: int) -> list[tuple[Turn, bytes]]:
+    """Return turns, each with the state of the asset behind it."""
     generator = np.random.default_rng(0)
-    turns = []
+    kept = []
     for number in range(count):
         observed = generator.standard_normal(24)
         observed[number] = np.nan
         monitors = {"a.b": float(generator.random())}
-        state, noise_free = generator.random(2), generator.random(24)
-        turns.append(FlownTurn(1, number % 2, observed, state, noise_free, monitors, STATE * (number + 1)))
-    return turns
+        happened = Happened(generator.random(2), generator.random(24), monitors)
+        belief = Predicted(np.empty(0), np.empty(0), np.empty(0))
+        concluded = TwinTurn(number, 1, np.ones(1), 0.0, belief, np.array([0.0, 1.0]), number % 2)
+        kept.append((Turn(Reading(observed, 1, happened=happened), concluded), STATE * (number + 1)))
+    return kept
 
 
-def write(folder: Path, turns: list[FlownTurn]) -> bytes:
-    with open_checkpoint(folder, "abc") as file:
+def write(folder: Path, turns: list[tuple[Turn, bytes]]) -> bytes:
+    with CheckpointFile(folder, "abc") as file:
         for turn in turns:
-            file.keep(turn)
+            file.keep(*turn)
     return (folder / JOURNAL_NAME).read_bytes()
 
 
 def read(folder: Path, config_hash: str = "abc") -> Checkpoint | None:
-    with open_checkpoint(folder, config_hash) as file:
+    with CheckpointFile(folder, config_hash) as file:
         return file.checkpoint
 
 
@@ -48,12 +53,14 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     write(tmp_path, turns)
     found = read(tmp_path)
     assert found is not None
-    assert found.turns == 3
-    assert found.observed.tobytes() == np.array([turn.observed for turn in turns]).tobytes()
-    assert found.control_index.tolist() == [1, 1, 1, 0]
-    assert found.plant.state.tobytes() == np.array([turn.state for turn in turns]).tobytes()
-    assert found.plant.observation.tobytes() == np.array([turn.observation for turn in turns]).tobytes()
-    assert found.plant.monitors["a.b"].tolist() == [turn.monitors["a.b"] for turn in turns]
+    assert found.decided == [0, 1, 0]
+    for reading, (turn, _) in zip(found.readings, turns, strict=True):
+        written = turn.reading
+        assert reading.control == 1
+        assert reading.observed.tobytes() == written.observed.tobytes()
+        assert reading.happened.state.tobytes() == written.happened.state.tobytes()
+        assert reading.happened.observation.tobytes() == written.happened.observation.tobytes()
+        assert reading.happened.monitors == written.happened.monitors
     assert found.asset_state == 3 * STATE
 
 
@@ -68,10 +75,10 @@ def test_a_line_cut_off_anywhere_is_flown_again(tmp_path: Path) -> None:
     for cut in [0, 1, ends[0] - 1, ends[0], ends[0] + 70, ends[1] - 1, ends[1], ends[3] + 1, ends[4] - 1]:
         (tmp_path / JOURNAL_NAME).write_bytes(whole[:cut])
         left = sum(end <= cut for end in ends[1:])
-        with open_checkpoint(tmp_path, "abc") as file:
+        with CheckpointFile(tmp_path, "abc") as file:
             assert file.turns == left
             for turn in turns[left:]:
-                file.keep(turn)
+                file.keep(*turn)
         assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
 
 
@@ -81,7 +88,7 @@ def test_a_changed_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
         read(tmp_path, "other")
     path = tmp_path / JOURNAL_NAME
     lines = whole.splitlines(keepends=True)
-    strain = str(flown(1)[0].observed[5]).encode()
+    strain = str(flown(1)[0][0].reading.observed[5]).encode()
     for damaged, line in (
         (whole.replace(strain, b"0.25"), 2),
         (lines[0] + lines[2] + lines[1], 2),
@@ -103,14 +110,14 @@ def test_large_states_are_kept_less_often_and_their_turns_flown_again(
     monkeypatch.setattr(checkpoint, "STATE_ALLOWANCE", 300)
     monkeypatch.setattr(checkpoint, "STATE_SHARE", 30)
     content = np.random.default_rng(1).bytes(100)  # 144 characters in the file
-    turns = [replace(turn, asset_state=content) for turn in flown(12)]
+    turns = [(turn, content) for turn, _ in flown(12)]
     whole = write(tmp_path, turns)
     found = read(tmp_path)
     assert found is not None
-    assert found.turns == 10
-    with open_checkpoint(tmp_path, "abc") as file:
-        for turn in turns[found.turns :]:
-            file.keep(turn)
+    assert len(found.readings) == 10
+    with CheckpointFile(tmp_path, "abc") as file:
+        for turn in turns[10:]:
+            file.keep(*turn)
     assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
 
 
@@ -120,10 +127,10 @@ def test_a_full_disk_leaves_the_turns_before(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
-        with open_checkpoint(tmp_path, "abc") as file:
+        with CheckpointFile(tmp_path, "abc") as file:
             resource.setrlimit(resource.RLIMIT_FSIZE, (size + 50, hard))
             with pytest.raises(DiskFullError, match="No space is left"):
-                file.keep(turns[2])
+                file.keep(*turns[2])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, ignored)

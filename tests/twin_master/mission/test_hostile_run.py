@@ -14,10 +14,10 @@ from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorke
 from twin_master import workflow
 from twin_master.environment import ScenarioEnvironment
 from twin_master.fleet.flight import fly_fleet
-from twin_master.fleet.outcome import ENDED
 from twin_master.fleet.plan import ensemble
 from twin_master.fleet.reading import fleet_groups
 from twin_master.fleet.report import write_fleet_report
+from twin_master.fleet.store import ENDED
 from twin_master.scenario.reading import load_scenario
 from twin_master.workflow import new_run, resume_run
 

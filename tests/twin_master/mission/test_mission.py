@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.seeds import fly_seeds
 from twin_master.assets.interface import AssetReading, StatelessAsset
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import AssetOutputError, NotResumableError
-from twin_master.fleet.reading import fly_seeds
-from twin_master.mission.checkpoint import FlownTurn, checkpoint_of
-from twin_master.mission.loop import Flight, fly
+from twin_master.mission.loop import Checkpoint, fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.turns import History, Turn
 from twin_master.scenario.reading import load_scenario
 
 
@@ -30,12 +29,12 @@ def knowledge_of(source: StrainLibrarySource) -> Knowledge:
     return prepare_knowledge(source._scenario, source, 3)
 
 
-def flown(source: StrainLibrarySource, knowledge: Knowledge, seed: int = 3, **options: object) -> Flight:
+def flown(source: StrainLibrarySource, knowledge: Knowledge, seed: int = 3, **options: object) -> History:
     plant = knowledge.plant(knowledge.truth(seed), source.open())
     return fly(knowledge.scenario, knowledge.twin(), plant, **options)  # type: ignore[arg-type]
 
 
-def same(first: Flight, second: Flight) -> bool:
+def same(first: History, second: History) -> bool:
     arrays = (
         "observed",
         "control_index",
@@ -48,18 +47,24 @@ def same(first: Flight, second: Flight) -> bool:
     return all(
         np.array_equal(getattr(first, name), getattr(second, name), equal_nan=name == "observed")
         for name in arrays
-    ) and np.array_equal(first.truth.state, second.truth.state)
+    ) and np.array_equal(first.state, second.state)
+
+
+def stopped(kept: list[tuple[Turn, bytes]]) -> Checkpoint:
+    turns = [turn for turn, _ in kept]
+    decided = [turn.concluded.next_control for turn in turns]
+    return Checkpoint([turn.reading for turn in turns], decided, kept[-1][1])
 
 
 def test_resuming_after_any_turn_is_bit_identical(source: StrainLibrarySource) -> None:
     knowledge = knowledge_of(source)
-    kept: list[FlownTurn] = []
-    whole = flown(source, knowledge, keep=kept.append)
+    kept: list[tuple[Turn, bytes]] = []
+    whole = flown(source, knowledge, keep=lambda *told: kept.append(told))
     assert len(kept) == 50
     for turns in (1, 2, 17, 49, 50):
-        rest = flown(source, knowledge, checkpoint=checkpoint_of(kept[:turns]))
+        rest = flown(source, knowledge, checkpoint=stopped(kept[:turns]))
         assert rest.resumed_at == turns
-        assert len(rest.timing) == 50 - turns
+        assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= turns))
         assert same(whole, rest)
 
 
@@ -119,7 +124,7 @@ def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_tw
     source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
     knowledge = prepare_knowledge(scenario, source, 1)
     flight = flown(source, knowledge, 1)
-    residual = flight.observed - flight.truth.observation
+    residual = flight.observed - flight.observation
     np.testing.assert_allclose(residual, knowledge.truth(1).noise, atol=1e-12)
     twin = knowledge.twin()
     again = [twin.turn(row, int(u)) for row, u in zip(flight.observed, flight.control_index, strict=True)]
@@ -142,10 +147,10 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(library
             values[7] = np.nan
         return AssetReading(values)
 
-    kept: list[FlownTurn] = []
+    kept: list[Turn] = []
     plant = knowledge.plant(knowledge.truth(1), StatelessAsset(broken))
     with pytest.raises(AssetOutputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
-        fly(scenario, knowledge.twin(), plant, keep=kept.append)
+        fly(scenario, knowledge.twin(), plant, keep=lambda turn, _state: kept.append(turn))
     assert len(kept) == 3
     short = knowledge.plant(
         knowledge.truth(1), StatelessAsset(lambda _control, _health: AssetReading(np.zeros(3)))
@@ -158,10 +163,10 @@ def test_a_checkpoint_whose_decisions_do_not_follow_is_refused(library_file: Pat
     scenario = load_scenario("paper_level_turns").scenario
     source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
     knowledge = prepare_knowledge(scenario, source, 1)
-    kept: list[FlownTurn] = []
-    flown(source, knowledge, keep=kept.append)
-    kept[5] = replace(kept[5], control_index=1 - kept[5].control_index)
-    altered = checkpoint_of(kept[:10])
+    kept: list[tuple[Turn, bytes]] = []
+    flown(source, knowledge, keep=lambda *told: kept.append(told))
+    altered = stopped(kept[:10])
+    altered.decided[4] = 1 - altered.decided[4]
     with pytest.raises(NotResumableError, match="after turn 4"):
         flown(source, knowledge, checkpoint=altered)
 

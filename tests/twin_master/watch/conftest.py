@@ -12,7 +12,8 @@ import pytest
 from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import begun, write_csv
 from twin_master.assets.resolution import Overrides
-from twin_master.mission.loop import Flight, fly
+from twin_master.mission.loop import fly
+from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
@@ -34,7 +35,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
 
 
 @pytest.fixture(scope="session")
-def mission(base: Watch) -> Flight:
+def mission(base: Watch) -> History:
     """The paper's mission, flown by the model that the watch believes."""
     knowledge = replace(base.models[0].knowledge, scenario=load_scenario("paper_level_turns").scenario)
     plant = knowledge.plant(knowledge.truth(knowledge.scenario.mission.seed), base._source.open())
@@ -42,7 +43,7 @@ def mission(base: Watch) -> Flight:
 
 
 @pytest.fixture(scope="session")
-def recorded(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The mission as a CSV file with some garbage between its turns."""
     path = tmp_path_factory.mktemp("recorded") / "mission.csv"
     return write_csv(path, mission.observed, mission.control_index, garbage=True)
@@ -72,7 +73,7 @@ def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory)
 
 
 @pytest.fixture(scope="session")
-def loose(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def loose(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The mission with a gauge that shows 30 % too little from turn 15 on."""
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7

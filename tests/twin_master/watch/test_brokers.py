@@ -21,13 +21,13 @@ from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, lines, soon_quiet, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.loop import Flight
+from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.broker import PASSWORD_VARIABLE, Broker, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import MqttFeed
-from twin_master.watch.snapshot import flown
+from twin_master.watch.opening import flown
 from uav_twin.cli import app
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
@@ -37,7 +37,7 @@ needs_mosquitto = pytest.mark.skipif(shutil.which("mosquitto") is None, reason="
 @needs_mosquitto
 @pytest.mark.parametrize("tls", [False, True])
 def test_over_a_broker_that_stops_and_a_hostile_publisher(
-    base: Watch, mission: Flight, whole: Path, tmp_path: Path, tls: bool, monkeypatch: pytest.MonkeyPatch
+    base: Watch, mission: History, whole: Path, tmp_path: Path, tls: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broker = Mosquitto(tmp_path, tls=tls)
     scheme, host = ("mqtts", "localhost") if tls else ("mqtt", "127.0.0.1")

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tests.twin_master.watch.watches import begun, lines, write_csv
-from twin_master.mission.loop import Flight
+from twin_master.mission.turns import History
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
@@ -214,7 +214,7 @@ def test_a_copy_in_the_place_of_a_log_is_read_on(base: Watch, tmp_path: Path) ->
 
 @pytest.mark.parametrize("rotation", ["create", "copytruncate"])
 def test_a_watch_that_was_down_takes_up_a_rotated_log(
-    base: Watch, mission: Flight, tmp_path: Path, rotation: str
+    base: Watch, mission: History, tmp_path: Path, rotation: str
 ) -> None:
     recorded = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
     never = begun(base, tmp_path / "never")

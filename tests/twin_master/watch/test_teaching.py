@@ -28,8 +28,8 @@ from tests.discrepancy.rigs import ORIGIN
 from tests.twin_master.watch.watches import lines, watchful
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.kept_knowledge import keep_knowledge, kept_knowledge
-from twin_master.mission.loop import Flight
+from twin_master.mission.preparation import keep_knowledge, kept_knowledge
+from twin_master.mission.turns import History
 from twin_master.network.inference import known_control
 from twin_master.viewer.flight import Flight as SeenFlight
 from twin_master.viewer.messages import Request, Teller
@@ -74,7 +74,7 @@ def search(watch: Watch, place: Path, kind: str | None, gain: float, gate: str =
 
 
 def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
-    base: Watch, mission: Flight, loose: Path, tmp_path: Path
+    base: Watch, mission: History, loose: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "whole").mkdir()
     watch = watchful(base, tmp_path / "whole" / "watch")
@@ -195,7 +195,7 @@ def test_live_turns_do_not_wait_for_the_search(base: Watch, loose: Path, tmp_pat
 
 
 def test_live_turns_do_not_wait_for_the_patched_model(
-    base: Watch, mission: Flight, loose: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    base: Watch, mission: History, loose: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is built beside them, and believed behind the turn that the journal says, to the bit."""
     judges: list[Judge] = []
@@ -240,7 +240,7 @@ def test_live_turns_do_not_wait_for_the_patched_model(
         found = twin.turn(row, int(mission.control_index[number]))
     assert lines(watch)[-1]["filtered"] == found.filtered.tolist()
     again = watchful(watch, tmp_path / "again")
-    twins = [replay(one._path, one.models, one.scenario.watch.lag).twin for one in (again, watch)]
+    twins = [replay(one._path, one.models, one.scenario.watch.lag)[0].twin for one in (again, watch)]
     assert twins[0].save_state() == twins[1].save_state()
 
 
@@ -265,7 +265,7 @@ def test_a_policy_that_changes_is_told(base: Watch) -> None:
 
 
 def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(
-    base: Watch, mission: Flight, tmp_path: Path
+    base: Watch, mission: History, tmp_path: Path
 ) -> None:
     """Gauge 17 is strained most: were its readings the strain, 3g would be left at z1 80 % only."""
     file = tmp_path / "patch.json"
@@ -280,7 +280,7 @@ def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(
     twin, observed = taught.twin(), mission.observed.copy()
     observed[:, 16] *= 0.88
     turns = [twin.turn(row, int(c)) for row, c in zip(observed, mission.control_index, strict=True)]
-    calls = mission.happened.state[:, 0] > 0.59
+    calls = mission.state[:, 0] > 0.59
     gentle = known.scenario.control_names.index("2g")
     assert {turn.next_control for turn in np.array(turns)[calls]} == {gentle}
     error_reward = taught.rewards.expectation(known_control(turns[-1].filtered, gentle, 2), observed[-1])

@@ -27,25 +27,23 @@ from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import begun, lines, soon_quiet, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of, read_records, whole_record
-from twin_master.mission.loop import Flight
+from twin_master.mission.turns import History
 from twin_master.network.estimator import ExactFilter
 from twin_master.report.reading import open_run as stored_run
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.viewer.flight import Flight as SeenFlight
-from twin_master.watch.decision import journalled_decision
 from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, file_feed
 from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.message import Message
-from twin_master.watch.opening import resume_watch
-from twin_master.watch.replay import BelievedModel
-from twin_master.watch.snapshot import flown
+from twin_master.watch.opening import flown, resume_watch
+from twin_master.watch.replay import BelievedModel, journalled_decision
 from uav_twin.cli import app
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 
 
-def test_a_recorded_mission_is_watched_as_it_was_flown(mission: Flight, whole: Path) -> None:
+def test_a_recorded_mission_is_watched_as_it_was_flown(mission: History, whole: Path) -> None:
     run = uav_twin.open_run(whole)
     for group, name, found in (
         ("observed", "strain", mission.observed),
@@ -78,7 +76,7 @@ def test_a_run_file_is_watched_too(base: Watch, whole: Path, tmp_path: Path) -> 
 
 
 def test_a_program_hands_over_messages_and_is_told_decisions(
-    scenario: LoadedScenario, mission: Flight, whole: Path, tmp_path: Path
+    scenario: LoadedScenario, mission: History, whole: Path, tmp_path: Path
 ) -> None:
     controls = [("2g", "3g")[index] for index in mission.control_index]
     messages = (
@@ -138,7 +136,7 @@ def test_a_kill_at_any_moment_loses_no_turn(
 
 
 def test_what_comes_behind_a_gap_is_not_lost_when_the_watch_ends_within_it(
-    base: Watch, mission: Flight, tmp_path: Path
+    base: Watch, mission: History, tmp_path: Path
 ) -> None:
     observed = mission.observed.copy()
     path = write_csv(tmp_path / "m.csv", observed, mission.control_index)
@@ -159,7 +157,7 @@ def belief_of(watch: Watch) -> object:
     return json.loads((watch.folder / JOURNAL_NAME).read_text().splitlines()[-1][65:])["filtered"]
 
 
-def test_another_file_is_read_from_its_beginning(base: Watch, mission: Flight, tmp_path: Path) -> None:
+def test_another_file_is_read_from_its_beginning(base: Watch, mission: History, tmp_path: Path) -> None:
     """A logger that begins a file each day; and the first of them once more, which says nothing new."""
     whole = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
     header, *rows = whole.read_text().splitlines()
@@ -177,7 +175,7 @@ def test_another_file_is_read_from_its_beginning(base: Watch, mission: Flight, t
     assert belief_of(watch) == mission.filtered[-1].tolist()
 
 
-def test_a_folder_tells_what_came_late_into_a_gap(base: Watch, mission: Flight, tmp_path: Path) -> None:
+def test_a_folder_tells_what_came_late_into_a_gap(base: Watch, mission: History, tmp_path: Path) -> None:
     controls = mission.control_index.copy()
     controls[20] = 1 - controls[20]  # not what was assumed while nothing was known of it
     header, *rows = write_csv(tmp_path / "m.csv", mission.observed, controls).read_text().splitlines()
@@ -194,7 +192,7 @@ def test_a_folder_tells_what_came_late_into_a_gap(base: Watch, mission: Flight, 
 
 
 def test_a_watch_that_learns_goes_on_as_if_it_had_never_ended(
-    base: Watch, mission: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    base: Watch, mission: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 8)
     learning = load_scenario("level_turns_learning").scenario.learning
@@ -218,7 +216,7 @@ def test_a_watch_that_learns_goes_on_as_if_it_had_never_ended(
 
 
 def test_a_control_that_is_reported_wrongly_ends_no_watch(
-    base: Watch, mission: Flight, tmp_path: Path
+    base: Watch, mission: History, tmp_path: Path
 ) -> None:
     """From turn 10 on, for a twin that learns and gives notice, also when it is taken up again."""
     controls = np.where(np.arange(50) < 10, mission.control_index, 1 - mission.control_index)
@@ -237,7 +235,7 @@ def test_a_control_that_is_reported_wrongly_ends_no_watch(
 
 
 def test_a_long_watch_goes_on_from_its_snapshot(
-    base: Watch, mission: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    base: Watch, mission: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 16)
     path = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
@@ -255,7 +253,7 @@ def test_a_long_watch_goes_on_from_its_snapshot(
 
 
 def test_a_watch_is_taken_up_from_the_end_of_its_journal(
-    base: Watch, mission: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    base: Watch, mission: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
     monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 8)
@@ -319,7 +317,7 @@ def test_the_last_decision_is_read_from_the_journal(base: Watch, whole: Path, tm
     assert watch.last_decision() is None
 
 
-def test_a_line_of_the_journal_says_what_was_told(base: Watch, mission: Flight, tmp_path: Path) -> None:
+def test_a_line_of_the_journal_says_what_was_told(base: Watch, mission: History, tmp_path: Path) -> None:
     header, *rows = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index).read_text().split()
     late = [*rows[:20], *rows[21:25], rows[20], rows[25].replace(",", ",,", 1), *rows[26:30], rows[25]]
     (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
@@ -332,7 +330,7 @@ def test_a_line_of_the_journal_says_what_was_told(base: Watch, mission: Flight, 
 
 
 @pytest.mark.parametrize("source", ["standard input", "a file that grows"])
-def test_silence_is_told_and_journalled(base: Watch, mission: Flight, tmp_path: Path, source: str) -> None:
+def test_silence_is_told_and_journalled(base: Watch, mission: History, tmp_path: Path, source: str) -> None:
     watch, told = soon_quiet(begun(base, tmp_path / "watch")), list[dict[str, Any]]()
     path = tmp_path / "m.csv"
     if source == "standard input":
@@ -377,7 +375,7 @@ def test_silence_is_told_and_journalled(base: Watch, mission: Flight, tmp_path: 
 
 
 def test_a_reader_that_leaves_ends_the_watch_in_order(
-    scenario: LoadedScenario, mission: Flight, tmp_path: Path
+    scenario: LoadedScenario, mission: History, tmp_path: Path
 ) -> None:
     shown = mission.observed[:4].tolist()
     lines = [json.dumps({"turn": turn, "strain": row}) + "\n" for turn, row in enumerate(shown)]
@@ -463,7 +461,7 @@ def test_the_shipped_recording_is_noticed(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.long
-def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: Flight, tmp_path: Path) -> None:
+def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: History, tmp_path: Path) -> None:
     observed = mission.observed.copy()
     observed[20:, 4] *= 0.88
     path = write_csv(tmp_path / "m.csv", observed, mission.control_index)
@@ -516,7 +514,7 @@ def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
 
 
 def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
-    scenario: LoadedScenario, mission: Flight, recorded: Path, whole: Path, tmp_path: Path
+    scenario: LoadedScenario, mission: History, recorded: Path, whole: Path, tmp_path: Path
 ) -> None:
     folder, decisions = tmp_path / "watch", list[dict[str, object]]()
     opened = []

@@ -17,7 +17,7 @@ import numpy as np
 from paho.mqtt import client as paho
 
 from twin_master.mission.journal import JOURNAL_NAME, read_records
-from twin_master.scenario.notice import Noticing
+from twin_master.scenario.tables import Noticing
 from twin_master.watch.folder import Watch
 from twin_master.watch.replay import BelievedModel
 

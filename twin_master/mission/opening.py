@@ -1,0 +1,121 @@
+"""The folder of a run or a watch, made or taken up again, with its scenario located in it."""
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from reporting.folders import restore_folder
+from reporting.progress import Progress
+from reporting.provenance import collect_provenance
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.resolution import located_scenario, portable_scenario
+from twin_master.errors import NotResumableError
+from twin_master.run_folder import CONFIG_NAME, KIND, create_run_folder, lock_run_folder, read_config
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.scenario.schema import Scenario
+
+Held = tuple[dict[str, Any], Scenario, int]
+"""Configuration of a folder, its scenario located in it, and the descriptor by which it is held."""
+
+
+def file_record(loaded: LoadedScenario) -> dict[str, str]:
+    """Return name and hash of the file of a scenario, by which its folders are known."""
+    return {"name": loaded.path.name, "sha256": loaded.content_hash}
+
+
+def begin_folder(
+    resolved: Scenario,
+    file: Mapping[str, str],
+    folder: Path,
+    source: AssetSource,
+    files: Mapping[str, bytes],
+    *,
+    replace: bool,
+    watched: bool = False,
+) -> Held:
+    """Make the folder of a run or a watch.
+
+    Parameters
+    ----------
+    resolved
+        The scenario with all that was given beside its file.
+    file
+        See `file_record`.
+    folder
+        Where.
+    source
+        Of what is believed or flown; what is not there costs the user no folder.
+    files
+        Further files: path inside the folder, content.
+    replace
+        Take the place of an existing run folder.
+    watched
+        Whether a real asset is watched.
+
+    Raises
+    ------
+    RunFolderExistsError
+        The folder exists.
+    TwinMasterError, FmuError, FiniteElementError, CalibrationError
+        Something that the scenario names is not there.
+    """
+    source.check()
+    config = {
+        "kind": KIND,
+        "format": 1,
+        **({"watched": True} if watched else {}),
+        "scenario": portable_scenario(resolved).to_dict(),
+        "scenario_file": dict(file),
+        "provenance": collect_provenance(resolved.mission.seed).as_dict(),
+    }
+    lock = create_run_folder(folder, config, {**source.files(), **files}, replace=replace)
+    with released(lock):
+        return config, located_scenario(portable_scenario(resolved), folder), lock
+
+
+def resume_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
+    """Take up the folder of a run or a watch.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    loaded
+        The scenario that the user believes to be there; checked against the folder.
+
+    Raises
+    ------
+    NotResumableError
+        The folder holds no run, or one of another scenario.
+    RunFolderError
+        Another process holds it.
+    """
+    config = read_config(folder)
+    scenario, file = parse_scenario(config["scenario"], str(folder / CONFIG_NAME)), config["scenario_file"]
+    if loaded is not None and file.get("sha256") != loaded.content_hash:
+        does = "watches" if config.get("watched") else "flies"
+        raise NotResumableError(
+            f"{folder} {does} another scenario ({scenario.mission.name}, {file.get('name')}) "
+            f"than {loaded.path}: resume it without naming a scenario."
+        )
+    lock = lock_run_folder(folder)
+    with released(lock):
+        return config, located_scenario(scenario, folder), lock
+
+
+@contextmanager
+def released(lock: int) -> Iterator[None]:
+    """Let go of a folder where an error ends what was to be done in it."""
+    try:
+        yield
+    except BaseException:
+        os.close(lock)
+        raise
+
+
+def restore(folder: Path, progress: Progress) -> None:
+    """Put back a run that a killed --replace had moved aside."""
+    if restore_folder(folder):
+        progress.note(f"A replacement of {folder} was interrupted: the run that was there is back.")

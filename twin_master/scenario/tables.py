@@ -1,0 +1,372 @@
+"""Tables of a scenario: how the state moves, the truth, actions, learning, notices, the watch."""
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from scenarios import recording_files
+from twin_master.scenario.observation import RecordSection
+from twin_master.scenario.section import (
+    Count,
+    Flag,
+    Name,
+    NotNegative,
+    Number,
+    PerSensor,
+    Positive,
+    Probability,
+    Section,
+    Step,
+    check_one_or_each,
+    check_same,
+    short,
+)
+
+ROW_SUM_TOLERANCE = 1e-12
+"""Largest departure of the sum of probabilities from one, as the graphical model has it."""
+
+
+class Transition(Section):
+    """How the state moves in one step under each control; factors move independently given the control."""
+
+    kind: Literal["independent_worsening", "independent_tables"]
+    probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
+    """`independent_worsening`: probability of one level up, for each control (or control and state)."""
+    tables: dict[str, dict[str, tuple[tuple[Probability, ...], ...]]] = Field(default_factory=dict)
+    """`independent_tables`: for each control and state a square table, rows from, columns to."""
+
+    def check(self, controls: tuple[str, ...], levels: Mapping[str, int]) -> None:
+        """Check that there is what it takes for each control and state with its number of levels."""
+        states = tuple(levels)
+        if self.kind == "independent_worsening":
+            if self.tables:
+                raise ValueError("`transition.tables` belongs to the kind `independent_tables`")
+            check_same(self.probability, controls, "transition.probability", "control")
+            for name, entry in self.probability.items():
+                if isinstance(entry, dict):
+                    check_same(entry, states, f"transition.probability.{name}", "state")
+            return
+        if self.probability:
+            raise ValueError("`transition.probability` belongs to the kind `independent_worsening`")
+        check_same(self.tables, controls, "transition.tables", "control")
+        for name, tables in self.tables.items():
+            check_same(tables, states, f"transition.tables.{name}", "state")
+            for state, size in levels.items():
+                table = tables[state]
+                if len(table) != size or any(len(row) != size for row in table):
+                    raise ValueError(
+                        f"`transition.tables.{name}.{state}` must be {size} rows of {size} probabilities"
+                    )
+                worst = max(abs(sum(row) - 1.0) for row in table)
+                if worst > ROW_SUM_TOLERANCE:
+                    raise ValueError(
+                        f"each row of `transition.tables.{name}.{state}` must sum to 1, one misses it by "
+                        f"{worst:.3g}"
+                    )
+
+
+class Gain(Section):
+    """What one factor of the true state gains at each step from `first_step` to `last_step`."""
+
+    units: ClassVar[Mapping[str, str]] = {"gain": "percent"}
+    state: Name
+    first_step: Step
+    last_step: Step | None = None
+    gain: Number
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.last_step is not None and self.last_step < self.first_step:
+            raise ValueError(f"`last_step` {self.last_step} lies before `first_step` {self.first_step}")
+        return self
+
+
+class Noise(Section):
+    """Noise of the real sensors, Gaussian and independent."""
+
+    units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain"}
+    standard_deviation: NotNegative | tuple[NotNegative, ...]
+    """One for all sensors or one for each."""
+
+
+class SensorFault(Section):
+    """A fault of some sensors (numbered from 1) between two steps, the last one included."""
+
+    units: ClassVar[Mapping[str, str]] = {"rate": "microstrain_per_step"}
+    kind: Literal["dropout", "drift"]
+    sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)]
+    first_step: Step
+    last_step: Step | None = None
+    rate: Number | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.kind == "drift") != (self.rate is not None):
+            raise ValueError("a drift needs `rate_microstrain_per_step`, and a dropout has none")
+        if self.last_step is not None and self.last_step < self.first_step:
+            raise ValueError(f"`last_step` {self.last_step} lies before `first_step` {self.first_step}")
+        return self
+
+
+class TruthSection(Section):
+    """What really happens, unseen by the twin: damage, sensor noise and faults.
+
+    With the kind `asset`, all of it happens inside the asset, and is read back for scoring only.
+    """
+
+    kind: Literal["scripted", "random_growth", "asset"]
+    gains: tuple[Gain, ...] = ()
+    probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
+    """`random_growth`: the true probabilities to worsen, as in `transition`; those of the twin if absent."""
+    noise: Noise = Noise(standard_deviation=0.0)
+    sensor_faults: tuple[SensorFault, ...] = ()
+    state: dict[str, Name] = Field(default_factory=dict)
+    """`asset`: for each state, the monitor of the binding that tells its true value."""
+    observation: Name | None = None
+    """`asset`: the observation of the binding that is free of noise; that of the scenario if absent."""
+    received: Name | None = None
+    """`asset`: the observation of the binding that is 0 where a sensor is lost."""
+
+    record: RecordSection | None = None
+    """Where modes are observed: the record of each turn."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.record is not None:
+            if self.kind == "asset" or self.sensor_faults or self.noise.standard_deviation:
+                raise ValueError(
+                    "with `truth.record` the noise is that of the record (`truth.record.noise`), and the "
+                    "truth the scenario's: leave out `truth.noise`, `truth.sensor_faults`, the kind `asset`"
+                )
+            return self
+        if self.kind == "asset":
+            if self.gains or self.sensor_faults or self.noise.standard_deviation:
+                raise ValueError(
+                    "the kind `asset` leaves damage, noise and faults to the asset: leave out `truth.gains`, "
+                    "`truth.noise` and `truth.sensor_faults`"
+                )
+        elif self.state or self.observation or self.received:
+            raise ValueError("`state`, `observation` and `received` of `truth` belong to the kind `asset`")
+        elif "noise" not in self.model_fields_set:
+            raise ValueError("`truth.noise` is missing")
+        return self
+
+
+class Action(Section):
+    """One choice of a turn beside the controls."""
+
+    units: ClassVar[Mapping[str, str]] = {"standard_deviation": "percent"}
+    name: Name
+    title: str = ""
+    control: Name
+    """The control whose loads are on the asset in that turn."""
+    cost: NotNegative
+    """What the reward of the turn is less than under the control."""
+    inspects: tuple[Name, ...] = ()
+    """States that are read in that turn, and only then."""
+    standard_deviation: PerSensor | None = None
+    """Of these readings, one for all or one for each."""
+    repairs: tuple[Name, ...] = ()
+    """States that are at their lowest level in the turn after."""
+    success: Probability = 1.0
+    """Probability with which a repair succeeds, for each state."""
+    ends: Flag = False
+    """Whether the mission ends with that turn."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if bool(self.inspects) != (self.standard_deviation is not None):
+            raise ValueError(
+                f"action `{self.name}`: `inspects` and `standard_deviation` go together: the states that are "
+                "read, and how well"
+            )
+        check_one_or_each("action.standard_deviation", self.standard_deviation, len(self.inspects))
+        if not (self.inspects or self.repairs or self.ends):
+            raise ValueError(
+                f"action `{self.name}` does nothing that its control does not: give `inspects`, `repairs` or "
+                "`ends`"
+            )
+        return self
+
+    @property
+    def readings(self) -> tuple[tuple[str, str, float], ...]:
+        """Name of each reading, the state that is read, and the standard deviation."""
+        given = self.standard_deviation
+        each = given if isinstance(given, tuple) else (given or 0.0,) * len(self.inspects)
+        return tuple(
+            (f"{self.name}_{state}", state, deviation)
+            for state, deviation in zip(self.inspects, each, strict=True)
+        )
+
+
+class Planner(Section):
+    """How the twin decides: value iteration, eq. (36), or planning on the belief."""
+
+    gamma: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)]
+    decide_on: Literal["filtered", "predicted"] = "filtered"
+    """Which belief the next control is the most probable one of: D_t, or D_{t+1} as predicted."""
+    safest: Name | None = None
+    """Control where no state explains the sensors; by default the one with the least load."""
+    policy: Literal["mode", "qmdp", "belief"] = "mode"
+    """The mode of the control of each state; the best control in the mean over the states, taken as if they
+    were known from the next turn on; or what is planned on the belief."""
+    limit_probability: Annotated[Probability, Field(gt=0.0)] | None = None
+    """`belief`: share of the turns, discounted, in which a health limit may be exceeded."""
+
+    inspections_a_turn: Count | None = None
+    """`belief` and `qmdp`: turns with an inspection that assets which fly side by side have among them."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.limit_probability is not None and self.policy != "belief":
+            raise ValueError("`planner.limit_probability` needs `planner.policy` `belief`")
+        if self.inspections_a_turn is not None and self.policy == "mode":
+            raise ValueError("`planner.inspections_a_turn` needs `planner.policy` `belief` or `qmdp`")
+        return self
+
+
+def with_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the table of a scenario with an entry for each action wherever there is one for each control.
+
+    What is malformed stays as it is: the schema says what is wrong with it.
+    """
+    try:
+        made = {**table, "control": list(table["control"])}
+        names = [dict(entry)["name"] for entry in made["control"]]
+        rewards = {**table["rewards"], "control": dict(table["rewards"]["control"])}
+        entries: list[dict[str, Any]] = [rewards["control"]]
+        for key, kinds in (("transition", ("probability", "tables")), ("truth", ("probability",))):
+            if key not in table:
+                continue
+            made[key] = dict(table[key]) | {k: dict(table[key][k]) for k in kinds if k in table[key]}
+            entries += [made[key][kind] for kind in kinds if made[key].get(kind)]
+        made["rewards"], weight = rewards, rewards.get("control_weight", 1.0)
+        for action in table["action"]:
+            name, base = action["name"], action["control"]
+            if name not in names:
+                values = dict(made["control"][names.index(base)])["values"]
+                made["control"].append({"name": name, "title": action.get("title", ""), "values": values})
+            rewards["control"].setdefault(name, rewards["control"][base] - action["cost"] / weight)
+            for entry in entries:
+                entry.setdefault(name, entry[base])
+    except (KeyError, TypeError, ValueError, AttributeError, ZeroDivisionError):
+        return table
+    return made
+
+
+class Learning(Section):
+    """What is learnt, each with its prior; everything else stays as the scenario says it."""
+
+    units: ClassVar[Mapping[str, str]] = {"gauge_gain": "percent", "gauge_offset": "microstrain"}
+    parameter: Flag = True
+    """The draws of the calibrated parameter keep their weights from turn to turn."""
+    noise: Flag = True
+    """The noise scale of each sensor, about the standard deviation that is assumed."""
+    noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0
+    """How sure the assumed noise is: as if it came from so many observations, more than two."""
+    gauge_gain: NotNegative | tuple[NotNegative, ...] = 0.0
+    """Prior standard deviation of the relative gain error of each sensor; 0 is not learnt."""
+    gauge_offset: NotNegative | tuple[NotNegative, ...] = 0.0
+    """Prior standard deviation of the offset of each sensor, in the unit of the sensors; 0 is not learnt."""
+    transition_factors: tuple[Positive, ...] = ()
+    """Factors on the probabilities to leave a state, equally probable at first; none is not learnt."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        factors = self.transition_factors
+        if any(b <= a for a, b in pairwise(factors)):
+            raise ValueError(f"`learning.transition_factors` must increase, and {short(factors)} came")
+        if len(factors) == 1:
+            raise ValueError("`learning.transition_factors` needs two or more factors to choose from")
+        return self
+
+    @property
+    def figure_names(self) -> tuple[str, ...]:
+        """Names of the figures of the summary on what is learnt beside the parameter."""
+        names = [f"transition_factor_{moment}" for moment in ("mean", "standard_deviation")]
+        names = names if self.transition_factors else []
+        for name, learnt in (
+            ("noise_scale", self.noise),
+            ("gauge_offset", _any(self.gauge_offset)),
+            ("gauge_gain", _any(self.gauge_gain)),
+        ):
+            if learnt:
+                names += [f"{name}_{figure}" for figure in ("mean", "most", "most_standard_deviation")]
+        return tuple(names)
+
+    def check_sensors(self, count: int) -> None:
+        """Check that what is given for each sensor is given once, or once for each of `count`."""
+        check_one_or_each("learning.gauge_gain", self.gauge_gain, count)
+        check_one_or_each("learning.gauge_offset", self.gauge_offset, count)
+
+
+def _any(value: float | tuple[float, ...]) -> bool:
+    return any(number > 0.0 for number in (value if isinstance(value, tuple) else (value,)))
+
+
+GAINS = 4
+"""Gain errors that are compared for each sensor."""
+MOST_DRAWS = 15
+"""Draws of the parameter that are kept apart: evidence is compared, and no fine posterior is needed."""
+NUMBERS_BY_DEFAULT = 1_000_000
+"""Numbers of the beliefs about sensors up to which a scenario gives notices by itself: 0.1 s a turn."""
+_LARGEST_GAIN = 0.4
+"""The largest gain errors that are compared are two and a half times as large."""
+
+
+class Noticing(Section):
+    """When an alarm is raised; the belief is not touched, but by readings that are left out."""
+
+    units: ClassVar[Mapping[str, str]] = {"gauge_gain": "percent", "all_gain": "percent"}
+    threshold: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1.0)] = 100.0
+    """Evidence from which an alarm is raised: a false one is at most so improbable, for each of two kinds."""
+    gauge_gain: Annotated[float, Field(strict=True, gt=0.0, le=_LARGEST_GAIN)] = 0.2
+    """Gain error of a single sensor that is to be found; less than half of it raises no alarm."""
+    all_gain: Annotated[float, Field(strict=True, gt=0.0, le=1.0)] = 0.1
+    """Prior standard deviation of the gains of sensors that have one, where no state explains all of them."""
+    memory_turns: Positive = 20.0
+    """Turns after which what was learnt of these gains has faded to 1 / e."""
+    onset_turns: Positive = 50.0
+    """Turns within which half of the faults begin that were not there from the start."""
+    absurd_deviations: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=3.0)] = 8.0
+    """A reading so many assumed standard deviations beyond what any state can show is left out."""
+    prior: Annotated[float, Field(strict=True, gt=0.0, lt=0.5)] = 0.01
+    """Prior probability of each of the two kinds of fault, for their posterior."""
+    noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0
+    """How sure the assumed noise is: as if it came from so many observations, more than two."""
+
+
+NoticingOrNot = Annotated[Noticing | None, BeforeValidator(lambda given: None if given is False else given)]
+"""The table, or `notice = false`."""
+
+
+class WatchSection(Section):
+    """How a real asset is watched."""
+
+    observations: str | None = None
+    """A recorded file that is watched where nothing else is given, or the name of a shipped one."""
+    lag: Count = 50
+    """Turns back over which the twin smooths, and which a message may be late."""
+    longest_gap: Count = 1000
+    """Turns that a message may be ahead of the next one; those between are predicted through."""
+    seconds_per_turn: Positive | None = None
+    """Of messages that have a time in the place of a turn."""
+    allow_unknown: bool = False
+    """Keys and columns that are no sensor are passed over, and not refused."""
+    quiet_after_seconds: Positive | None = None
+    """Without a turn for so long, a notice says that the last decision grows old."""
+
+    @property
+    def recording(self) -> Path | None:
+        """The recorded file."""
+        name = self.observations
+        return None if name is None else recording_files().get(name, Path(name))
+
+    def moved(self, folder: Path) -> Self:
+        """Return the table with the path of the recorded file from a folder; a run folder has no copy."""
+        if self.observations is None or self.observations in recording_files():
+            return self
+        return self.model_copy(update={"observations": str(folder / self.observations)})
