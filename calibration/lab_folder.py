@@ -20,6 +20,11 @@ def places_of(folder: Path, name: Path) -> Iterator[Path]:
         yield folder / above / name
 
 
+def lab_place(folder: Path, name: Path) -> Path | None:
+    """Return where a file or folder lies in a user's folder, None where it does not."""
+    return next((place for place in places_of(folder, name) if place.exists()), None)
+
+
 def find_lab_file(path: Path, name: Path) -> Path:
     """Return the path if it is a file, or the file `name` of the laboratory's (or its step's) folder `path`.
 

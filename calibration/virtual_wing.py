@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.dynamics.records import RingDownRecord
-from calibration.joint.prior import WeighedMass
+from calibration.joint.prior import weighed
+from calibration.result.record import Reading
 from calibration.static.experiments import (
     DISPLACEMENT_STANDARD_DEVIATION,
     HALF_WIDTH_95,
@@ -304,7 +305,7 @@ def measure_lengths(
     return GeometryCalibration(source="virtual lengths", **measured)
 
 
-def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> WeighedMass:
+def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> Reading:
     """Weigh two servos and the pitot tube together.
 
     Parameters
@@ -318,4 +319,4 @@ def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) 
     """
     generator = np.random.default_rng(child_seed(seed, _PURPOSES["weighing"]))
     error = float(generator.normal(0.0, standard_deviation))
-    return WeighedMass(2.0 * truth.servo_mass + truth.pitot_mass + error, standard_deviation)
+    return weighed(2.0 * truth.servo_mass + truth.pitot_mass + error, standard_deviation)

@@ -9,8 +9,9 @@ import numpy as np
 from calibration.dynamics.records import STEP_FOLDER, RingDownRecord
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, GeometryCalibration
-from calibration.joint.prior import WeighedMass
+from calibration.joint.prior import weighed
 from calibration.lab_folder import LAB_ERRORS
+from calibration.result.record import Reading
 from calibration.static.experiments import MEASUREMENTS_FILE, LoadDisplacementData
 from reporting.files import atomic_write_text
 from reporting.table_file import read_table, table_text
@@ -27,7 +28,7 @@ def write_lab_folder(
     lengths: GeometryCalibration,
     load_test: LoadDisplacementData,
     records: Sequence[RingDownRecord],
-    total_mass: WeighedMass | None = None,
+    total_mass: Reading | None = None,
 ) -> tuple[Path, ...]:
     """Write measurements as the readers of `calibration` take them; every file is whole or not there.
 
@@ -42,7 +43,7 @@ def write_lab_folder(
     records : sequence of RingDownRecord
         Records, to `step3/initialconditiondata_N.DAT`: time [s], spanwise signal [V], and a chordwise column
         of zeros, because the wing model has no chordwise gauge.
-    total_mass : WeighedMass, optional
+    total_mass : Reading, optional
         Weighed total, to `step3/weighed_mass.csv` [g].
 
     Returns
@@ -76,12 +77,12 @@ def write_lab_folder(
         file = folder / STEP_FOLDER / f"initialconditiondata_{number}.DAT"
         files.append(atomic_write_text(file, lines.getvalue()))
     if total_mass is not None:
-        columns = [[f"{kilograms * 1e3:.10g}"] for kilograms in total_mass]
+        columns = [[f"{kilograms * 1e3:.10g}"] for kilograms in (total_mass.value, total_mass.deviation)]
         files.append(atomic_write_text(folder / WEIGHED_MASS_FILE, table_text(_WEIGHED_COLUMNS, columns)))
     return tuple(files)
 
 
-def read_weighed_mass(folder: Path) -> WeighedMass:
+def read_weighed_mass(folder: Path) -> Reading:
     """Read the weighed total of a laboratory folder; the paper's 472 g where there is no such file.
 
     Raises
@@ -93,7 +94,7 @@ def read_weighed_mass(folder: Path) -> WeighedMass:
     """
     file = Path(folder) / WEIGHED_MASS_FILE
     if not file.exists():
-        return WeighedMass()
+        return weighed()
     table = read_table(file, LAB_ERRORS)
     if len(table) != 1:
         raise ExperimentFileError(
@@ -107,4 +108,4 @@ def read_weighed_mass(folder: Path) -> WeighedMass:
         raise ExperimentDataError(
             f"{file}: the standard deviation, {deviation:g} g, must be less than the mass, {mass:g} g."
         )
-    return WeighedMass(1e-3 * mass, 1e-3 * deviation)
+    return weighed(1e-3 * mass, 1e-3 * deviation)
