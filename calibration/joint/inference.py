@@ -28,7 +28,8 @@ LEAST_EFFECTIVE_SAMPLE_SIZE = 200.0
 
 _FREEDOM = 10.0  # of the Student-t proposals: tails heavier than those of the posterior, a cut-off Gaussian
 _INFLATION = 1.05  # of the proposal's covariance over the posterior's
-_STARTS = 8  # of the search for the optimum: the prior's mean, and draws of it
+_STARTS = 4  # of the search for the optimum: the prior's mean, and draws of it
+_STEP = 1e-7  # of a scaled parameter, for slopes
 _ROUNDS, _MOST_ROUNDS, _ADAPTATION_COUNT = 3, 60, 1000
 _TEMPERED_SHARE = 0.1
 _PROPOSALS_PER_SAMPLE, _FEWEST_PROPOSALS = 20, 4_000
@@ -153,8 +154,9 @@ class _Density:
         starts = [np.zeros(len(priors)), *generator.standard_normal((_STARTS - 1, len(priors)))]
         width = self._high - self._low
         inside = [np.clip(start, self._low + 1e-6 * width, self._high - 1e-6 * width) for start in starts]
+        limits = self._low, self._high
         found = [
-            least_squares(self._residuals, start, bounds=(self._low, self._high), x_scale="jac")
+            least_squares(lambda u: self._residuals(u[None])[0], start, self._jacobian, limits, x_scale="jac")
             for start in inside
         ]
         best = max(found, key=lambda item: float(self._log_density(item.x[None])[0]))
@@ -191,8 +193,13 @@ class _Density:
         return value
 
     def _residuals(self, u: FloatArray) -> FloatArray:
-        difference, deviation = self._compare(self._mean + self._deviation * u[None])
-        return np.concatenate([(difference / deviation)[0], u])
+        difference, deviation = self._compare(self._mean + self._deviation * u)
+        return np.hstack([difference / deviation, u])
+
+    def _jacobian(self, u: FloatArray) -> FloatArray:
+        step = np.where(u + _STEP < self._high, _STEP, -_STEP)
+        residuals = self._residuals(np.vstack([u, u + np.diag(step)]))
+        return np.asarray((residuals[1:] - residuals[0]).T / step)
 
 
 def _normalised(log_weight: FloatArray) -> FloatArray:
