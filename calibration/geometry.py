@@ -88,12 +88,6 @@ class MeasuredLength:
         mean = self.designed + (self.measured - self.designed) * reading / (prior + reading)
         return GaussianPrior(mean, (prior + reading) ** -0.5)
 
-    @property
-    def score(self) -> float:
-        """How far the measurement lies from the design, in standard deviations of prior and reading [1]."""
-        scatter = math.hypot(self.tolerance, self.reading_uncertainty) / HALF_WIDTH_95
-        return (self.measured - self.designed) / scatter
-
 
 @dataclass(frozen=True)
 class GeometryCalibration:
@@ -103,24 +97,16 @@ class GeometryCalibration:
     ----------
     semi_span, root_chord, tip_chord : MeasuredLength
         The three lengths; their errors are independent.
-    source : str
-        Where the figures come from.
     """
 
     semi_span: MeasuredLength
     root_chord: MeasuredLength
     tip_chord: MeasuredLength
-    source: str
 
     @property
     def lengths(self) -> tuple[MeasuredLength, MeasuredLength, MeasuredLength]:
         """The three lengths in the order of `LENGTH_NAMES`."""
         return self.semi_span, self.root_chord, self.tip_chord
-
-    @property
-    def geometry(self) -> Geometry:
-        """The planform at the posterior mean, from which a wing is modelled [m]."""
-        return Geometry(*(length.posterior.mean for length in self.lengths))
 
 
 def published_lengths() -> GeometryCalibration:
@@ -133,7 +119,6 @@ def published_lengths() -> GeometryCalibration:
         semi_span=MeasuredLength("semi_span", 1.8288, 1.8280),
         root_chord=MeasuredLength("root_chord", 0.43561, 0.4330),
         tip_chord=MeasuredLength("tip_chord", 0.261112, 0.2600),
-        source="published lengths (Kapteyn et al. 2021, Table 1)",
     )
 
 
@@ -173,7 +158,7 @@ def read_lengths(path: Path) -> GeometryCalibration:
         )
         for published, name in PUBLISHED_NAMES.items()
     }
-    return GeometryCalibration(source=file.name, **found)
+    return GeometryCalibration(**found)
 
 
 def _length(table: TextTable, column: str, row: int) -> float:
@@ -186,21 +171,12 @@ def _length(table: TextTable, column: str, row: int) -> float:
     return millimetres * 1e-3
 
 
-RESOLUTION = 1e-4
-"""To what the planform of a tailored design is rounded: what the measurement leaves uncertain [m]."""
-
-LARGEST_DEPARTURE = 0.10
-"""By how much the measured lengths may differ from the design that is tailored [1]."""
-
-_DIGITS = 4
-
-
 def tailored_geometry(lengths: GeometryCalibration) -> Geometry:
-    """Return the posterior means, rounded to `RESOLUTION` [m].
+    """Return the posterior means, rounded to what the measurement leaves uncertain, 0.1 mm [m].
 
     The paper keeps the means and drops their standard deviation, which is 0.1 mm.
     """
-    return Geometry(*(round(length.posterior.mean, _DIGITS) for length in lengths.lengths))
+    return Geometry(*(round(length.posterior.mean, 4) for length in lengths.lengths))
 
 
 def tailored_design(design: WingDesign, lengths: GeometryCalibration) -> WingDesign:
@@ -222,7 +198,7 @@ def tailored_design(design: WingDesign, lengths: GeometryCalibration) -> WingDes
     planform = {name: getattr(geometry, name) for name in LENGTH_NAMES}
     for name, value in planform.items():
         drawn = getattr(design.planform, name)
-        if abs(value / drawn - 1.0) > LARGEST_DEPARTURE:
+        if abs(value / drawn - 1.0) > _LARGEST_DEVIATION:
             raise ExperimentDataError(
                 f"{name} measures {value * 1e3:.1f} mm, but the design {design.name} has "
                 f"{drawn * 1e3:.1f} mm, more than 10 % apart: give the design of this wing with --design."

@@ -302,7 +302,7 @@ def measure_lengths(
             length,
             reading_uncertainty=reading_uncertainty,
         )
-    return GeometryCalibration(source="virtual lengths", **measured)
+    return GeometryCalibration(**measured)
 
 
 def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> Reading:

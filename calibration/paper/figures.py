@@ -58,14 +58,9 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
     ):
         lower, upper = posterior.interval(0.95)
         axes.fill_between(
-            displacement * 1e3,
-            lower * displacement,
-            upper * displacement,
-            color=colour,
-            alpha=opacity,
-            lw=0.0,
-            label=f"{name}, 95 % band",
-        )
+            displacement * 1e3, lower * displacement, upper * displacement,
+            color=colour, alpha=opacity, lw=0.0, label=f"{name}, 95 % band",
+        )  # fmt: skip
     axes.plot(
         displacement * 1e3, result.tip_stiffness_prior.mean * displacement, color=REFERENCE, lw=1.0, ls="--"
     )
@@ -73,14 +68,11 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
     for number, index in enumerate(data.run_indices):
         of_run = data.run == index
         axes.errorbar(
-            data.displacement[of_run] * 1e3,
-            data.load[of_run],
+            data.displacement[of_run] * 1e3, data.load[of_run],
             xerr=HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3,
             yerr=HALF_WIDTH_95 * data.load_standard_deviation,
-            **_of_run(number),
-            label=f"measured, run {index + 1}",
-            zorder=3 + number,
-        )
+            **_of_run(number), label=f"measured, run {index + 1}", zorder=3 + number,
+        )  # fmt: skip
     axes.set_xlim(0.0, reach * 1e3)
     axes.set_ylim(0.0, 1.12 * float(data.load.max()))
     axes.set_xlabel("tip displacement $x$ (mm)", parse_math=True)
@@ -91,15 +83,9 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
 
 def _of_run(number: int) -> dict[str, Any]:
     """Return how the pairs of a loading run are marked."""
-    return {
-        "fmt": _MARKERS[number % len(_MARKERS)],
-        "color": OBSERVED,
-        "mfc": "white" if number % 2 else OBSERVED,
-        "ms": 3.6,
-        "mew": 0.9,
-        "elinewidth": 0.8,
-        "capsize": 1.8,
-    }
+    marker, face = _MARKERS[number % len(_MARKERS)], "white" if number % 2 else OBSERVED
+    line: dict[str, Any] = {"ms": 3.6, "mew": 0.9, "elinewidth": 0.8, "capsize": 1.8}
+    return line | {"fmt": marker, "color": OBSERVED, "mfc": face}
 
 
 def _draw_factor(axes: Axes, result: StaticCalibration) -> None:
@@ -185,17 +171,6 @@ def _draw_residuals(axes: Axes, result: StaticCalibration) -> None:
     panel_label(axes, "a", "Residuals of the two runs" if len(quality.runs) == 2 else "Residuals")
 
 
-def _short_name(assumption: str) -> str:
-    for beginning, short in (
-        ("prior flat", "flat in load"),
-        ("density", "ratio"),
-        ("a zero", "zero offsets"),
-    ):
-        if assumption.startswith(beginning):
-            return short
-    return assumption
-
-
 def _draw_alternatives(axes: Axes, result: StaticCalibration) -> None:
     rows = [
         ("paper", PAPER_MEAN, PAPER_STANDARD_DEVIATION, REFERENCE),
@@ -203,7 +178,7 @@ def _draw_alternatives(axes: Axes, result: StaticCalibration) -> None:
         ("exact", result.exact.mean, result.exact.standard_deviation, PAST),
     ]
     rows += [
-        (f"exact, {_short_name(alternative.name)}", alternative.mean, alternative.standard_deviation, PAST)
+        (f"exact, {alternative.name}", alternative.mean, alternative.standard_deviation, PAST)
         for alternative in result.alternatives
     ]
     for row, (_, mean, deviation, colour) in enumerate(rows):

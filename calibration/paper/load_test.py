@@ -1,20 +1,20 @@
 """Calibration step 2 alone, as in Fig. 5 of the paper: e and the tip stiffness, exactly and by particles."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from calibration.errors import OutsideValidityError
 from calibration.paper.particle_filter import DEFAULT_PARTICLE_COUNT, ParticlePosterior, particle_filter
 from calibration.static.errors_in_variables import Measure, exact_posterior
-from calibration.static.experiments import HALF_WIDTH_95, LoadDisplacementData, published_measurements
+from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import GaussianPrior, ScalarPosterior
 from calibration.static.quality import FitQuality, assess_fit
 from calibration.static.stiffness_curve import PUBLISHED_LINE, StiffnessCurve
 
 
-@dataclass(frozen=True)
-class Alternative:
+class Alternative(NamedTuple):
     """The same posterior under another assumption: its name, mean and standard deviation of e [1]."""
 
     name: str
@@ -123,15 +123,10 @@ def _alternatives(
     curve: StiffnessCurve, data: LoadDisplacementData, prior: GaussianPrior
 ) -> tuple[Alternative, ...]:
     """Return the posterior under other assumptions, but for those that lead out of the curve's range."""
-    half_width = HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3
     assumptions: tuple[tuple[str, Measure, float], ...] = (
-        ("prior flat in the true load", "load", 0.0),
-        ("density of the ratio (the particle filter with unlimited samples)", "ratio", 0.0),
-        (
-            f"a zero offset of ±{half_width:.2g} mm shared by each run",
-            "displacement",
-            data.displacement_standard_deviation,
-        ),
+        ("flat in load", "load", 0.0),
+        ("ratio", "ratio", 0.0),  # what the particle filter tends to
+        ("zero offsets", "displacement", data.displacement_standard_deviation),  # that each run shares
     )
     found = []
     for name, measure, offset in assumptions:

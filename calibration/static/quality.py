@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincc
 
 from .errors_in_variables import residual_variance
 from .experiments import LoadDisplacementData
@@ -48,12 +47,6 @@ class FitQuality:
         x - f / k [m].
     standardised_residual : (N,) array
         (k x - f) / sqrt(R_f + k^2 R_x) [1]; positive where the wing bends more than the model.
-    chi_square : float
-        Sum of their squares.
-    degrees_of_freedom : int
-        Number of pairs less one, for the one fitted factor.
-    tail_probability : float
-        Probability that chi-square with these degrees of freedom is larger; NaN without any.
     runs : tuple of RunFit
         The loading runs.
     remarks : tuple of str
@@ -63,9 +56,6 @@ class FitQuality:
     stiffness: float
     displacement_residual: NDArray[np.float64]
     standardised_residual: NDArray[np.float64]
-    chi_square: float
-    degrees_of_freedom: int
-    tail_probability: float
     runs: tuple[RunFit, ...]
     remarks: tuple[str, ...]
 
@@ -83,23 +73,13 @@ def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
     scatter = math.sqrt(float(residual_variance(data, stiffness)))
     residual = data.displacement - data.load / stiffness
     standardised = residual * stiffness / scatter
-    chi_square = float(np.sum(standardised**2))
-    degrees = data.count - 1
     runs = []
     for index in data.run_indices:
         of_run = residual[data.run == index]
         error = scatter / stiffness / math.sqrt(of_run.size)
         runs.append(RunFit(index, of_run.size, float(of_run.mean()), error))
-    return FitQuality(
-        stiffness=stiffness,
-        displacement_residual=residual,
-        standardised_residual=standardised,
-        chi_square=chi_square,
-        degrees_of_freedom=degrees,
-        tail_probability=float(gammaincc(0.5 * degrees, 0.5 * chi_square)) if degrees else math.nan,
-        runs=tuple(runs),
-        remarks=tuple(_remarks(data, standardised, runs)),
-    )
+    remarks = tuple(_remarks(data, standardised, runs))
+    return FitQuality(stiffness, residual, standardised, tuple(runs), remarks)
 
 
 def _remarks(
