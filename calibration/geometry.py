@@ -4,15 +4,15 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from calibration.result.record import ParameterPrior, Reading
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError
 from fe.runtime.state import Geometry
 from fe.wing.design import WingDesign
-from reporting.table_file import TextTable, read_table
 
 from .errors import ExperimentDataError, ExperimentFileError
-from .lab_folder import LAB_ERRORS, find_lab_file
+from .lab_folder import lab_table
 
 TOLERANCE = 2.54e-3
 """Design tolerance of a length, half-width of a 95 % interval [m] (Kapteyn et al. 2021, Table 1)."""
@@ -72,9 +72,16 @@ class MeasuredLength:
             )
 
     @property
-    def prior(self) -> GaussianPrior:
-        """The design and its tolerance [m]."""
-        return GaussianPrior(self.designed, self.tolerance / HALF_WIDTH_95)
+    def prior(self) -> ParameterPrior:
+        """The design and its tolerance."""
+        low, high = (self.designed * (1.0 + side * _LARGEST_DEVIATION) for side in (-1.0, 1.0))
+        deviation = self.tolerance / HALF_WIDTH_95
+        return ParameterPrior(self.name, "m", self.designed, deviation, low, high, "design tolerance")
+
+    @property
+    def reading(self) -> Reading:
+        """What was measured."""
+        return Reading(self.name, "planform", self.measured, self.reading_uncertainty / HALF_WIDTH_95)
 
     @property
     def posterior(self) -> GaussianPrior:
@@ -83,8 +90,7 @@ class MeasuredLength:
         The precisions add, and the mean is weighted by them: 1/s² = 1/s_0² + 1/s_r²,
         m = s² (designed / s_0² + measured / s_r²).
         """
-        prior = (self.tolerance / HALF_WIDTH_95) ** -2
-        reading = (self.reading_uncertainty / HALF_WIDTH_95) ** -2
+        prior, reading = self.prior.deviation**-2, self.reading.deviation**-2
         mean = self.designed + (self.measured - self.designed) * reading / (prior + reading)
         return GaussianPrior(mean, (prior + reading) ** -0.5)
 
@@ -140,35 +146,29 @@ def read_lengths(path: Path) -> GeometryCalibration:
     ExperimentDataError
         If a value is not positive and finite, or the lengths are in another unit.
     """
-    file = find_lab_file(Path(path), GEOMETRY_FILE)
-    table = read_table(file, LAB_ERRORS)
+    table = lab_table(path, GEOMETRY_FILE)
     names = table.cells("parameter", _USER)
     table.refuse_repeated(names, "parameter", "keep one of them")
     lost = [published for published in PUBLISHED_NAMES if published not in names]
     if lost:
         raise ExperimentFileError(
-            f"{file} lacks the row {' and '.join(lost)}; the rows {', '.join(PUBLISHED_NAMES)} are needed."
+            f"{table.name} lacks the row {' and '.join(lost)}; {', '.join(PUBLISHED_NAMES)} are needed."
         )
-    for column in ("designed", "manufactured"):
+    columns = ("designed", "manufactured")
+    for column in columns:
         table.cells(column, _USER)
-    found = {
-        name: MeasuredLength(
-            name,
-            *(_length(table, column, names.index(published)) for column in ("designed", "manufactured")),
-        )
-        for published, name in PUBLISHED_NAMES.items()
-    }
+    found = {}
+    for published, name in PUBLISHED_NAMES.items():
+        row = names.index(published)
+        millimetres = [table.positive_number(column, row) for column in columns]
+        for column, value in zip(columns, millimetres, strict=True):
+            if value < 10.0:
+                raise ExperimentDataError(
+                    f"{table.name}, line {table.lines[row]}: {column} is {value:g} mm, which looks like m: "
+                    "give it in mm."
+                )
+        found[name] = MeasuredLength(name, *(value * 1e-3 for value in millimetres))
     return GeometryCalibration(**found)
-
-
-def _length(table: TextTable, column: str, row: int) -> float:
-    millimetres = table.positive_number(column, row)
-    if millimetres < 10.0:
-        raise ExperimentDataError(
-            f"{table.name}, line {table.lines[row]}: {column} is {millimetres:g} mm, which looks like m: "
-            "give it in mm."
-        )
-    return millimetres * 1e-3
 
 
 def tailored_geometry(lengths: GeometryCalibration) -> Geometry:

@@ -20,6 +20,7 @@ from calibration.result.record import Reading
 MODAL = ("frequency_1", "frequency_2", "damping_ratio_1", "damping_ratio_2")
 """What a ring-down tells of a wing."""
 
+_NAMES = ("frequency", "damping_ratio")
 _SIGNIFICANT_SCATTER = 0.95
 _SIGNIFICANT_DIFFERENCE = 2.0  # standard errors
 _LATER_STARTS = (0.04, 0.08)  # s; one and two and a half periods of the second mode
@@ -89,7 +90,7 @@ def measured_modes(trials: RingDownTrials) -> tuple[Reading, ...]:
     ExperimentDataError
         If an uncertainty comes out as zero, as for a drawn record without noise.
     """
-    means = [_mean_of(trials.fits, name, mode) for name in ("frequency", "damping_ratio") for mode in (0, 1)]
+    means = [_mean_of([fit.modes[mode] for fit in trials.fits], name) for name in _NAMES for mode in (0, 1)]
     softening = _amplitude_terms(trials)
     choice = _choice_terms(trials, means[1][0], means[3][0])
     systematic = softening[0], choice[0], softening[1], choice[1]
@@ -97,8 +98,7 @@ def measured_modes(trials: RingDownTrials) -> tuple[Reading, ...]:
     return modal_readings([mean for mean, _ in means], deviations)
 
 
-def _mean_of(fits: Sequence[RingDownFit], name: str, mode: int) -> tuple[float, float]:
-    modes = [fit.modes[mode] for fit in fits]
+def _mean_of(modes: Sequence[RingDownMode], name: str) -> tuple[float, float]:
     values, errors = ([getattr(item, which) for item in modes] for which in (name, f"{name}_standard_error"))
     return _mean(values, errors)
 
@@ -127,7 +127,7 @@ def _amplitude_terms(trials: RingDownTrials) -> tuple[float, float]:
     if not spread > 0.0:
         return 0.0, 0.0
     terms = []
-    for name in ("frequency", "damping_ratio"):
+    for name in _NAMES:
         value = np.array([getattr(point, name) for point in points])
         slope = float(logarithm @ value / (logarithm @ logarithm))
         rest = value - value.mean() - slope * logarithm
@@ -145,12 +145,7 @@ def _choice_terms(trials: RingDownTrials, frequency: float, ratio: float) -> tup
         found = [refitted for fit in trials.fits if (refitted := _refit(fit, delay)) is not None]
         if len(found) < len(trials.fits):
             continue  # the mode has died away by then
-        others = (
-            _mean([item.frequency for item in found], [item.frequency_standard_error for item in found]),
-            _mean(
-                [item.damping_ratio for item in found], [item.damping_ratio_standard_error for item in found]
-            ),
-        )
+        others = [_mean_of(found, name) for name in _NAMES]
         pairs = zip(others, (frequency, ratio), strict=True)
         terms.append([_beyond_chance(other - first, error) for (other, error), first in pairs])
     if not terms:

@@ -1,7 +1,7 @@
 """Calibration step 2 alone, as in Fig. 5 of the paper: e and the tip stiffness, exactly and by particles."""
 
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,14 +12,6 @@ from calibration.static.experiments import LoadDisplacementData, published_measu
 from calibration.static.posterior import GaussianPrior, ScalarPosterior
 from calibration.static.quality import FitQuality, assess_fit
 from calibration.static.stiffness_curve import PUBLISHED_LINE, StiffnessCurve
-
-
-class Alternative(NamedTuple):
-    """The same posterior under another assumption: its name, mean and standard deviation of e [1]."""
-
-    name: str
-    mean: float
-    standard_deviation: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +32,7 @@ class StaticCalibration:
         p(e | pairs) with errors in both variables, by quadrature.
     tip_stiffness_prior, tip_stiffness_particle, tip_stiffness_exact : ScalarPosterior
         p(k) and p(k | pairs), the quantity of interest of Fig. 5 [N/m].
-    alternatives : tuple of Alternative
+    alternatives : dict of str to ScalarPosterior
         The exact posterior under other assumptions; those that leave the range of the curve are missing.
     quality : FitQuality
         Residuals at the exact posterior mean.
@@ -54,7 +46,7 @@ class StaticCalibration:
     tip_stiffness_prior: ScalarPosterior
     tip_stiffness_particle: ScalarPosterior
     tip_stiffness_exact: ScalarPosterior
-    alternatives: tuple[Alternative, ...]
+    alternatives: dict[str, ScalarPosterior]
     quality: FitQuality
 
 
@@ -121,20 +113,17 @@ def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPos
 
 def _alternatives(
     curve: StiffnessCurve, data: LoadDisplacementData, prior: GaussianPrior
-) -> tuple[Alternative, ...]:
+) -> dict[str, ScalarPosterior]:
     """Return the posterior under other assumptions, but for those that lead out of the curve's range."""
     assumptions: tuple[tuple[str, Measure, float], ...] = (
         ("flat in load", "load", 0.0),
         ("ratio", "ratio", 0.0),  # what the particle filter tends to
         ("zero offsets", "displacement", data.displacement_standard_deviation),  # that each run shares
     )
-    found = []
+    found = {}
     for name, measure, offset in assumptions:
-        try:
-            posterior = exact_posterior(
+        with suppress(OutsideValidityError):
+            found[name] = exact_posterior(
                 data, curve=curve, prior=prior, measure=measure, zero_offset_standard_deviation=offset
             )
-        except OutsideValidityError:
-            continue
-        found.append(Alternative(name, posterior.mean, posterior.standard_deviation))
-    return tuple(found)
+    return found

@@ -17,10 +17,9 @@ from calibration.dynamics.records import STEP_FOLDER
 from calibration.errors import ExperimentDataError, MassConstraintError
 from calibration.joint.measurement import MODAL
 from calibration.joint.posterior import servo_range
-from calibration.lab_folder import LAB_ERRORS, find_lab_file
+from calibration.lab_folder import lab_table
 from calibration.result.record import Reading
 from fe.runtime.modal_system import rayleigh_coefficients
-from reporting.table_file import read_table
 
 RESULTS_FILE = "massoptimizationresults.csv"
 """The authors' masses and frequencies for each of their samples of e."""
@@ -135,7 +134,7 @@ def read_published_results(path: Path) -> PaperSamples:
     ExperimentDataError
         If a value is not positive and finite.
     """
-    table = read_table(find_lab_file(Path(path), STEP_FOLDER / RESULTS_FILE), LAB_ERRORS)
+    table = lab_table(path, STEP_FOLDER / RESULTS_FILE)
     columns = np.array([table.positive_numbers(name, "the authors' step 3") for name in _RESULT_COLUMNS])
     first, second = columns[5:7, 0].tolist()
     pairs = columns[3:5].T

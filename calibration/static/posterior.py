@@ -105,7 +105,7 @@ class ScalarPosterior:
         good = good and bool(np.all(np.isfinite(grid)) and np.all(np.diff(grid) > 0.0))
         if not (good and np.all(np.isfinite(density)) and density.min() >= 0.0 and density.max() > 0.0):
             raise PosteriorError(
-                "a posterior needs a grid of three finite values or more that ascend, and a density there that "
+                "a posterior needs a grid of three finite values or more that ascend, and a density that "
                 f"is finite, not negative, and positive somewhere; {grid.shape} and {density.shape} came."
             )
         density /= density.max()  # guards the integral against overflow

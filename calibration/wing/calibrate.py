@@ -20,13 +20,12 @@ from calibration.result.file import save_calibration
 from calibration.result.record import (
     Calibration,
     ChannelFit,
-    ParameterPrior,
     Procedure,
     Reading,
     check_name,
     prior_samples,
 )
-from calibration.static.experiments import HALF_WIDTH_95, LoadDisplacementData
+from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import child_seed
 from calibration.static.quality import assess_fit
 from calibration.static.stiffness_curve import PUBLISHED_LINE
@@ -140,7 +139,7 @@ def calibrate_wing(
         paper = fit_masses(table.frequency, factors, table.validity, lab.readings)
     with progress.stage("Step 3: masses and damping, joint posterior"):
         joint = joint_posterior(table, lab.pairs, lab.readings, seed=seed, count=SAMPLE_COUNT)
-    priors = (*wing_priors(model.validity), *_length_priors(lab.lengths))
+    priors = (*wing_priors(model.validity), *(length.prior for length in lab.lengths.lengths))
     prior = prior_samples(priors, SAMPLE_COUNT, seed)
     prior = np.column_stack([prior, table.outputs(prior)])
 
@@ -156,7 +155,7 @@ def calibrate_wing(
             prior_samples=prior,
             explained=None,
             findings=(),
-            channels=(_fit(static, float(state[:, 0].mean())),),
+            channels=_fits(static, float(state[:, 0].mean())),
             source="; ".join(origin.text for origin in lab.origins),
             seed=seed,
             provenance=_provenance(lab, drawn, seed),
@@ -182,22 +181,20 @@ def _provenance(lab: LabData, drawn: WingDesign, seed: int) -> Mapping[str, Any]
     ).as_dict()
 
 
-def _fit(static: StaticCalibration, factor: float) -> ChannelFit:
-    """Return how far the load test is from the model at the prior mean of e and at a calibrated one."""
+def _fits(static: StaticCalibration, factor: float) -> tuple[ChannelFit, ...]:
+    """Return how far each loading run is from the model at the prior mean of e and at a calibrated one."""
+    data = static.data
     before, after = (
-        float(np.sqrt(np.mean(assess_fit(static.data, stiffness).standardised_residual ** 2)))
+        assess_fit(data, stiffness).standardised_residual ** 2
         for stiffness in static.curve.stiffness([static.prior.mean, factor]).tolist()
     )
-    return ChannelFit("load test", "fitted", static.data.count, before, after)
-
-
-def _length_priors(lengths: GeometryCalibration) -> tuple[ParameterPrior, ...]:
     return tuple(
-        ParameterPrior(
-            length.name, "m", length.prior.mean, length.prior.standard_deviation,
-            0.9 * length.designed, 1.1 * length.designed, "design tolerance",
+        ChannelFit(
+            f"load test, run {run + 1}", "fitted", int(of_run.sum()),
+            float(np.sqrt(before[of_run].mean())), float(np.sqrt(after[of_run].mean())),
         )
-        for length in lengths.lengths
+        for run in data.run_indices
+        for of_run in [data.run == run]
     )  # fmt: skip
 
 
@@ -217,12 +214,8 @@ def _readings(lab: LabData) -> tuple[Reading, ...]:
     square = float(pairs.displacement @ pairs.displacement)
     stiffness = float(pairs.load @ pairs.displacement) / square
     scatter = np.hypot(pairs.load_standard_deviation, stiffness * pairs.displacement_standard_deviation)
-    lengths = (
-        Reading(length.name, "planform", length.measured, length.reading_uncertainty / HALF_WIDTH_95)
-        for length in lab.lengths.lengths
-    )
     load_test = Reading("tip_stiffness", "load test", stiffness, float(scatter / np.sqrt(square)))
-    return *lengths, load_test, *lab.readings
+    return *(length.reading for length in lab.lengths.lengths), load_test, *lab.readings
 
 
 def _measured(pairs: LoadDisplacementData) -> xr.Dataset:

@@ -143,7 +143,7 @@ def read_lab_folder(
     elif records:
         origins[3] = StepOrigin(3, False, "records left aside as asked; " + _PUBLISHED[3])
     if (file := lab_place(path, WEIGHED_MASS_FILE)) is not None:
-        mass = read_weighed_mass(file.parents[1])
+        mass = read_weighed_mass(file)
         hashes["weighed_mass"] = hash_record([mass.value, mass.deviation])
         origins[3] = origins[3]._replace(text=f"{origins[3].text}; {WEIGHED_MASS_FILE.as_posix()} read")
     if (file := lab_place(path, STEP_FOLDER / RESULTS_FILE)) is not None:

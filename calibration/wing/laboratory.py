@@ -10,11 +10,11 @@ from calibration.dynamics.records import STEP_FOLDER, RingDownRecord
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, GeometryCalibration
 from calibration.joint.prior import weighed
-from calibration.lab_folder import LAB_ERRORS
+from calibration.lab_folder import lab_table
 from calibration.result.record import Reading
 from calibration.static.experiments import MEASUREMENTS_FILE, LoadDisplacementData
 from reporting.files import atomic_write_text
-from reporting.table_file import read_table, table_text
+from reporting.table_file import table_text
 
 WEIGHED_MASS_FILE = STEP_FOLDER / "weighed_mass.csv"
 """The weighed total of servos and pitot tube [g]; the authors give theirs in the paper alone."""
@@ -82,8 +82,8 @@ def write_lab_folder(
     return tuple(files)
 
 
-def read_weighed_mass(folder: Path) -> Reading:
-    """Read the weighed total of a laboratory folder; the paper's 472 g where there is no such file.
+def read_weighed_mass(file: Path) -> Reading:
+    """Read the weighed total of a laboratory.
 
     Raises
     ------
@@ -92,10 +92,7 @@ def read_weighed_mass(folder: Path) -> Reading:
     ExperimentDataError
         If a figure is not a positive finite number of grams, or looks like kg.
     """
-    file = Path(folder) / WEIGHED_MASS_FILE
-    if not file.exists():
-        return weighed()
-    table = read_table(file, LAB_ERRORS)
+    table = lab_table(file, WEIGHED_MASS_FILE)
     if len(table) != 1:
         raise ExperimentFileError(
             f"{file} needs a header `mass,standard_deviation` and one row in grams, and {len(table)} came."

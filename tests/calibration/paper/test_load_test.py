@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibration.paper.figures import calibration_figure, residual_figure
+from calibration.paper.figures import calibration_figure
 from calibration.paper.load_test import StaticCalibration, calibrate_static
 from calibration.static.experiments import published_measurements
 from calibration.static.quality import assess_fit
@@ -40,8 +40,6 @@ def test_tip_stiffness_of_figure_5(result):
 
 
 def test_the_offset_between_the_runs_is_noticed(result):
-    first, second = result.quality.runs
-    assert first.offset - second.offset == pytest.approx(0.47e-3, abs=0.01e-3)
     assert "differ by 0.47 mm" in result.quality.remarks[0]
     chi_square = float(np.sum(result.quality.standardised_residual**2))
     assert chi_square == pytest.approx(11.76, abs=0.05)
@@ -60,14 +58,13 @@ def test_an_alternative_that_leaves_the_model_is_left_out():
     """Only the assumption of a shared offset is wide enough to reach the end of this curve."""
     line = stiffness_line(575.2, 101.8, "short", 0.9, 1.06)
     found = calibrate_static(line, particle_count=20_000)
-    assert [alternative.name for alternative in found.alternatives] == ["flat in load", "ratio"]
-    assert len(residual_figure(found).axes) == 2
+    assert [*found.alternatives] == ["flat in load", "ratio"]
     assert len(calibrate_static(particle_count=20_000).alternatives) == 3
 
 
 def test_alternatives_stay_near(result):
-    means = {alternative.name: alternative.mean for alternative in result.alternatives}
-    assert list(means.values()) == pytest.approx([1.00868, 1.00730, 1.01337], abs=1e-4)
+    means = [posterior.mean for posterior in result.alternatives.values()]
+    assert means == pytest.approx([1.00868, 1.00730, 1.01337], abs=1e-4)
 
 
 def test_our_own_model_as_curve():
