@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import cumulative_trapezoid
 from scipy.special import ndtri
 
 from calibration.errors import PosteriorError
@@ -110,7 +109,7 @@ class ScalarPosterior:
             )
         density /= density.max()  # guards the integral against overflow
         density /= np.trapezoid(density, grid)
-        cumulative = cumulative_trapezoid(density, grid, initial=0.0)
+        cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(grid))])
         mean = float(np.trapezoid(density * grid, grid)) if math.isnan(self.mean) else self.mean
         variance = float(np.trapezoid(density * (grid - mean) ** 2, grid))
         given = self.standard_deviation
