@@ -117,9 +117,7 @@ LOADERS: dict[str, Loader] = {
     "strains": Loader("strains.json", load_strain_library, TEXT),
     "geometry": Loader("laboratory/step1/geometry_data.csv", read_lengths, TEXT),
     "load test": Loader("laboratory/step2/load_displacement_measurements.csv", read_measurements, TEXT),
-    "mass": Loader(
-        "laboratory/step3/weighed_mass.csv", lambda path: read_weighed_mass(path.parents[1]), TEXT
-    ),
+    "mass": Loader("laboratory/step3/weighed_mass.csv", read_weighed_mass, TEXT),
     "ring-down": Loader("laboratory/step3/initialconditiondata_1.DAT", read_records, TEXT),
     "ring-down, read off": Loader("laboratory/digitised.csv", read_records, TEXT),
     "histories": Loader(

@@ -23,12 +23,12 @@ from rich.table import Table
 from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, RingDownError
-from calibration.joint.frequency_table import WingTables, tabulate_wing
-from calibration.joint.inference import joint_posterior
-from calibration.joint.measurement import ModalMeasurement, modal_measurement
-from calibration.joint.prior import ModelError, WeighedMass, wing_priors
+from calibration.joint.measurement import measured_modes
+from calibration.joint.posterior import joint_posterior
+from calibration.joint.prior import MODEL_ERROR, wing_priors
+from calibration.joint.wing_table import WingTable, tabulate_wing
 from calibration.paper.procedure import fit_masses
-from calibration.result.record import STATE, prior_samples
+from calibration.result.record import STATE, Reading, prior_samples
 from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import LoadDisplacementData
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down, weigh
@@ -56,42 +56,28 @@ class Wing:
 
     truth: NDArray[np.float64]
     static: LoadDisplacementData
-    modal: ModalMeasurement
-    total_mass: WeighedMass
+    readings: tuple[Reading, ...]
 
 
-def measure(model: ReducedModel, seed: int, model_error: ModelError, procedure: Frequencies) -> Wing:
+def measure(model: ReducedModel, seed: int, model_error: tuple[float, float], procedure: Frequencies) -> Wing:
     generator = np.random.default_rng([2021, seed])
     truth = prior_samples(wing_priors(model.validity, **DAMPING), 1, int(generator.integers(2**32)))[0]
     state = DigitalState(Geometry(), *truth.tolist())
-    first, second = (model_error.frequency * generator.standard_normal(2)).tolist()
+    first, second = (np.array(model_error) * generator.standard_normal(2)).tolist()
     bench = VirtualWing(model, state, (first, second))
     records = measure_ring_down(bench, seed, sampling_rate=SAMPLING_RATE, duration=DURATION, noise=NOISE)
     return Wing(
         truth,
         measure_load_test(bench, seed),
-        modal_measurement(fit_trials(records, procedure)),
-        weigh(state, seed),
+        (weigh(state, seed), *measured_modes(fit_trials(records, procedure))),
     )
 
 
-def paper(model: ReducedModel, tables: WingTables, wing: Wing, seed: int) -> NDArray[np.float64]:
+def paper(table: WingTable, wing: Wing, seed: int) -> NDArray[np.float64]:
     """Return (5, 2) intervals of the paper's procedure: samples of e, eqs. (19), (20) and (25)."""
-    factors = exact_posterior(wing.static, curve=tables.stiffness).samples(
-        seed, PAPER_SAMPLES, stratified=True
-    )
-
-    def frequencies(factor: float, servo: float, pitot: float) -> tuple[float, float]:
-        first, second = tables.frequency.frequency([[factor, servo, pitot]])[0].tolist()
-        return first, second
-
-    result = fit_masses(
-        frequencies,
-        factors,
-        model.validity,
-        wing.modal,
-        total_mass=wing.total_mass.mass,
-    )
+    alone = exact_posterior(wing.static, curve=table.stiffness)
+    factors = alone.samples(seed, PAPER_SAMPLES, stratified=True)
+    result = fit_masses(table.frequency, factors, table.validity, wing.readings)
     tail = 0.5 * (1.0 - PROBABILITY)
     return np.quantile(result.samples, [tail, 1.0 - tail], axis=0).T
 
@@ -105,10 +91,10 @@ def main() -> int:
     parser.add_argument("--peaks", action="store_true", help="frequencies from the spectrum, as the paper")
     given = parser.parse_args()
     model = reduced_model(progress=RichProgress())
-    tables = tabulate_wing(model)
+    table = tabulate_wing(model)
     priors = wing_priors(model.validity, **DAMPING)
-    of_wings = ModelError((0.0, 0.0)) if given.exact_model else ModelError()
-    assumed = ModelError((0.0, 0.0)) if given.trusting else ModelError()
+    of_wings = (0.0, 0.0) if given.exact_model else MODEL_ERROR
+    assumed = (0.0, 0.0) if given.trusting else MODEL_ERROR
     procedure = Frequencies.PEAKS if given.peaks else Frequencies.FITTED
     held, held_paper, widths, ratios = [], [], [], []
     not_seen = refused = refused_paper = 0
@@ -124,9 +110,8 @@ def main() -> int:
         begin = time.perf_counter()
         try:
             result = joint_posterior(
-                tables, wing.static, wing.modal, priors=priors, total_mass=wing.total_mass,
-                model_error=assumed, seed=seed,
-            )  # fmt: skip
+                table, wing.static, wing.readings, priors=priors, model_error=assumed, seed=seed
+            )
         except CalibrationError as error:
             print(f"wing {seed}: {error}")
             refused += 1
@@ -138,7 +123,7 @@ def main() -> int:
         widths.append(upper - lower)
         begin = time.perf_counter()
         try:
-            interval = paper(model, tables, wing, seed)
+            interval = paper(table, wing, seed)
         except CalibrationError:
             refused_paper += 1
             continue
@@ -148,20 +133,20 @@ def main() -> int:
     share, share_paper = np.mean(held, axis=0), np.mean(held_paper, axis=0)
     width, ratio = np.median(widths, axis=0), np.median(ratios, axis=0)
     count = len(held)
-    error = 100.0 * np.sqrt(PROBABILITY * (1.0 - PROBABILITY) / count)
-    table = Table(
+    standard_error = 100.0 * np.sqrt(PROBABILITY * (1.0 - PROBABILITY) / count)
+    shown = Table(
         "quantity", "joint posterior", "wanted", "reached", "the paper's procedure", "width, joint",
         "width, paper's over joint", title=f"{count} wings, share of 90 % intervals that hold the truth",
     )  # fmt: skip
     reached = (share >= TARGET[0]) & (share <= TARGET[1])
     for place, name in enumerate(STATE):
-        table.add_row(
+        shown.add_row(
             name, f"{100 * share[place]:.1f} %", "85 to 95 %", "yes" if reached[place] else "NO",
             f"{100 * share_paper[place]:.1f} %", f"{width[place]:.3g}", f"{ratio[place]:.2f}",
         )  # fmt: skip
     console = Console(width=160)
-    console.print(table)
-    console.print(f"binomial standard error of a calibrated share: {error:.1f} points")
+    console.print(shown)
+    console.print(f"binomial standard error of a calibrated share: {standard_error:.1f} points")
     console.print(
         f"{not_seen} wings whose records do not show two modes, {refused} refused by the joint posterior, "
         f"{refused_paper} refused by the paper's procedure (not counted for it)"

@@ -4,15 +4,15 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from calibration.result.record import ParameterPrior, Reading
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError
 from fe.runtime.state import Geometry
 from fe.wing.design import WingDesign
-from reporting.table_file import TextTable, read_table
 
 from .errors import ExperimentDataError, ExperimentFileError
-from .lab_folder import LAB_ERRORS, find_lab_file
+from .lab_folder import lab_table
 
 TOLERANCE = 2.54e-3
 """Design tolerance of a length, half-width of a 95 % interval [m] (Kapteyn et al. 2021, Table 1)."""
@@ -72,9 +72,16 @@ class MeasuredLength:
             )
 
     @property
-    def prior(self) -> GaussianPrior:
-        """The design and its tolerance [m]."""
-        return GaussianPrior(self.designed, self.tolerance / HALF_WIDTH_95)
+    def prior(self) -> ParameterPrior:
+        """The design and its tolerance."""
+        low, high = (self.designed * (1.0 + side * _LARGEST_DEVIATION) for side in (-1.0, 1.0))
+        deviation = self.tolerance / HALF_WIDTH_95
+        return ParameterPrior(self.name, "m", self.designed, deviation, low, high, "design tolerance")
+
+    @property
+    def reading(self) -> Reading:
+        """What was measured."""
+        return Reading(self.name, "planform", self.measured, self.reading_uncertainty / HALF_WIDTH_95)
 
     @property
     def posterior(self) -> GaussianPrior:
@@ -83,16 +90,9 @@ class MeasuredLength:
         The precisions add, and the mean is weighted by them: 1/s² = 1/s_0² + 1/s_r²,
         m = s² (designed / s_0² + measured / s_r²).
         """
-        prior = (self.tolerance / HALF_WIDTH_95) ** -2
-        reading = (self.reading_uncertainty / HALF_WIDTH_95) ** -2
+        prior, reading = self.prior.deviation**-2, self.reading.deviation**-2
         mean = self.designed + (self.measured - self.designed) * reading / (prior + reading)
         return GaussianPrior(mean, (prior + reading) ** -0.5)
-
-    @property
-    def score(self) -> float:
-        """How far the measurement lies from the design, in standard deviations of prior and reading [1]."""
-        scatter = math.hypot(self.tolerance, self.reading_uncertainty) / HALF_WIDTH_95
-        return (self.measured - self.designed) / scatter
 
 
 @dataclass(frozen=True)
@@ -103,24 +103,16 @@ class GeometryCalibration:
     ----------
     semi_span, root_chord, tip_chord : MeasuredLength
         The three lengths; their errors are independent.
-    source : str
-        Where the figures come from.
     """
 
     semi_span: MeasuredLength
     root_chord: MeasuredLength
     tip_chord: MeasuredLength
-    source: str
 
     @property
     def lengths(self) -> tuple[MeasuredLength, MeasuredLength, MeasuredLength]:
         """The three lengths in the order of `LENGTH_NAMES`."""
         return self.semi_span, self.root_chord, self.tip_chord
-
-    @property
-    def geometry(self) -> Geometry:
-        """The planform at the posterior mean, from which a wing is modelled [m]."""
-        return Geometry(*(length.posterior.mean for length in self.lengths))
 
 
 def published_lengths() -> GeometryCalibration:
@@ -133,7 +125,6 @@ def published_lengths() -> GeometryCalibration:
         semi_span=MeasuredLength("semi_span", 1.8288, 1.8280),
         root_chord=MeasuredLength("root_chord", 0.43561, 0.4330),
         tip_chord=MeasuredLength("tip_chord", 0.261112, 0.2600),
-        source="published lengths (Kapteyn et al. 2021, Table 1)",
     )
 
 
@@ -155,52 +146,37 @@ def read_lengths(path: Path) -> GeometryCalibration:
     ExperimentDataError
         If a value is not positive and finite, or the lengths are in another unit.
     """
-    file = find_lab_file(Path(path), GEOMETRY_FILE)
-    table = read_table(file, LAB_ERRORS)
+    table = lab_table(path, GEOMETRY_FILE)
     names = table.cells("parameter", _USER)
     table.refuse_repeated(names, "parameter", "keep one of them")
     lost = [published for published in PUBLISHED_NAMES if published not in names]
     if lost:
         raise ExperimentFileError(
-            f"{file} lacks the row {' and '.join(lost)}; the rows {', '.join(PUBLISHED_NAMES)} are needed."
+            f"{table.name} lacks the row {' and '.join(lost)}; {', '.join(PUBLISHED_NAMES)} are needed."
         )
-    for column in ("designed", "manufactured"):
+    columns = ("designed", "manufactured")
+    for column in columns:
         table.cells(column, _USER)
-    found = {
-        name: MeasuredLength(
-            name,
-            *(_length(table, column, names.index(published)) for column in ("designed", "manufactured")),
-        )
-        for published, name in PUBLISHED_NAMES.items()
-    }
-    return GeometryCalibration(source=file.name, **found)
-
-
-def _length(table: TextTable, column: str, row: int) -> float:
-    millimetres = table.positive_number(column, row)
-    if millimetres < 10.0:
-        raise ExperimentDataError(
-            f"{table.name}, line {table.lines[row]}: {column} is {millimetres:g} mm, which looks like m: "
-            "give it in mm."
-        )
-    return millimetres * 1e-3
-
-
-RESOLUTION = 1e-4
-"""To what the planform of a tailored design is rounded: what the measurement leaves uncertain [m]."""
-
-LARGEST_DEPARTURE = 0.10
-"""By how much the measured lengths may differ from the design that is tailored [1]."""
-
-_DIGITS = 4
+    found = {}
+    for published, name in PUBLISHED_NAMES.items():
+        row = names.index(published)
+        millimetres = [table.positive_number(column, row) for column in columns]
+        for column, value in zip(columns, millimetres, strict=True):
+            if value < 10.0:
+                raise ExperimentDataError(
+                    f"{table.name}, line {table.lines[row]}: {column} is {value:g} mm, which looks like m: "
+                    "give it in mm."
+                )
+        found[name] = MeasuredLength(name, *(value * 1e-3 for value in millimetres))
+    return GeometryCalibration(**found)
 
 
 def tailored_geometry(lengths: GeometryCalibration) -> Geometry:
-    """Return the posterior means, rounded to `RESOLUTION` [m].
+    """Return the posterior means, rounded to what the measurement leaves uncertain, 0.1 mm [m].
 
     The paper keeps the means and drops their standard deviation, which is 0.1 mm.
     """
-    return Geometry(*(round(length.posterior.mean, _DIGITS) for length in lengths.lengths))
+    return Geometry(*(round(length.posterior.mean, 4) for length in lengths.lengths))
 
 
 def tailored_design(design: WingDesign, lengths: GeometryCalibration) -> WingDesign:
@@ -222,7 +198,7 @@ def tailored_design(design: WingDesign, lengths: GeometryCalibration) -> WingDes
     planform = {name: getattr(geometry, name) for name in LENGTH_NAMES}
     for name, value in planform.items():
         drawn = getattr(design.planform, name)
-        if abs(value / drawn - 1.0) > LARGEST_DEPARTURE:
+        if abs(value / drawn - 1.0) > _LARGEST_DEVIATION:
             raise ExperimentDataError(
                 f"{name} measures {value * 1e3:.1f} mm, but the design {design.name} has "
                 f"{drawn * 1e3:.1f} mm, more than 10 % apart: give the design of this wing with --design."

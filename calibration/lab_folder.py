@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from reporting.table_file import TableErrors
+from reporting.table_file import TableErrors, TextTable, read_table
 
 from .errors import ExperimentDataError, ExperimentFileError
 
@@ -20,19 +20,24 @@ def places_of(folder: Path, name: Path) -> Iterator[Path]:
         yield folder / above / name
 
 
-def find_lab_file(path: Path, name: Path) -> Path:
-    """Return the path if it is a file, or the file `name` of the laboratory's (or its step's) folder `path`.
+def lab_place(folder: Path, name: Path) -> Path | None:
+    """Return where a file or folder lies in a user's folder, None where it does not."""
+    return next((place for place in places_of(folder, name) if place.exists()), None)
+
+
+def lab_table(path: Path | str, name: Path) -> TextTable:
+    """Return the table of a file, or of the file `name` in the laboratory's (or its step's) folder `path`.
 
     Raises
     ------
     ExperimentFileError
-        If there is neither.
+        If there is neither, or it is no table.
     """
-    if path.is_file():
-        return path
-    for place in (*places_of(path, name), path / name.name):
-        if place.is_file():
-            return place
+    path = Path(path)
     if not path.exists():
         raise ExperimentFileError(f"{path} does not exist; give the folder that holds {name}.")
-    raise ExperimentFileError(f"{path} does not hold {name}; give the authors' calibration folder.")
+    places = (path,) if path.is_file() else (*places_of(path, name), path / name.name)
+    file = next((place for place in places if place.is_file()), None)
+    if file is None:
+        raise ExperimentFileError(f"{path} does not hold {name}; give the authors' calibration folder.")
+    return read_table(file, LAB_ERRORS)

@@ -7,14 +7,15 @@ its truth, `twin_master.assets.virtual_experiments` has the FMU behind the same 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.dynamics.records import RingDownRecord
-from calibration.joint.prior import WeighedMass
+from calibration.joint.prior import weighed
+from calibration.result.record import Reading
 from calibration.static.experiments import (
     DISPLACEMENT_STANDARD_DEVIATION,
     HALF_WIDTH_95,
@@ -108,7 +109,6 @@ class VirtualWing:
     frequency_error: tuple[float, float] = (0.0, 0.0)
     gauge: int = RECORDED_GAUGE
     sensitivity: float = SENSITIVITY
-    _modal: "_FreeVibration" = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not 1 <= self.gauge <= self.model.gauge_count:
@@ -120,7 +120,7 @@ class VirtualWing:
                 "a relative frequency error must be finite and above -1, but "
                 f"{' and '.join(f'{error:g}' for error in self.frequency_error)} were given."
             )
-        object.__setattr__(self, "_modal", _free_vibration(self))
+        self.model.modes(self.truth.values, self.truth.stiffness_loss)  # refuses a truth outside the model
 
     def tip_displacement(self, load: float) -> float:
         """Return the displacement [m] of the load point under a load there [N]."""
@@ -131,32 +131,18 @@ class VirtualWing:
     ) -> RingDownSignal:
         """Return the strain signal after the tip is let go: each mode's free decay, exactly."""
         time = sampling_times(duration, sampling_rate)
-        modal = self._modal
+        truth, model = self.truth, self.model
+        vector = model.vector(truth.values, truth.stiffness_loss)
+        modes, held = model.modes(vector), model.static_response(vector, load=np.array((0.0, 1.0)))
+        omega = 2.0 * math.pi * modes.frequency
+        released = modes.participation[1] / omega**2 / held.displacement[0]  # of each mode, per displacement
+        for mode, error in zip(modes.followed, self.frequency_error, strict=True):
+            omega[mode] *= 1.0 + error
+        zeta = rayleigh_damping_ratio(truth.damping_alpha, truth.damping_beta, modes.frequency)
         signal = np.zeros_like(time)
-        for omega, zeta, amplitude in zip(*modal, strict=True):
-            signal += amplitude * _free_decay(float(omega), float(zeta), time)
+        for mode, strain in enumerate(modes.output[self.gauge - 1] * released):
+            signal += strain * _free_decay(float(omega[mode]), float(zeta[mode]), time)
         return RingDownSignal(time, self.sensitivity * initial_tip_displacement * signal)
-
-
-class _FreeVibration(NamedTuple):
-    """Angular frequency [rad/s], damping ratio, and strain at the release per tip displacement [1/m]."""
-
-    omega: FloatArray
-    zeta: FloatArray
-    amplitude: FloatArray
-
-
-def _free_vibration(wing: VirtualWing) -> _FreeVibration:
-    truth, model = wing.truth, wing.model
-    vector = model.vector(truth.values, truth.stiffness_loss)
-    modes, static = model.modes(vector), model.static_response(vector, load=np.array((0.0, 1.0)))
-    omega = 2.0 * math.pi * modes.frequency
-    displacement = modes.participation[1] / omega**2 / static.displacement[0]
-    frequency = modes.frequency.copy()
-    for mode, error in zip(modes.followed, wing.frequency_error, strict=True):
-        frequency[mode] *= 1.0 + error
-    zeta = rayleigh_damping_ratio(truth.damping_alpha, truth.damping_beta, modes.frequency)
-    return _FreeVibration(2.0 * math.pi * frequency, zeta, modes.output[wing.gauge - 1] * displacement)
 
 
 def _free_decay(omega: float, zeta: float, time: FloatArray) -> FloatArray:
@@ -301,10 +287,10 @@ def measure_lengths(
             length,
             reading_uncertainty=reading_uncertainty,
         )
-    return GeometryCalibration(source="virtual lengths", **measured)
+    return GeometryCalibration(**measured)
 
 
-def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> WeighedMass:
+def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> Reading:
     """Weigh two servos and the pitot tube together.
 
     Parameters
@@ -318,4 +304,4 @@ def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) 
     """
     generator = np.random.default_rng(child_seed(seed, _PURPOSES["weighing"]))
     error = float(generator.normal(0.0, standard_deviation))
-    return WeighedMass(2.0 * truth.servo_mass + truth.pitot_mass + error, standard_deviation)
+    return weighed(2.0 * truth.servo_mass + truth.pitot_mass + error, standard_deviation)

@@ -95,10 +95,6 @@ def _check_integers(
         _check_integers(item, here, subject, error)
 
 
-class Printed(str):
-    """A number as it is to stand in a file."""
-
-
 def toml_text(content: dict[str, Any]) -> str:
     """Return plain data as TOML, of which `parse_toml` makes the same again; what is None is left out.
 
@@ -129,10 +125,6 @@ def _key(name: str) -> str:
 
 
 def _shown(item: Any) -> str:
-    if isinstance(item, Printed):  # `E+5` is not one of its exponents after a bare point
-        mantissa, letter, exponent = item.lower().partition("e")
-        mantissa += "0" if mantissa.endswith(".") else ""
-        return f"{mantissa}e{int(exponent)}" if letter else mantissa
     if isinstance(item, str):  # the escapes of JSON are TOML's, but for DEL
         return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(item, bool):

@@ -217,8 +217,8 @@ def synthetic_calibration(
     import xarray as xr
 
     from calibration.joint.prior import wing_priors
+    from calibration.joint.wing_table import QUANTITIES
     from calibration.result.record import Calibration, Reading
-    from calibration.wing.calibrate import QUANTITIES
     from fe.wing.design import load_design
 
     generator = np.random.default_rng(seed)

@@ -43,7 +43,7 @@ ROOMS = {
         "packing", "companions", "structures", "coupling", "check", "ssp",
     ),
     "calibration": (
-        "errors", "lab_folder", "static", "geometry", "result", "dynamics", "published_strains", "joint",
+        "errors", "lab_folder", "static", "result", "geometry", "dynamics", "published_strains", "joint",
         "virtual_wing", "paper", "wing",
     ),
     "twin_master": (

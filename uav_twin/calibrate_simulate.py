@@ -48,12 +48,16 @@ def calibrate_simulate(
     frequency_error: FrequencyError = (0.0, 0.0),
 ) -> None:
     """Measure a virtual wing: a folder as `calibrate` reads it, and truth.json beside it."""
+    import json
     from contextlib import nullcontext
+    from dataclasses import asdict
 
     from calibration.errors import ExperimentFileError
+    from calibration.result.record import STATE
     from calibration.virtual_wing import VirtualWing
     from fe.runtime.state import DigitalState
     from fe.wing.design import load_design
+    from reporting.files import atomic_write_text
 
     if fmu is not None and frequency_error != (0.0, 0.0):
         raise typer.BadParameter("--frequency-error needs the reduced model; an FMU has its own frequencies.")
@@ -62,17 +66,12 @@ def calibrate_simulate(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ExperimentFileError(f"{out} exists and is not an empty folder: choose another --out.")
     drawn = load_design(design)
-    truth = DigitalState(
-        geometry=drawn.geometry,
-        young_modulus_factor=e,
-        servo_mass=servo_mass,
-        pitot_mass=pitot_mass,
-        damping_alpha=alpha,
-        damping_beta=beta,
-    )
+    state: dict[str, Any] = dict(zip(STATE, (e, servo_mass, pitot_mass, alpha, beta), strict=True))
+    truth = DigitalState(drawn.geometry, **state)
     designed = None if design is None else drawn.geometry
     recorder = {"sampling_rate": sampling_rate, "noise": noise, "quantisation": quantisation}
-    told = {
+    told = asdict(drawn.geometry) | {
+        **state,
         "frequency_error": list(frequency_error),
         "seed": seed,
         "bench": "reduced model" if fmu is None else fmu.name,
@@ -89,7 +88,7 @@ def calibrate_simulate(
         opened = nullcontext(VirtualWing(model, truth, frequency_error))
     with opened as bench:
         _measure(bench, truth, designed, out, seed, recorder)
-    _write_truth(out / TRUTH_FILE, _truth(truth) | told)
+    atomic_write_text(out / TRUTH_FILE, json.dumps(told, indent=2) + "\n")
     terminal.say(f"Laboratory folder: {out}; its truth: {out / TRUTH_FILE}")
 
 
@@ -112,25 +111,3 @@ def _measure(
         lengths=measure_lengths(truth.geometry, seed, designed=designed),
         total_mass=weigh(truth, seed),
     )
-
-
-def _write_truth(path: Path, record: Mapping[str, Any]) -> None:
-    import json
-
-    from reporting.files import atomic_write_text
-
-    atomic_write_text(path, json.dumps(record, indent=2) + "\n")
-
-
-def _truth(truth: "DigitalState") -> dict[str, object]:
-    geometry = truth.geometry
-    return {
-        "semi_span": geometry.semi_span,
-        "root_chord": geometry.root_chord,
-        "tip_chord": geometry.tip_chord,
-        "young_modulus_factor": truth.young_modulus_factor,
-        "servo_mass": truth.servo_mass,
-        "pitot_mass": truth.pitot_mass,
-        "damping_alpha": truth.damping_alpha,
-        "damping_beta": truth.damping_beta,
-    }

@@ -118,32 +118,81 @@ class DampedCosines:
         return np.asarray((slope + self._gain(s) * self._time) * np.exp(s * self._time))
 
 
-class NaturalMode(NamedTuple):
-    """Natural frequency [Hz] and damping ratio [1] of a mode, each with its standard error."""
+class RingDownMode(NamedTuple):
+    """One damped cosine of a record as a mode: Kapteyn et al. 2021, eqs. (23) and (24).
 
-    frequency: float
-    frequency_standard_error: float
-    damping_ratio: float
-    damping_ratio_standard_error: float
+    With the natural angular frequency w_n = sqrt(s^2 + w_d^2): f = w_n / 2 pi and zeta = s / w_n. Standard
+    errors are propagated to first order with all of the covariance, that between s and w_d too, for
+    independent residuals of equal variance. A frequency that was not fitted has the share of s alone.
 
-
-def natural_mode(decay: float, damped: float, covariance: NDArray[np.float64]) -> NaturalMode:
-    """Return a mode's natural frequency and damping ratio from those of its damped oscillation.
-
-    With w_n = sqrt(s^2 + w_d^2): f = w_n / 2 pi and zeta = s / w_n. Errors are propagated to first order with
-    all of the covariance, that between decay rate and damped frequency too.
-
-    Parameters
+    Attributes
     ----------
-    decay, damped : float
-        Decay rate s [1/s] and damped angular frequency w_d [rad/s].
+    decay_rate, omega : float
+        s [1/s], and the damped angular frequency w_d [rad/s].
+    wave : complex
+        Amplitude at the start of the cropped record [V].
     covariance : (2, 2) array
-        Of the two [1/s^2].
+        Of decay rate and damped angular frequency [1/s^2].
     """
-    natural = math.hypot(damped, decay)
-    of_frequency = np.array([decay, damped]) / natural / (2.0 * math.pi)
-    of_ratio = np.array([damped**2, -decay * damped]) / natural**3
-    frequency_error, ratio_error = (
-        math.sqrt(max(float(slope @ covariance @ slope), 0.0)) for slope in (of_frequency, of_ratio)
+
+    decay_rate: float
+    omega: float
+    wave: complex
+    covariance: NDArray[np.float64]
+
+    @property
+    def natural(self) -> float:
+        """Natural angular frequency [rad/s]."""
+        return math.hypot(self.omega, self.decay_rate)
+
+    @property
+    def frequency(self) -> float:
+        """Natural frequency [Hz]."""
+        return self.natural / (2.0 * math.pi)
+
+    @property
+    def damping_ratio(self) -> float:
+        """Damping ratio [1]."""
+        return self.decay_rate / self.natural
+
+    @property
+    def damped_frequency(self) -> float:
+        """Frequency of the damped cosine [Hz]."""
+        return self.omega / (2.0 * math.pi)
+
+    @property
+    def amplitude(self) -> float:
+        """Amplitude at the start of the cropped record [V]."""
+        return abs(self.wave)
+
+    @property
+    def phase(self) -> float:
+        """Phase there [rad]."""
+        return math.atan2(self.wave.imag, self.wave.real)
+
+    @property
+    def frequency_standard_error(self) -> float:
+        """Of the natural frequency [Hz]."""
+        return self._error(np.array([self.decay_rate, self.omega]) / self.natural / (2.0 * math.pi))
+
+    @property
+    def damping_ratio_standard_error(self) -> float:
+        """Of the damping ratio [1]."""
+        return self._error(np.array([self.omega**2, -self.decay_rate * self.omega]) / self.natural**3)
+
+    def _error(self, slope: NDArray[np.float64]) -> float:
+        return math.sqrt(max(float(slope @ self.covariance @ slope), 0.0))
+
+
+def modes_of(found: Search, solution: Solution) -> tuple[RingDownMode, ...]:
+    """Return the modes of a solution by ascending frequency."""
+    count = found.decay.size
+    return tuple(
+        RingDownMode(
+            float(found.decay[at]),
+            float(found.omega[at]),
+            complex(solution.amplitude[at]),
+            solution.covariance[np.ix_([at, count + at], [at, count + at])],
+        )
+        for at in np.argsort(found.omega)
     )
-    return NaturalMode(natural / (2.0 * math.pi), frequency_error, decay / natural, ratio_error)

@@ -14,7 +14,8 @@ from scipy.optimize import least_squares
 
 from calibration.errors import RingDownError
 
-from .ringdown import RingDownFit, RingDownMode
+from .damped_cosine import RingDownMode
+from .ringdown import RingDownFit, refuse_growing
 from .trials import RingDownTrials
 
 _POINTS = 17  # instants within a column at which the model is evaluated
@@ -40,7 +41,7 @@ def _refine(fit: RingDownFit) -> RingDownFit:
     lowest, highest = record.lowest, record.highest
     time = record.time - record.time[0]
     within = time[:, np.newaxis] + np.linspace(-0.5, 0.5, _POINTS) * record.averaging_width
-    damped = 2.0 * math.pi * np.array([mode.damped_frequency for mode in fit.modes])
+    damped = np.array([mode.omega for mode in fit.modes])
 
     def residual(scaled: NDArray[np.float64]) -> NDArray[np.float64]:
         unknown = scaled * scale
@@ -49,11 +50,7 @@ def _refine(fit: RingDownFit) -> RingDownFit:
             [value.min(axis=1) - unknown[8] - lowest, value.max(axis=1) + unknown[8] - highest]
         )
 
-    start = []
-    for mode in fit.modes:
-        start += [
-            mode.amplitude * math.cos(mode.phase), mode.amplitude * math.sin(mode.phase), mode.decay_rate,
-        ]  # fmt: skip
+    start = [part for mode in fit.modes for part in (mode.wave.real, mode.wave.imag, mode.decay_rate)]
     size = float(np.ptp(record.signal))
     half_line = 0.5 * float(np.percentile(highest - lowest, 10.0))
     scale = np.array([size, size, start[2], size, size, start[5], size, size, size])
@@ -61,14 +58,17 @@ def _refine(fit: RingDownFit) -> RingDownFit:
     found = least_squares(residual, first, method="lm", xtol=1e-10, ftol=1e-12, diff_step=1e-6)
     unknown = found.x * scale
     # Both extremes of a column see the same signal: they count as one reading.
-    freedom = max(time.size - unknown.size, 1)
-    variance = 2.0 * float(found.cost) / 2.0 / freedom
+    variance = float(found.cost) / max(time.size - unknown.size, 1)
     covariance = 2.0 * variance * np.linalg.pinv(found.jac.T @ found.jac) * np.outer(scale, scale)
-    variances = np.diag(covariance).tolist()
     modes = [
-        _refined_mode(mode, number, unknown[3 * number :][:3], variances[3 * number + 2], record.source)
-        for number, mode in enumerate(fit.modes)
-    ]
+        RingDownMode(
+            float(unknown[at + 2]), mode.omega, complex(unknown[at], unknown[at + 1]),
+            np.diag([covariance[at + 2, at + 2], 0.0]),
+        )
+        for at, mode in zip((0, 3), fit.modes, strict=True)
+    ]  # fmt: skip
+    for number, mode in enumerate(modes, start=1):
+        refuse_growing(mode, number, record.source)
     return replace(
         fit,
         modes=(modes[0], modes[1]),
@@ -86,28 +86,3 @@ def _signal(
         cosine, sine, decay = unknown[3 * number : 3 * number + 3]
         value = value + np.exp(-decay * when) * (cosine * np.cos(omega * when) - sine * np.sin(omega * when))
     return np.asarray(value)
-
-
-def _refined_mode(
-    mode: RingDownMode, number: int, unknown: NDArray[np.float64], variance: float, source: str
-) -> RingDownMode:
-    """Return a mode with its fitted cosine, sine and decay rate; `variance` is that of the rate."""
-    cosine, sine, decay = (float(value) for value in unknown)
-    omega = 2.0 * math.pi * mode.damped_frequency
-    if not 0.0 < decay < omega:
-        raise RingDownError(
-            f"{source}: mode {number + 1} at {mode.damped_frequency:.3g} Hz is not a decaying "
-            f"oscillation (rate {decay:.3g} 1/s fitted to the extremes); a ring-down record is needed."
-        )
-    natural = math.hypot(omega, decay)
-    error = math.sqrt(variance)
-    return RingDownMode(
-        frequency=natural / (2.0 * math.pi),
-        damping_ratio=decay / natural,
-        damped_frequency=mode.damped_frequency,
-        decay_rate=decay,
-        amplitude=math.hypot(cosine, sine),
-        phase=math.atan2(sine, cosine),
-        frequency_standard_error=error * decay / natural / (2.0 * math.pi),
-        damping_ratio_standard_error=error * omega**2 / natural**3,
-    )

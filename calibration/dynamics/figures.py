@@ -15,7 +15,7 @@ from reporting.figures import (
     publication_style,
 )
 
-from .ringdown import RingDownFit
+from .ringdown import RingDownFit, spectrum
 from .trials import RingDownTrials, amplitude_dependence
 
 
@@ -48,17 +48,17 @@ def _draw_record(axes: Axes, fit: RingDownFit) -> None:
 
 
 def _draw_spectra(axes: Axes, trials: RingDownTrials) -> None:
+    top = 0.0
     for number, fit in enumerate(trials.fits):
-        axes.semilogy(
-            fit.spectrum_frequency, fit.spectrum_amplitude * 1e3, color=OBSERVED, lw=0.5,
-            alpha=0.6, label=f"{len(trials.fits)} trials" if number == 0 else None,
-        )  # fmt: skip
+        frequency, amplitude = spectrum(fit.record)
+        top = max(top, 1e3 * float(amplitude.max()))
+        label = f"{len(trials.fits)} trials" if number == 0 else None
+        axes.semilogy(frequency, amplitude * 1e3, color=OBSERVED, lw=0.5, alpha=0.6, label=label)
     for mode, name in ((0, "first"), (1, "second")):
         axes.axvline(
             trials.frequency(mode).mean, color=PAST, lw=0.8, ls=("--", ":")[mode], label=f"{name} mode"
         )
-    axes.set_xlim(0.0, float(trials.fits[0].spectrum_frequency[-1]))
-    top = max(float(fit.spectrum_amplitude.max()) for fit in trials.fits) * 1e3
+    axes.set_xlim(0.0, float(frequency[-1]))
     axes.set_ylim(2e-4 * top, 2.0 * top)
     axes.set_xlabel("frequency (Hz)")
     axes.set_ylabel("amplitude (mV)")

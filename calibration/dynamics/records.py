@@ -23,10 +23,10 @@ MINIMUM_COUNT = 64
 """Fewest samples that a record may have."""
 
 _RAW_COLUMNS = ["time", "spanwise", "chordwise"]
-_TIME_NAMES = ("time", "t", "t_s")
-_SIGNAL_NAMES = ("spanwise", "V_mid", "middle")
-_LOWEST_NAMES = ("V_low", "lowest")
-_HIGHEST_NAMES = ("V_high", "highest")
+_NAMES = (
+    ("time", "t", "t_s"), ("spanwise", "V_mid", "middle"), ("V_low", "lowest"), ("V_high", "highest"),
+)  # fmt: skip
+"""What the columns of a record may be called, those of a record read off a plot last."""
 _ROUNDING = 1e-4  # s; a time printed to few digits may stand still at 100 kHz
 _CLIPPED_DURATION = 3e-3  # s at the extreme value; natural peaks of a 30 Hz mode are sharper
 
@@ -159,41 +159,34 @@ def _read_record(file: Path) -> RingDownRecord:
     if not first:
         raise ExperimentFileError(f"{file} is empty; columns of time [s] and spanwise signal [V] are needed.")
     separator = "," if "," in first and "\t" not in first else None
-    header = _header(first, separator)
-    if header is None:
-        count = len(first.split(separator))
-        if not 2 <= count <= len(_RAW_COLUMNS):
-            raise ExperimentFileError(
-                f"{file} has {counted(count, 'column')}; time [s], spanwise and, if there is one, chordwise "
-                "signal [V] are needed, without header."
-            )
-        header = _RAW_COLUMNS[:count]
-    elif not first.startswith("#"):
-        text = text.replace(first, f"#{first}", 1)
-    _refuse_other_time(file, header)
-    names = [_name(cell) for cell in header]
-    table = parse_table(text, str(file), LAB_ERRORS, header=names, separator=separator)
-    time, signal = (_column(table, spellings) for spellings in (_TIME_NAMES, _SIGNAL_NAMES))
-    if "spanwise" in names:
-        return RingDownRecord(time=time, signal=signal, source=file.name)
-    lowest, highest = (_column(table, spellings) for spellings in (_LOWEST_NAMES, _HIGHEST_NAMES))
+    header = _RAW_COLUMNS[: len(first.split(separator))]
+    if re.search(r"[^\d\s.,;eE+-]", first.lstrip("#")):  # a word
+        # A remark in brackets may hold separators of its own.
+        between = separator or (r"\t+" if "\t" in first else r"\s+")
+        cells = re.split(between + r"(?![^(\[]*[)\]])", first.lstrip("#").strip())
+        header = [_named(cell.strip().strip('"'), file) for cell in cells]
+        text = text if first.startswith("#") else text.replace(first, f"#{first}", 1)
+    elif not 2 <= (count := len(first.split(separator))) <= len(_RAW_COLUMNS):
+        raise ExperimentFileError(
+            f"{file} has {counted(count, 'column')}; time [s], spanwise and, if there is one, chordwise "
+            "signal [V] are needed, without header."
+        )
+    table = parse_table(text, str(file), LAB_ERRORS, header=header, separator=separator)
+    time, signal = (_column(table, spellings) for spellings in _NAMES[:2])
+    if "spanwise" in header:
+        return RingDownRecord(time, signal, source=file.name)
+    lowest, highest = (_column(table, spellings) for spellings in _NAMES[2:])
     width = float(np.median(np.diff(time))) if time.size > 1 else 0.0
-    return RingDownRecord(time, signal, lowest, highest, averaging_width=width, source=file.name)
+    return RingDownRecord(time, signal, lowest, highest, width, file.name)
 
 
-def _header(first: str, separator: str | None) -> list[str] | None:
-    """Return the names of the columns, or None if the first line holds nothing that is a word."""
-    text = first.lstrip("#").strip()
-    if not re.search(r"[^\d\s.,;eE+-]", text):
-        return None
-    # A remark in brackets may hold separators of its own.
-    between = separator or (r"\t+" if "\t" in text else r"\s+")
-    return [cell.strip().strip('"') for cell in re.split(between + r"(?![^(\[]*[)\]])", text)]
-
-
-def _name(cell: str) -> str:
+def _named(cell: str, file: Path) -> str:
     """Return the name in a header's cell without unit or remark in brackets."""
-    return re.split(r"\s*[(\[]", cell, maxsplit=1)[0]
+    name = re.split(r"\s*[(\[]", cell, maxsplit=1)[0]
+    unit = re.search(r"[(\[]\s*(\w+)\s*[)\]]", cell)
+    if name in _NAMES[0] and unit and unit[1] not in ("s", "sec", "second", "seconds"):
+        raise ExperimentDataError(f"{file} gives {name} in {unit[1]}: give it in s.")
+    return name
 
 
 def _column(table: TextTable, spellings: tuple[str, ...]) -> NDArray[np.float64]:
@@ -205,27 +198,17 @@ def _column(table: TextTable, spellings: tuple[str, ...]) -> NDArray[np.float64]
     )
 
 
-def _refuse_other_time(file: Path, header: list[str]) -> None:
-    for cell in header:
-        unit = re.search(r"[(\[]\s*(\w+)\s*[)\]]", cell)
-        if _name(cell) in _TIME_NAMES and unit and unit[1] not in ("s", "sec", "second", "seconds"):
-            raise ExperimentDataError(f"{file} gives {_name(cell)} in {unit[1]}: give it in s.")
-
-
 def _refuse_clipped(record: RingDownRecord) -> None:
-    lowest = record.signal if record.lowest is None else record.lowest
-    highest = record.signal if record.highest is None else record.highest
     if np.ptp(record.signal) == 0.0:
         raise ExperimentDataError(f"{record.source}: the signal is constant; nothing rings.")
+    lowest = record.signal if record.lowest is None else record.lowest
+    highest = record.signal if record.highest is None else record.highest
     for column, extreme, name in ((lowest, lowest.min(), "smallest"), (highest, highest.max(), "largest")):
-        run = _longest_run(np.abs(column - extreme) <= 1e-9 * np.ptp(column))
+        there = np.abs(column - extreme) <= 1e-9 * np.ptp(column)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(np.int8)))
+        run = int(np.max(edges[1::2] - edges[::2]))
         if run >= 3 and run / record.sampling_rate >= _CLIPPED_DURATION:
             raise ExperimentDataError(
                 f"{record.source}: {run} samples in a row have the {name} value {extreme:g}, as if the "
                 "recorder had clipped the signal; repeat the test with a wider range."
             )
-
-
-def _longest_run(where: NDArray[np.bool_]) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
-    return int(np.max(edges[1::2] - edges[::2]))

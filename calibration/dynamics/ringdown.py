@@ -5,7 +5,7 @@ frequency and decay rate into natural frequency and damping ratio.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.signal import decimate, detrend, find_peaks
 
 from calibration.errors import RingDownError
 
-from .damped_cosine import DampedCosines, natural_mode
+from .damped_cosine import DampedCosines, RingDownMode, modes_of
 from .records import MINIMUM_COUNT, RingDownRecord
 
 FIRST_PEAK = 0.00548
@@ -48,37 +48,6 @@ class Frequencies(Enum):
     FITTED = "fitted"
 
 
-@dataclass(frozen=True)
-class RingDownMode:
-    """One mode of one record.
-
-    Attributes
-    ----------
-    frequency : float
-        Natural frequency, eq. (23) [Hz].
-    damping_ratio : float
-        Eq. (24) [1].
-    damped_frequency : float
-        Frequency of the damped cosine [Hz].
-    decay_rate : float
-        Of its exponential [1/s].
-    amplitude, phase : float
-        At the start of the cropped record [V], [rad].
-    frequency_standard_error, damping_ratio_standard_error : float
-        From the least-squares fit, for independent residuals of equal variance [Hz], [1]. A frequency
-        taken from the spectrum is not fitted: its error then holds the share of the decay rate alone.
-    """
-
-    frequency: float
-    damping_ratio: float
-    damped_frequency: float
-    decay_rate: float
-    amplitude: float
-    phase: float
-    frequency_standard_error: float
-    damping_ratio_standard_error: float
-
-
 @dataclass(frozen=True, eq=False)
 class RingDownFit:
     """Two modes of one record.
@@ -93,8 +62,6 @@ class RingDownFit:
         The fitted signal [V].
     residual_deviation : float
         Standard deviation of the residuals [V].
-    spectrum_frequency, spectrum_amplitude : (K,) array
-        Amplitude spectrum of the detrended record within the band [Hz], [V].
     procedure : Frequencies
         How the frequencies were found.
     """
@@ -103,8 +70,6 @@ class RingDownFit:
     record: RingDownRecord
     fitted: NDArray[np.float64]
     residual_deviation: float
-    spectrum_frequency: NDArray[np.float64]
-    spectrum_amplitude: NDArray[np.float64]
     procedure: Frequencies
 
 
@@ -141,14 +106,8 @@ def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDow
             f"{record.source}: cropped at {start:g} s, {np.count_nonzero(after)} of {time.size} samples "
             "remain; give the instant of release."
         )
-    return RingDownRecord(
-        time[after],
-        signal[after],
-        None if lowest is None else lowest[after],
-        None if highest is None else highest[after],
-        record.averaging_width,
-        record.source,
-    )
+    lowest, highest = (None if column is None else column[after] for column in (lowest, highest))
+    return replace(record, time=time[after], signal=signal[after], lowest=lowest, highest=highest)
 
 
 def spectrum(
@@ -257,55 +216,25 @@ def fit_ring_down(
     """
     record = prepare(record, start)
     _refuse_steady(record)
-    peaks = np.array(spectral_peaks(record, band))
-    frequency, amplitude = spectrum(record, band)
+    omega = 2.0 * math.pi * np.array(spectral_peaks(record, band))
     model = DampedCosines(record.time, record.signal, record.averaging_width)
-    omega = 2.0 * math.pi * peaks
-    fixed = procedure is Frequencies.PEAKS
-    searches = [
-        model.fitted(ratio * omega, omega, frequencies_fitted=not fixed) for ratio in _STARTING_RATIOS
-    ]
-    decay, omega, _ = min(searches, key=lambda search: search.cost)
-    for number in range(2):
-        if not 0.0 < decay[number] < omega[number]:
-            raise RingDownError(
-                f"{record.source}: mode {number + 1} at {omega[number] / (2.0 * math.pi):.3g} Hz is not a "
-                f"decaying oscillation (fitted rate {decay[number]:.3g} 1/s); a ring-down record is needed."
-            )
-    solution = model.solve(decay, omega, frequencies_fitted=not fixed)
-    order = np.argsort(omega)
-    modes = tuple(
-        _mode(
-            float(decay[place]),
-            float(omega[place]),
-            complex(solution.amplitude[place]),
-            solution.covariance[np.ix_([place, 2 + place], [place, 2 + place])],
+    free = procedure is Frequencies.FITTED
+    searches = [model.fitted(ratio * omega, omega, frequencies_fitted=free) for ratio in _STARTING_RATIOS]
+    found = min(searches, key=lambda search: search.cost)
+    solution = model.solve(found.decay, found.omega, frequencies_fitted=free)
+    first, second = modes_of(found, solution)
+    for number, mode in enumerate((first, second), start=1):
+        refuse_growing(mode, number, record.source)
+    return RingDownFit((first, second), record, solution.fitted, solution.residual_deviation, procedure)
+
+
+def refuse_growing(mode: RingDownMode, number: int, source: str) -> None:
+    """Raise RingDownError for what is no decaying oscillation."""
+    if not 0.0 < mode.decay_rate < mode.omega:
+        raise RingDownError(
+            f"{source}: mode {number} at {mode.damped_frequency:.3g} Hz is not a decaying oscillation "
+            f"(fitted rate {mode.decay_rate:.3g} 1/s); a ring-down record is needed."
         )
-        for place in order
-    )
-    return RingDownFit(
-        modes=(modes[0], modes[1]),
-        record=record,
-        fitted=solution.fitted,
-        residual_deviation=solution.residual_deviation,
-        spectrum_frequency=frequency,
-        spectrum_amplitude=amplitude,
-        procedure=procedure,
-    )
-
-
-def _mode(decay: float, damped: float, amplitude: complex, covariance: NDArray[np.float64]) -> RingDownMode:
-    natural = natural_mode(decay, damped, covariance)
-    return RingDownMode(
-        frequency=natural.frequency,
-        damping_ratio=natural.damping_ratio,
-        damped_frequency=damped / (2.0 * math.pi),
-        decay_rate=decay,
-        amplitude=abs(amplitude),
-        phase=math.atan2(amplitude.imag, amplitude.real),
-        frequency_standard_error=natural.frequency_standard_error,
-        damping_ratio_standard_error=natural.damping_ratio_standard_error,
-    )
 
 
 def _refuse_steady(record: RingDownRecord) -> None:

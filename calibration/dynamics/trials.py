@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.errors import RingDownError
 
-from .damped_cosine import DampedCosines
+from .damped_cosine import DampedCosines, modes_of
 from .records import RingDownRecord
 from .ringdown import FIRST_PEAK, Frequencies, RingDownFit, fit_ring_down
 
@@ -47,18 +47,19 @@ class RingDownTrials:
 
     def frequency(self, mode: int) -> Averaged:
         """Return the natural frequency of mode 0 or 1 [Hz]."""
-        return _average(
-            [(fit.modes[mode].frequency, fit.modes[mode].frequency_standard_error) for fit in self.fits]
-        )
+        return self._average("frequency", mode)
 
     def damping_ratio(self, mode: int) -> Averaged:
         """Return the damping ratio of mode 0 or 1 [1]."""
-        return _average(
-            [
-                (fit.modes[mode].damping_ratio, fit.modes[mode].damping_ratio_standard_error)
-                for fit in self.fits
-            ]
-        )
+        return self._average("damping_ratio", mode)
+
+    def _average(self, name: str, mode: int) -> Averaged:
+        values = [float(getattr(fit.modes[mode], name)) for fit in self.fits]
+        mean = float(np.mean(values))
+        if len(values) == 1:
+            return Averaged(mean, math.nan, getattr(self.fits[0].modes[mode], f"{name}_standard_error"))
+        deviation = float(np.std(values, ddof=1))
+        return Averaged(mean, deviation, deviation / math.sqrt(len(values)))
 
 
 class AmplitudePoint(NamedTuple):
@@ -106,28 +107,15 @@ def amplitude_dependence(
     points = []
     record, mode = fit.record, fit.modes[0]
     begin = float(record.time[0]) + first
-    omega = 2.0 * math.pi * mode.damped_frequency
     while begin + window <= float(record.time[-1]):
         inside = (record.time >= begin) & (record.time < begin + window)
-        time = record.time[inside]
-        model = DampedCosines(time, record.signal[inside], record.averaging_width)
-        found = model.fitted(np.array([mode.decay_rate]), np.array([omega]))
+        model = DampedCosines(record.time[inside], record.signal[inside], record.averaging_width)
+        found = model.fitted(np.array([mode.decay_rate]), np.array([mode.omega]))
         solution = model.solve(found.decay, found.omega, frequencies_fitted=True)
-        decay, damped = float(found.decay[0]), float(found.omega[0])
-        middle = 0.5 * window
-        amplitude = abs(complex(solution.amplitude[0])) * math.exp(-decay * middle)
+        (seen,) = modes_of(found, solution)
+        amplitude = seen.amplitude * math.exp(-seen.decay_rate * 0.5 * window)
         if amplitude > 4.0 * solution.residual_deviation:
-            natural = math.hypot(decay, damped)
-            points.append(
-                AmplitudePoint(begin + middle, amplitude, natural / (2.0 * math.pi), decay / natural)
-            )
+            middle = begin + 0.5 * window
+            points.append(AmplitudePoint(middle, amplitude, seen.frequency, seen.damping_ratio))
         begin += step
     return tuple(points)
-
-
-def _average(values: list[tuple[float, float]]) -> Averaged:
-    mean = float(np.mean([value for value, _ in values]))
-    if len(values) == 1:
-        return Averaged(mean, math.nan, values[0][1])
-    deviation = float(np.std([value for value, _ in values], ddof=1))
-    return Averaged(mean, deviation, deviation / math.sqrt(len(values)))

@@ -1,61 +1,57 @@
-"""The joint posterior of a wing's stiffness, masses and damping, by importance sampling."""
+"""The posterior of parameters under readings, by importance sampling from a density that adapts to it.
+
+Every reading is a difference from what a model shows and a standard deviation, both functions of the
+parameters: a number that was measured of an output (its deviation holds what the model errs, too), or a pair
+of a test. Nothing here knows what was measured, or of what.
+"""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.special import gammaln
 
-from calibration.errors import ExperimentDataError, MassConstraintError, OutsideValidityError, PosteriorError
+from calibration.errors import PosteriorError
 from calibration.result.record import ParameterPrior
-from calibration.static.errors_in_variables import exact_posterior
-from calibration.static.experiments import LoadDisplacementData
-from calibration.static.posterior import GaussianPrior, check_count, child_seed
-from fe.runtime.reduced import ReducedModel
+from calibration.static.posterior import Seed, check_count, child_seed
 
-from .density import JointDensity, masses_of
-from .frequency_table import WingTables, tabulate_wing
-from .measurement import ModalMeasurement
-from .prior import ModelError, WeighedMass, wing_priors
-from .sampler import (
-    StudentT,
-    adapted_proposal,
-    effective_sample_size,
-    normalised,
-    systematic_resampling,
-)
+FloatArray = NDArray[np.float64]
+
+Comparison = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""Parameters (N, P) within their ranges to differences (N, R) and their standard deviations (N, R)."""
 
 LEAST_EFFECTIVE_SAMPLE_SIZE = 200.0
 """A posterior that the weighted draws describe with fewer effective ones is refused."""
 
-_LIMIT_MARGIN = 0.01  # of the range of e
-_LARGEST_SHARE_AT_LIMIT = 0.05
-_ADAPTATION_ROUNDS = 3
-_ADAPTATION_COUNT = 1000
-_PROPOSALS_PER_SAMPLE = 20
+_FREEDOM = 10.0  # of the Student-t proposals: tails heavier than those of the posterior, a cut-off Gaussian
+_INFLATION = 1.05  # of the proposal's covariance over the posterior's
+_STARTS = 4  # of the search for the optimum: the prior's mean, and draws of it
+_STEP = 1e-7  # of a scaled parameter, for slopes
+_ROUNDS, _MOST_ROUNDS, _ADAPTATION_COUNT = 3, 60, 1000
+_TEMPERED_SHARE = 0.1
+_PROPOSALS_PER_SAMPLE, _FEWEST_PROPOSALS = 20, 4_000
 _MOST_SAMPLES = 100_000  # the proposals of more do not fit into memory
-_FEWEST_PROPOSALS = 4_000
 _PURPOSE = 22  # of the seed
 
-FloatArray = NDArray[np.float64]
 
-
-class JointDraws(NamedTuple):
-    """p(e, masses, Rayleigh coefficients | load test, weighed total, ring-down) as samples.
+class Draws(NamedTuple):
+    """A posterior as samples.
 
     Attributes
     ----------
-    samples : (N, 5) array
-        Equally weighted samples of the parameters in SI units, in no order.
-    mean, standard_deviation : (5,) array
-        Of all weighted draws, closer to the posterior's than those of the samples [SI].
+    samples : (N, P) array
+        Equally weighted samples of the parameters, in no order [their units].
+    mean, standard_deviation : (P,) array
+        Of all weighted draws, closer to the posterior's than those of the samples.
     proposals : int
         Weighted draws from which the samples were taken.
     effective : float
         (sum w)^2 / sum w^2 of their weights.
     log_evidence : float
-        Log of the probability density of all measurements under priors and model error.
+        Log of the probability density of all readings under the priors.
     """
 
     samples: FloatArray
@@ -66,164 +62,152 @@ class JointDraws(NamedTuple):
     log_evidence: float
 
 
-def joint_posterior(
-    model: ReducedModel | WingTables,
-    static: LoadDisplacementData,
-    modal: ModalMeasurement,
-    *,
-    priors: tuple[ParameterPrior, ...] | None = None,
-    total_mass: WeighedMass | None = None,
-    model_error: ModelError | None = None,
-    seed: int = 0,
-    count: int = 1000,
-) -> JointDraws:
-    """Return the posterior of e, masses and Rayleigh coefficients, given all measurements at once.
+def infer(
+    priors: tuple[ParameterPrior, ...], compare: Comparison, *, seed: Seed = 0, count: int = 1000
+) -> Draws:
+    """Return the posterior of parameters under everything that was read.
 
-    The likelihoods are in `calibration.joint.density`; that of the load test is exact (errors in both
-    variables) with k(e) of the same model. Samples are taken by importance sampling from a Student-t density
-    that follows the posterior of e and the masses; alpha and beta are drawn from their exact conditional.
+    The search begins at the most probable parameters; proposals are Student-t densities in coordinates in
+    which the posterior there is round, so that parameters of which the readings tell next to one combination
+    alone are sampled as well as others.
 
     Parameters
     ----------
-    model : ReducedModel or WingTables
-        The wing; the tables of `tabulate_wing` spare a fifth of a second where many posteriors are wanted.
-    static : LoadDisplacementData
-        The load test.
-    modal : ModalMeasurement
-        The ring-down.
-    priors : tuple of ParameterPrior, optional
-        `wing_priors` of the model by default.
-    total_mass : WeighedMass, optional
-        2 m_servo + m_pitot as weighed; 0.472 kg ± 1 g by default.
-    model_error : ModelError, optional
-        Relative standard deviation of the model's two frequencies; 1 and 5 % by default. Zero trusts them.
-    seed : int
+    priors : tuple of ParameterPrior
+        Normal distributions, cut off at their ranges.
+    compare : callable
+        Differences of all readings from the model, and their standard deviations.
+    seed : int or SeedSequence
         The same seed gives the same samples.
     count : int
         Number of samples.
 
     Raises
     ------
-    MassConstraintError
-        If no masses within the model's range keep the weighed total.
-    ExperimentDataError
-        If weighed total or model error make no sense, or the damping ratios need negative coefficients.
-    OutsideValidityError
-        If the load test alone puts e outside the model, or all measurements together press it against the
-        end of the model's range.
     PosteriorError
-        If `count` is not 1 to 100,000, a prior lies outside its range, or the measurements contradict each
-        other so much that the sampler finds no posterior.
+        If `count` is not 1 to 100,000, a prior lies outside its range, or the readings contradict each other
+        so much that no posterior is found.
     """
-    total_mass = WeighedMass() if total_mass is None else total_mass
-    model_error = ModelError() if model_error is None else model_error
     check_count(count, PosteriorError, most=_MOST_SAMPLES)
-    _check(total_mass, model_error)
-    tables = model if isinstance(model, WingTables) else tabulate_wing(model)
-    priors = wing_priors(tables.validity) if priors is None else priors
     normaliser = sum(prior.log_share_inside for prior in priors)
-    density = JointDensity(tables, static, modal, total_mass, priors, model_error)
     generator = np.random.default_rng(child_seed(seed, _PURPOSE))
-    proposal = adapted_proposal(
-        density, _begun(density), generator, rounds=_ADAPTATION_ROUNDS, count=_ADAPTATION_COUNT
-    )
+    density = _Density(priors, compare, generator)
+    centre: FloatArray = np.zeros(len(priors))
+    factor: FloatArray = np.eye(len(priors))
+    good = 0
+    for _ in range(_MOST_ROUNDS):
+        points, log_weight = density.weighted(centre, factor, _ADAPTATION_COUNT, generator)
+        if np.count_nonzero(np.isfinite(log_weight)) <= _TEMPERED_SHARE * len(points):
+            factor = 0.5 * factor  # most draws lie outside the range
+            continue
+        weight, tempered = _normalised(log_weight), False
+        while _effective(weight) < _TEMPERED_SHARE * len(
+            points
+        ):  # they say too little: begin closer next time
+            log_weight, tempered = 0.5 * log_weight, True
+            weight = _normalised(log_weight)
+        centre = weight @ points
+        deviation = points - centre
+        covariance = (deviation * weight[:, None]).T @ deviation
+        factor = np.asarray(np.linalg.cholesky(_INFLATION * covariance), dtype=np.float64)
+        good += not tempered
+        if good == _ROUNDS:
+            break
     proposals = max(_FEWEST_PROPOSALS, _PROPOSALS_PER_SAMPLE * count)
-    quantities, log_weight = _weighted(density, proposal, generator, proposals)
-    weight, log_mean = normalised(log_weight)
-    effective = effective_sample_size(weight) if math.isfinite(log_mean) else 0.0
+    points, log_weight = density.weighted(centre, factor, proposals, generator)
+    weight = _normalised(log_weight)
+    largest = float(log_weight.max())
+    effective = _effective(weight) if math.isfinite(largest) else 0.0
     if effective < LEAST_EFFECTIVE_SAMPLE_SIZE:
         raise PosteriorError(
-            f"only {effective:.0f} of {proposals} draws describe the joint posterior: load test, weighed "
-            "total and frequencies contradict each other within the model's range; check them, or allow "
-            "the model a larger error of its frequencies."
+            f"only {effective:.0f} of {proposals} draws describe the posterior: the readings contradict each "
+            "other within the model's range; check them, or allow the model a larger error."
         )
-    _refuse_limit(quantities[:, 0], weight, priors[0])
-    mean = weight @ quantities
-    return JointDraws(
-        samples=quantities[systematic_resampling(weight, generator, count)],
+    values = density.values(points)
+    mean = weight @ values
+    chosen = np.searchsorted(np.cumsum(weight), (np.arange(count) + generator.random()) / count)
+    return Draws(
+        samples=values[generator.permutation(np.minimum(chosen, proposals - 1))],
         mean=mean,
-        standard_deviation=np.sqrt(weight @ (quantities - mean) ** 2),
+        standard_deviation=np.sqrt(weight @ (values - mean) ** 2),
         proposals=proposals,
         effective=effective,
-        log_evidence=log_mean + math.log(len(quantities) / proposals) - normaliser,
+        log_evidence=largest + math.log(np.mean(np.exp(log_weight - largest))) + density.scale - normaliser,
     )
 
 
-def _weighted(
-    density: JointDensity, proposal: StudentT, generator: np.random.Generator, proposals: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return draws (N, 5) within the model and the logs of their weights (N,)."""
-    points, log_proposal = proposal.draw(generator, proposals)
-    standard = generator.standard_normal((proposals, 2))
-    inside = density.inside(points)
-    points, standard, log_proposal = points[inside], standard[inside], log_proposal[inside]
-    logarithm, damping = density.log_density(points)
-    factor = np.linalg.cholesky(damping.covariance)
-    coefficients = damping.mean + (factor @ standard[..., None])[..., 0]
-    positive = (coefficients >= 0.0).all(axis=1)
-    if np.mean(positive) < 0.01:
-        first, second = density.modal.damping_ratio
-        raise ExperimentDataError(
-            f"damping ratios {first:g} and {second:g} need a negative "
-            "Rayleigh coefficient, but neither may be negative; check the ring-down records."
-        )
-    quantities = np.column_stack([masses_of(points), coefficients])
-    return quantities, np.where(positive, logarithm - log_proposal, -np.inf)
+class _Density:
+    """The posterior up to its normaliser over z, in which it is round where it is greatest.
 
-
-def _refuse_limit(factor: FloatArray, weight: FloatArray, prior: ParameterPrior) -> None:
-    margin = _LIMIT_MARGIN * (prior.high - prior.low)
-    for limit in (prior.low, prior.high):
-        share = float(weight[np.abs(factor - limit) < margin].sum())
-        if share > _LARGEST_SHARE_AT_LIMIT:
-            raise OutsideValidityError(
-                f"{share:.0%} of the joint posterior of e is pressed against {limit:g}, where the model "
-                "ends: load test and frequencies contradict each other; check them, or allow the model a "
-                "larger error of its frequencies."
-            )
-
-
-def _check(total_mass: WeighedMass, model_error: ModelError) -> None:
-    if not all(math.isfinite(value) and value > 0.0 for value in total_mass):
-        raise ExperimentDataError(
-            f"the weighed total and its standard deviation must be positive and finite, but "
-            f"{total_mass.mass:g} kg and {total_mass.standard_deviation:g} kg were given."
-        )
-    if not all(math.isfinite(value) and 0.0 <= value < 1.0 for value in model_error.frequency):
-        raise ExperimentDataError(
-            "the model error of a frequency is a relative standard deviation from 0 to below 1 (not "
-            f"percent), but {' and '.join(f'{value:g}' for value in model_error.frequency)} were given."
-        )
-
-
-def servo_range(validity: Mapping[str, tuple[float, float]], total_mass: float) -> tuple[float, float]:
-    """Return least and greatest mass of a servo with which a model can keep the weighed total [kg].
-
-    Raises
-    ------
-    MassConstraintError
-        If there is none.
+    Parameters are mean + deviation u with the prior's moments, and u = optimum + stretch z. `scale` is the
+    log of the volume of u for that of z.
     """
-    servo, pitot = validity["servo_mass"], validity["pitot_mass"]
-    lower = max(servo[0], 0.5 * (total_mass - pitot[1]))
-    upper = min(servo[1], 0.5 * (total_mass - pitot[0]))
-    if not (math.isfinite(total_mass) and lower < upper):
-        least, greatest = 2.0 * servo[0] + pitot[0], 2.0 * servo[1] + pitot[1]
-        raise MassConstraintError(
-            f"two servos and the pitot tube cannot weigh {total_mass:g} kg: the model takes totals between "
-            f"{least:g} and {greatest:g} kg."
-        )
-    return lower, upper
+
+    def __init__(
+        self, priors: tuple[ParameterPrior, ...], compare: Comparison, generator: np.random.Generator
+    ) -> None:
+        self._compare = compare
+        self._mean, self._deviation, low, high = np.array(
+            [(prior.mean, prior.deviation, prior.low, prior.high) for prior in priors]
+        ).T
+        self._low, self._high = (low - self._mean) / self._deviation, (high - self._mean) / self._deviation
+        starts = [np.zeros(len(priors)), *generator.standard_normal((_STARTS - 1, len(priors)))]
+        width = self._high - self._low
+        inside = [np.clip(start, self._low + 1e-6 * width, self._high - 1e-6 * width) for start in starts]
+        limits = self._low, self._high
+        found = [
+            least_squares(lambda u: self._residuals(u[None])[0], start, self._jacobian, limits, x_scale="jac")
+            for start in inside
+        ]
+        best = max(found, key=lambda item: float(self._log_density(item.x[None])[0]))
+        _, singular, rows = np.linalg.svd(best.jac, full_matrices=False)
+        self._optimum, self._stretch = best.x, rows.T / singular
+        self.scale = -float(np.log(singular).sum())
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return the parameters of points z (N, P) [their units]."""
+        return np.asarray(self._mean + self._deviation * (self._optimum + points @ self._stretch.T))
+
+    def weighted(
+        self, centre: FloatArray, factor: FloatArray, count: int, generator: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return draws z (N, P) of a Student-t density and the logs of their weights; -inf outside."""
+        size = len(centre)
+        standard = generator.standard_normal((count, size))
+        standard /= np.sqrt(generator.chisquare(_FREEDOM, count) / _FREEDOM)[:, None]
+        constant = gammaln(0.5 * (_FREEDOM + size)) - gammaln(0.5 * _FREEDOM)
+        constant -= 0.5 * size * math.log(_FREEDOM * math.pi) + float(np.log(np.diag(factor)).sum())
+        square = np.sum(standard**2, axis=1)
+        log_proposal = constant - 0.5 * (_FREEDOM + size) * np.log1p(square / _FREEDOM)
+        points = centre + standard @ factor.T
+        return points, self._log_density(self._optimum + points @ self._stretch.T) - log_proposal
+
+    def _log_density(self, u: FloatArray) -> FloatArray:
+        inside = np.all((u >= self._low) & (u <= self._high), axis=1)
+        value = np.full(len(u), -np.inf)
+        if inside.any():
+            difference, deviation = self._compare(self._mean + self._deviation * u[inside])
+            terms = -0.5 * (difference / deviation) ** 2 - np.log(deviation) - 0.5 * math.log(2.0 * math.pi)
+            prior = -0.5 * np.sum(u[inside] ** 2, axis=1) - 0.5 * u.shape[1] * math.log(2.0 * math.pi)
+            value[inside] = prior + terms.sum(axis=1)
+        return value
+
+    def _residuals(self, u: FloatArray) -> FloatArray:
+        difference, deviation = self._compare(self._mean + self._deviation * u)
+        return np.hstack([difference / deviation, u])
+
+    def _jacobian(self, u: FloatArray) -> FloatArray:
+        step = np.where(u + _STEP < self._high, _STEP, -_STEP)
+        residuals = self._residuals(np.vstack([u, u + np.diag(step)]))
+        return np.asarray((residuals[1:] - residuals[0]).T / step)
 
 
-def _begun(density: JointDensity) -> StudentT:
-    """Return where the search of (e, s, t) begins: the best servo mass at the e of the load test alone."""
-    total, prior = density.total_mass, density.priors[0]
-    lower, upper = servo_range(density.tables.validity, total.mass)
-    alone = exact_posterior(
-        density.static, curve=density.tables.stiffness, prior=GaussianPrior(prior.mean, prior.deviation)
-    )
-    factor = min(max(alone.mean, prior.low + 1e-6), prior.high - 1e-6)
-    candidates = np.array([(factor, mass, total.mass) for mass in np.linspace(lower, upper, 67)[1:-1]])
-    scale = np.array([alone.standard_deviation, 0.05 * (upper - lower), total.standard_deviation])
-    return StudentT(candidates[int(np.argmax(density(candidates)))], np.diag(scale**2))
+def _normalised(log_weight: FloatArray) -> FloatArray:
+    """Return weights of sum one; all alike where no draw has one."""
+    largest = float(log_weight.max())
+    weight = np.exp(log_weight - largest) if math.isfinite(largest) else np.ones(len(log_weight))
+    return np.asarray(weight / weight.sum())
+
+
+def _effective(weight: FloatArray) -> float:
+    return float(1.0 / np.sum(weight**2))

@@ -2,12 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri
 
-from calibration.dynamics.damped_cosine import DampedCosines, NaturalMode, natural_mode
+from calibration.dynamics.damped_cosine import DampedCosines, RingDownMode, modes_of
 from calibration.dynamics.ringdown import Frequencies, RingDownFit
 from calibration.dynamics.trials import (
     PUBLISHED_DAMPING_RATIOS,
@@ -16,10 +15,12 @@ from calibration.dynamics.trials import (
     amplitude_dependence,
 )
 from calibration.errors import ExperimentDataError
+from calibration.result.record import Reading
 
-PUBLISHED_STANDARD_DEVIATIONS = (0.062, 0.63, 0.0039, 0.0162)
-"""Of f1, f2 [Hz], zeta1 and zeta2 [1]; see `published_modal_measurement`."""
+MODAL = ("frequency_1", "frequency_2", "damping_ratio_1", "damping_ratio_2")
+"""What a ring-down tells of a wing."""
 
+_NAMES = ("frequency", "damping_ratio")
 _SIGNIFICANT_SCATTER = 0.95
 _SIGNIFICANT_DIFFERENCE = 2.0  # standard errors
 _LATER_STARTS = (0.04, 0.08)  # s; one and two and a half periods of the second mode
@@ -28,64 +29,43 @@ _SAME_MODE = 0.2  # relative change of its frequency beyond which a fit has foun
 _VISIBLE = 1.0  # amplitude of the second mode at the later start, over the residuals
 
 
-@dataclass(frozen=True)
-class ModalMeasurement:
-    """Measured frequencies and damping ratios of the first two flapwise modes.
-
-    Attributes
-    ----------
-    frequency : (float, float)
-        Natural frequencies [Hz].
-    frequency_standard_deviation : (float, float)
-        Their standard deviations, statistical and systematic parts together [Hz].
-    damping_ratio : (float, float)
-        Damping ratios [1].
-    damping_ratio_standard_deviation : (float, float)
-        Their standard deviations, statistical and systematic parts together [1].
-    source : str
-        Where the figures come from.
+def check_readings(readings: Sequence[Reading]) -> tuple[Reading, ...]:
+    """Return the readings of a wing.
 
     Raises
     ------
     ExperimentDataError
-        If a frequency, a damping ratio or a standard deviation is not positive and finite, a damping ratio is
-        1 or more, or the first frequency is not the lower one.
+        If one or its standard deviation is not positive and finite, a damping ratio is 1 or more, or the
+        first frequency is not the lower one.
     """
-
-    frequency: tuple[float, float]
-    frequency_standard_deviation: tuple[float, float]
-    damping_ratio: tuple[float, float]
-    damping_ratio_standard_deviation: tuple[float, float]
-    source: str
-
-    def __post_init__(self) -> None:
-        for name, unit in (
-            ("frequency", " Hz"),
-            ("frequency_standard_deviation", " Hz"),
-            ("damping_ratio", ""),
-            ("damping_ratio_standard_deviation", ""),
-        ):
-            values = getattr(self, name)
-            if len(values) != 2 or not all(math.isfinite(value) and value > 0.0 for value in values):
-                raise ExperimentDataError(
-                    f"{self.source}: {name} must hold two positive finite numbers, one for each flapwise "
-                    f"mode, but {', '.join(f'{value:g}{unit}' for value in values)} came."
-                )
-            object.__setattr__(self, name, tuple(float(value) for value in values))
-        if not max(self.damping_ratio) < 1.0:
+    for item in readings:
+        if not all(math.isfinite(value) and value > 0.0 for value in (item.value, item.deviation)):
             raise ExperimentDataError(
-                f"{self.source}: a damping ratio of {max(self.damping_ratio):.4g} lets nothing swing; give "
+                f"{item.experiment}: {item.name} and its standard deviation must be positive and finite, but "
+                f"{item.value:g} and {item.deviation:g} came."
+            )
+        if item.name.startswith("damping_ratio") and not item.value < 1.0:
+            raise ExperimentDataError(
+                f"{item.experiment}: a damping ratio of {item.value:.4g} lets nothing swing; give "
                 "fractions of critical damping, 0.05 for 5 %."
             )
-        if not self.frequency[0] < self.frequency[1]:
-            raise ExperimentDataError(
-                f"{self.source}: the first flapwise frequency, {self.frequency[0]:.4g} Hz, must lie below "
-                f"the second, {self.frequency[1]:.4g} Hz."
-            )
+    first, second = ([item.value for item in readings if item.name == f"frequency_{mode}"] for mode in (1, 2))
+    if first and second and not first[0] < second[0]:
+        raise ExperimentDataError(
+            f"the first flapwise frequency, {first[0]:.4g} Hz, must lie below the second, {second[0]:.4g} Hz."
+        )
+    return tuple(readings)
 
 
-def modal_measurement(trials: RingDownTrials) -> ModalMeasurement:
-    """Return mean modal data of fitted trials with statistical and systematic uncertainty.
+def modal_readings(values: Sequence[float], deviations: Sequence[float]) -> tuple[Reading, ...]:
+    """Return readings of f1, f2 [Hz], zeta1 and zeta2 [1]; errors as `check_readings`."""
+    return check_readings(
+        [Reading(*given) for given in zip(MODAL, ["ring-down"] * 4, values, deviations, strict=True)]
+    )
+
+
+def measured_modes(trials: RingDownTrials) -> tuple[Reading, ...]:
+    """Return mean frequencies and damping ratios of fitted trials, statistical and systematic uncertainty.
 
     *Statistical*: the standard error of the mean over the trials, from the least-squares fits; where the
     trials scatter more than these explain (chi-square at 5 %), from their scatter, widened as Student's t.
@@ -110,29 +90,17 @@ def modal_measurement(trials: RingDownTrials) -> ModalMeasurement:
     ExperimentDataError
         If an uncertainty comes out as zero, as for a drawn record without noise.
     """
-    frequency, ratio = [], []
-    for mode in (0, 1):
-        fitted = [fit.modes[mode] for fit in trials.fits]
-        frequency.append(_mean([m.frequency for m in fitted], [m.frequency_standard_error for m in fitted]))
-        ratio.append(
-            _mean([m.damping_ratio for m in fitted], [m.damping_ratio_standard_error for m in fitted])
-        )
+    means = [_mean_of([fit.modes[mode] for fit in trials.fits], name) for name in _NAMES for mode in (0, 1)]
     softening = _amplitude_terms(trials)
-    choice = _choice_terms(trials, frequency[1][0], ratio[1][0])
-    return ModalMeasurement(
-        frequency=(frequency[0][0], frequency[1][0]),
-        frequency_standard_deviation=(
-            math.hypot(frequency[0][1], softening[0]),
-            math.hypot(frequency[1][1], choice[0]),
-        ),
-        damping_ratio=(ratio[0][0], ratio[1][0]),
-        damping_ratio_standard_deviation=(
-            math.hypot(ratio[0][1], softening[1]),
-            math.hypot(ratio[1][1], choice[1]),
-        ),
-        source=f"{len(trials.fits)} ring-down records ({trials.fits[0].record.source}, ...), frequencies "
-        f"{'fitted' if trials.procedure is Frequencies.FITTED else 'of spectral peaks'}",
-    )
+    choice = _choice_terms(trials, means[1][0], means[3][0])
+    systematic = softening[0], choice[0], softening[1], choice[1]
+    deviations = [math.hypot(error, term) for (_, error), term in zip(means, systematic, strict=True)]
+    return modal_readings([mean for mean, _ in means], deviations)
+
+
+def _mean_of(modes: Sequence[RingDownMode], name: str) -> tuple[float, float]:
+    values, errors = ([getattr(item, which) for item in modes] for which in (name, f"{name}_standard_error"))
+    return _mean(values, errors)
 
 
 def _mean(values: Sequence[float], errors: Sequence[float]) -> tuple[float, float]:
@@ -159,7 +127,7 @@ def _amplitude_terms(trials: RingDownTrials) -> tuple[float, float]:
     if not spread > 0.0:
         return 0.0, 0.0
     terms = []
-    for name in ("frequency", "damping_ratio"):
+    for name in _NAMES:
         value = np.array([getattr(point, name) for point in points])
         slope = float(logarithm @ value / (logarithm @ logarithm))
         rest = value - value.mean() - slope * logarithm
@@ -177,12 +145,9 @@ def _choice_terms(trials: RingDownTrials, frequency: float, ratio: float) -> tup
         found = [refitted for fit in trials.fits if (refitted := _refit(fit, delay)) is not None]
         if len(found) < len(trials.fits):
             continue  # the mode has died away by then
-        frequencies, errors, ratios, ratio_errors = zip(*found, strict=True)
-        other, error = _mean(frequencies, errors)
-        other_ratio, ratio_error = _mean(ratios, ratio_errors)
-        terms.append(
-            (_beyond_chance(other - frequency, error), _beyond_chance(other_ratio - ratio, ratio_error))
-        )
+        others = [_mean_of(found, name) for name in _NAMES]
+        pairs = zip(others, (frequency, ratio), strict=True)
+        terms.append([_beyond_chance(other - first, error) for (other, error), first in pairs])
     if not terms:
         return 0.0, 0.0
     square = np.mean(np.square(terms), axis=0)
@@ -195,32 +160,27 @@ def _beyond_chance(difference: float, error: float) -> float:
     return math.sqrt(difference**2 - error**2)
 
 
-def _refit(fit: RingDownFit, delay: float) -> NaturalMode | None:
+def _refit(fit: RingDownFit, delay: float) -> RingDownMode | None:
     """Return the second mode of a record begun later, or None where it is gone by then."""
     record = fit.record
     after = record.time >= record.time[0] + delay
     model = DampedCosines(record.time[after], record.signal[after], record.averaging_width)
-    omega = 2.0 * math.pi * np.array([mode.damped_frequency for mode in fit.modes])
-    found = model.fitted(np.array([mode.decay_rate for mode in fit.modes]), omega)
-    decay, damped = float(found.decay[1]), float(found.omega[1])
-    if not (0.0 < decay < damped and abs(damped / omega[1] - 1.0) < _SAME_MODE):
+    decay, omega = np.array([(mode.decay_rate, mode.omega) for mode in fit.modes]).T
+    found = model.fitted(decay, omega)
+    rate, damped = float(found.decay[1]), float(found.omega[1])
+    if not (0.0 < rate < damped and abs(damped / omega[1] - 1.0) < _SAME_MODE):
         return None
     solution = model.solve(found.decay, found.omega, frequencies_fitted=True)
     if abs(solution.amplitude[1]) < _VISIBLE * solution.residual_deviation:
         return None
-    return natural_mode(decay, damped, solution.covariance[np.ix_([1, 3], [1, 3])])
+    return next(mode for mode in modes_of(found, solution) if mode.omega == damped)
 
 
-def published_modal_measurement() -> ModalMeasurement:
-    """Return the published means of the five trials, with the uncertainty that our records of them show.
+PUBLISHED_MODES = modal_readings(
+    (*PUBLISHED_FREQUENCIES, *PUBLISHED_DAMPING_RATIOS), (0.062, 0.63, 0.0039, 0.0162)
+)
+"""The published means of the five trials, with the uncertainty that our records of them show.
 
-    The paper gives no uncertainty. These are the standard deviations that `modal_measurement` finds in the
-    same five trials read off the published plots, frequencies from the spectral peaks as in the paper.
-    """
-    return ModalMeasurement(
-        frequency=PUBLISHED_FREQUENCIES,
-        frequency_standard_deviation=PUBLISHED_STANDARD_DEVIATIONS[:2],
-        damping_ratio=PUBLISHED_DAMPING_RATIOS,
-        damping_ratio_standard_deviation=PUBLISHED_STANDARD_DEVIATIONS[2:],
-        source="published targets (Kapteyn et al. 2021, step 3)",
-    )
+The paper gives no uncertainty. These are the standard deviations that `measured_modes` finds in the same five
+trials read off the published plots, frequencies from the spectral peaks as in the paper.
+"""

@@ -1,17 +1,30 @@
 """What is known of a wing before the ring-down: priors, weighed mass, error of the model."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
-from calibration.result.record import ParameterPrior
+from calibration.result.record import ParameterPrior, Reading
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import PRIOR_HALF_WIDTH
 
 TOTAL_MASS = 0.472
 """Weighed mass of two servos and the pitot tube [kg] (Kapteyn et al. 2021, eqs. (19) and (20))."""
 
-DEFAULT_MODEL_ERROR = (0.01, 0.05)
-"""Relative standard deviations of the model's first two flapwise frequencies about the wing's [1]."""
+MODEL_ERROR = (0.01, 0.05)
+"""How far the model's two frequencies may lie from those of the wing with the very same digital state [1].
+
+The wing's frequency is f_i (1 + delta_i) with the model's f_i and independent delta_i ~ N(0, tau_i^2); these
+are tau_1 and tau_2. See `docs/calibration.md` for the choice and for other choices.
+"""
+
+
+def weighed(mass: float = TOTAL_MASS, deviation: float = 1e-3) -> Reading:
+    """Return the reading of a weighing of two servos and the pitot tube [kg].
+
+    The paper gives no uncertainty: 1 g is our choice, a scale that shows grams and leads that may or may not
+    have been weighed.
+    """
+    return Reading("weighed_mass", "weighing", mass, deviation)
+
 
 _OURS = "our choice"
 _PRIORS = {
@@ -28,27 +41,6 @@ _PRIORS = {
     "damping_beta": ("s", 0.0, 1.5e-3, _OURS, "stiffness-proportional Rayleigh damping, beta"),
 }
 _DAMPING_RANGES = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
-
-
-class WeighedMass(NamedTuple):
-    """Weighed mass of two servos and the pitot tube, and the standard deviation of the weighing [kg].
-
-    The mass is that of Kapteyn et al. 2021, eqs. (19) and (20). The paper gives no uncertainty: 1 g is our
-    choice, a scale that shows grams and leads that may or may not have been weighed.
-    """
-
-    mass: float = TOTAL_MASS
-    standard_deviation: float = 1e-3
-
-
-class ModelError(NamedTuple):
-    """How far the model's frequencies may lie from those of the wing with the very same digital state.
-
-    The wing's frequency is f_i (1 + delta_i) with the model's f_i and delta_i ~ N(0, tau_i^2), independent;
-    `frequency` holds tau_1, tau_2 [1]. See `docs/calibration.md` for the choice and for other choices.
-    """
-
-    frequency: tuple[float, float] = DEFAULT_MODEL_ERROR
 
 
 def wing_priors(

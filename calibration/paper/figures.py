@@ -1,4 +1,4 @@
-"""Figures of calibration step 2: the panels of Kapteyn et al. 2021, Fig. 5, and what they leave open."""
+"""Figure of calibration step 2: the panels of Kapteyn et al. 2021, Fig. 5."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibration.paper.load_test import StaticCalibration
-from calibration.paper.table_1 import PAPER_MEAN, PAPER_STANDARD_DEVIATION
+from calibration.paper.table_1 import PAPER_MEAN
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import ScalarPosterior
 from reporting.figures import (
@@ -37,17 +37,6 @@ def calibration_figure(result: StaticCalibration) -> Figure:
     return figure
 
 
-def residual_figure(result: StaticCalibration) -> Figure:
-    """Draw the residuals run by run, and the posterior under other assumptions."""
-    with publication_style():
-        figure = new_figure(height=2.6)
-        grid = figure.add_gridspec(1, 2, width_ratios=(1.0, 0.9), wspace=0.45)
-        figure.subplots_adjust(left=0.075, right=0.985, bottom=0.165, top=0.90)
-        _draw_residuals(figure.add_subplot(grid[0, 0]), result)
-        _draw_alternatives(figure.add_subplot(grid[0, 1]), result)
-    return figure
-
-
 def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
     data = result.data
     reach = 1.12 * float(data.displacement.max())
@@ -58,14 +47,9 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
     ):
         lower, upper = posterior.interval(0.95)
         axes.fill_between(
-            displacement * 1e3,
-            lower * displacement,
-            upper * displacement,
-            color=colour,
-            alpha=opacity,
-            lw=0.0,
-            label=f"{name}, 95 % band",
-        )
+            displacement * 1e3, lower * displacement, upper * displacement,
+            color=colour, alpha=opacity, lw=0.0, label=f"{name}, 95 % band",
+        )  # fmt: skip
     axes.plot(
         displacement * 1e3, result.tip_stiffness_prior.mean * displacement, color=REFERENCE, lw=1.0, ls="--"
     )
@@ -73,14 +57,11 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
     for number, index in enumerate(data.run_indices):
         of_run = data.run == index
         axes.errorbar(
-            data.displacement[of_run] * 1e3,
-            data.load[of_run],
+            data.displacement[of_run] * 1e3, data.load[of_run],
             xerr=HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3,
             yerr=HALF_WIDTH_95 * data.load_standard_deviation,
-            **_of_run(number),
-            label=f"measured, run {index + 1}",
-            zorder=3 + number,
-        )
+            **_of_run(number), label=f"measured, run {index + 1}", zorder=3 + number,
+        )  # fmt: skip
     axes.set_xlim(0.0, reach * 1e3)
     axes.set_ylim(0.0, 1.12 * float(data.load.max()))
     axes.set_xlabel("tip displacement $x$ (mm)", parse_math=True)
@@ -91,15 +72,9 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
 
 def _of_run(number: int) -> dict[str, Any]:
     """Return how the pairs of a loading run are marked."""
-    return {
-        "fmt": _MARKERS[number % len(_MARKERS)],
-        "color": OBSERVED,
-        "mfc": "white" if number % 2 else OBSERVED,
-        "ms": 3.6,
-        "mew": 0.9,
-        "elinewidth": 0.8,
-        "capsize": 1.8,
-    }
+    marker, face = _MARKERS[number % len(_MARKERS)], "white" if number % 2 else OBSERVED
+    line: dict[str, Any] = {"ms": 3.6, "mew": 0.9, "elinewidth": 0.8, "capsize": 1.8}
+    return line | {"fmt": marker, "color": OBSERVED, "mfc": face}
 
 
 def _draw_factor(axes: Axes, result: StaticCalibration) -> None:
@@ -156,71 +131,3 @@ def _draw_densities(
     reach = 3.6 * prior.standard_deviation
     axes.set_xlim((prior.mean - reach) * scale, (prior.mean + reach) * scale)
     axes.set_ylim(0.0, 1.12 * float(exact.density.max()) / scale)
-
-
-def _draw_residuals(axes: Axes, result: StaticCalibration) -> None:
-    data, quality = result.data, result.quality
-    half_width = HALF_WIDTH_95 * np.hypot(
-        data.displacement_standard_deviation, data.load_standard_deviation / quality.stiffness
-    )
-    shift = 0.008 * float(data.load.max())
-    axes.axhline(0.0, color=PAST, lw=1.0)
-    for number, (index, run) in enumerate(zip(data.run_indices, quality.runs, strict=True)):
-        of_run = data.run == index
-        side = shift * (2 * number - len(quality.runs) + 1)
-        line = axes.errorbar(
-            data.load[of_run] + side,
-            quality.displacement_residual[of_run] * 1e3,
-            yerr=half_width * 1e3,
-            **_of_run(number),
-            label=f"run {index + 1} ({run.offset * 1e3:+.2f} mm)".replace("-", "−"),
-        )
-        line.lines[0].set_zorder(3 + number)
-        axes.axhline(run.offset * 1e3, color=OBSERVED, lw=0.8, ls=_RUN_LINES[1 + number % 3])
-    limit = 1.75 * float(np.max(np.abs(quality.displacement_residual))) * 1e3 + 0.25
-    axes.set_ylim(-limit, 1.3 * limit)
-    axes.set_xlabel("tip load $f$ (N)", parse_math=True)
-    axes.set_ylabel("$x - f/k$ (mm)", parse_math=True)
-    axes.legend(loc="upper center", ncols=2, fontsize=6.8, handletextpad=0.3, borderaxespad=0.0)
-    panel_label(axes, "a", "Residuals of the two runs" if len(quality.runs) == 2 else "Residuals")
-
-
-def _short_name(assumption: str) -> str:
-    for beginning, short in (
-        ("prior flat", "flat in load"),
-        ("density", "ratio"),
-        ("a zero", "zero offsets"),
-    ):
-        if assumption.startswith(beginning):
-            return short
-    return assumption
-
-
-def _draw_alternatives(axes: Axes, result: StaticCalibration) -> None:
-    rows = [
-        ("paper", PAPER_MEAN, PAPER_STANDARD_DEVIATION, REFERENCE),
-        ("particle filter", result.particle.mean, result.particle.standard_deviation, PRESENT),
-        ("exact", result.exact.mean, result.exact.standard_deviation, PAST),
-    ]
-    rows += [
-        (f"exact, {_short_name(alternative.name)}", alternative.mean, alternative.standard_deviation, PAST)
-        for alternative in result.alternatives
-    ]
-    for row, (_, mean, deviation, colour) in enumerate(rows):
-        axes.errorbar(
-            mean,
-            row,
-            xerr=HALF_WIDTH_95 * deviation,
-            fmt="o",
-            color=colour,
-            ms=3.8,
-            elinewidth=1.2,
-            capsize=2.2,
-        )
-    axes.axvline(PAPER_MEAN, color=REFERENCE, lw=0.7, ls=":")
-    axes.set_yticks(range(len(rows)), [row[0] for row in rows])
-    axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.tick_params(axis="y", length=0.0)
-    axes.spines["left"].set_visible(False)
-    axes.set_xlabel("Young's modulus factor $e$ (95 %)", parse_math=True)
-    panel_label(axes, "b", "Under other assumptions")

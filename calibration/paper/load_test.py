@@ -1,5 +1,6 @@
 """Calibration step 2 alone, as in Fig. 5 of the paper: e and the tip stiffness, exactly and by particles."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,19 +8,10 @@ import numpy as np
 from calibration.errors import OutsideValidityError
 from calibration.paper.particle_filter import DEFAULT_PARTICLE_COUNT, ParticlePosterior, particle_filter
 from calibration.static.errors_in_variables import Measure, exact_posterior
-from calibration.static.experiments import HALF_WIDTH_95, LoadDisplacementData, published_measurements
+from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import GaussianPrior, ScalarPosterior
 from calibration.static.quality import FitQuality, assess_fit
 from calibration.static.stiffness_curve import PUBLISHED_LINE, StiffnessCurve
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """The same posterior under another assumption: its name, mean and standard deviation of e [1]."""
-
-    name: str
-    mean: float
-    standard_deviation: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +32,7 @@ class StaticCalibration:
         p(e | pairs) with errors in both variables, by quadrature.
     tip_stiffness_prior, tip_stiffness_particle, tip_stiffness_exact : ScalarPosterior
         p(k) and p(k | pairs), the quantity of interest of Fig. 5 [N/m].
-    alternatives : tuple of Alternative
+    alternatives : dict of str to ScalarPosterior
         The exact posterior under other assumptions; those that leave the range of the curve are missing.
     quality : FitQuality
         Residuals at the exact posterior mean.
@@ -54,7 +46,7 @@ class StaticCalibration:
     tip_stiffness_prior: ScalarPosterior
     tip_stiffness_particle: ScalarPosterior
     tip_stiffness_exact: ScalarPosterior
-    alternatives: tuple[Alternative, ...]
+    alternatives: dict[str, ScalarPosterior]
     quality: FitQuality
 
 
@@ -121,25 +113,17 @@ def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPos
 
 def _alternatives(
     curve: StiffnessCurve, data: LoadDisplacementData, prior: GaussianPrior
-) -> tuple[Alternative, ...]:
+) -> dict[str, ScalarPosterior]:
     """Return the posterior under other assumptions, but for those that lead out of the curve's range."""
-    half_width = HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3
     assumptions: tuple[tuple[str, Measure, float], ...] = (
-        ("prior flat in the true load", "load", 0.0),
-        ("density of the ratio (the particle filter with unlimited samples)", "ratio", 0.0),
-        (
-            f"a zero offset of ±{half_width:.2g} mm shared by each run",
-            "displacement",
-            data.displacement_standard_deviation,
-        ),
+        ("flat in load", "load", 0.0),
+        ("ratio", "ratio", 0.0),  # what the particle filter tends to
+        ("zero offsets", "displacement", data.displacement_standard_deviation),  # that each run shares
     )
-    found = []
+    found = {}
     for name, measure, offset in assumptions:
-        try:
-            posterior = exact_posterior(
+        with suppress(OutsideValidityError):
+            found[name] = exact_posterior(
                 data, curve=curve, prior=prior, measure=measure, zero_offset_standard_deviation=offset
             )
-        except OutsideValidityError:
-            continue
-        found.append(Alternative(name, posterior.mean, posterior.standard_deviation))
-    return tuple(found)
+    return found

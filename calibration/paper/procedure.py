@@ -5,7 +5,7 @@ the measured ones, under the weighed total; eq. (25): the Rayleigh coefficients 
 measured damping ratios through eq. (18).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from calibration.dynamics.records import STEP_FOLDER
-from calibration.errors import ExperimentDataError, MassConstraintError, OutsideValidityError
-from calibration.joint.inference import servo_range
-from calibration.joint.measurement import ModalMeasurement
-from calibration.joint.prior import TOTAL_MASS
-from calibration.lab_folder import LAB_ERRORS, find_lab_file
+from calibration.errors import ExperimentDataError, MassConstraintError
+from calibration.joint.measurement import MODAL
+from calibration.joint.posterior import servo_range
+from calibration.lab_folder import lab_table
+from calibration.result.record import Reading
 from fe.runtime.modal_system import rayleigh_coefficients
-from fe.runtime.reduced import ReducedModel
-from reporting.table_file import read_table
 
 RESULTS_FILE = "massoptimizationresults.csv"
 """The authors' masses and frequencies for each of their samples of e."""
@@ -33,8 +31,8 @@ _RESULT_COLUMNS = (
 
 FloatArray = NDArray[np.float64]
 
-FrequencyModel = Callable[[float, float, float], tuple[float, float]]
-"""(e, servo mass [kg], pitot mass [kg]) to the natural frequencies of the two flapwise modes [Hz]."""
+FrequencyModel = Callable[[FloatArray], FloatArray]
+"""Rows of e, servo and pitot mass [kg] (N, 3) to the frequencies of the two flapwise modes (N, 2) [Hz]."""
 
 
 class PaperSamples(NamedTuple):
@@ -44,45 +42,11 @@ class PaperSamples(NamedTuple):
     frequency: FloatArray
 
 
-def calibrate_dynamics(
-    model: ReducedModel,
-    young_modulus_factor: FloatArray,
-    modal: ModalMeasurement,
-    *,
-    total_mass: float = TOTAL_MASS,
-) -> PaperSamples:
-    """Calibrate masses and damping on a reduced model; its flapwise modes are followed by their shape.
-
-    Raises
-    ------
-    MassConstraintError, ExperimentDataError
-        See `fit_masses`.
-    OutsideValidityError
-        If a sample of e lies outside the range of the model.
-    """
-    lower, upper = model.validity["young_modulus_factor"]
-    outside = young_modulus_factor[~((young_modulus_factor >= lower) & (young_modulus_factor <= upper))]
-    if outside.size:
-        raise OutsideValidityError(
-            f"a sample of e is {outside[0]:g}, but the model holds for {lower:g} to {upper:g}; build one "
-            "with a wider range."
-        )
-
-    def frequencies(factor: float, servo: float, pitot: float) -> tuple[float, float]:
-        modes = model.modes(young_modulus_factor=factor, servo_mass=servo, pitot_mass=pitot)
-        first, second = modes.frequency[list(modes.followed)].tolist()
-        return first, second
-
-    return fit_masses(frequencies, young_modulus_factor, model.validity, modal, total_mass=total_mass)
-
-
 def fit_masses(
     frequencies: FrequencyModel,
     young_modulus_factor: FloatArray,
     validity: Mapping[str, tuple[float, float]],
-    modal: ModalMeasurement,
-    *,
-    total_mass: float = TOTAL_MASS,
+    readings: Sequence[Reading],
 ) -> PaperSamples:
     """Find masses under the weighed total, then damping, for each sample of e.
 
@@ -92,15 +56,13 @@ def fit_masses(
     Parameters
     ----------
     frequencies : callable
-        Of a model.
+        Of a model, such as `WingTable.frequency`.
     young_modulus_factor : (N,) array
         Samples of e [1].
     validity : mapping of str to (float, float)
         Range of the masses for which the model may be asked [kg].
-    modal : ModalMeasurement
-        What was measured.
-    total_mass : float
-        2 m_servo + m_pitot [kg].
+    readings : sequence of Reading
+        The weighed mass and both modes.
 
     Raises
     ------
@@ -108,15 +70,18 @@ def fit_masses(
         If no masses within the range keep the total, or the best lie at the limit of the range.
     ExperimentDataError
         If the damping ratios need a negative Rayleigh coefficient.
+    OutsideValidityError
+        If a sample of e lies outside the range of the model.
     """
+    measured = {item.name: item.value for item in readings}
+    total_mass, wanted = measured["weighed_mass"], np.array([measured[name] for name in MODAL[:2]])
     lower, upper = servo_range(validity, total_mass)
-    wanted = modal.frequency
     samples, pairs = [], []
     for factor in young_modulus_factor.tolist():
 
         def error(mass: float, factor: float = factor) -> float:
-            first, second = frequencies(factor, mass, total_mass - 2.0 * mass)
-            return 0.5 * (abs(first / wanted[0] - 1.0) + abs(second / wanted[1] - 1.0))
+            found = frequencies(np.array([[factor, mass, total_mass - 2.0 * mass]]))[0]
+            return 0.5 * float(np.abs(found / wanted - 1.0).sum())
 
         servo = float(
             minimize_scalar(error, bounds=(lower, upper), method="bounded", options={"xatol": 1e-9}).x
@@ -127,9 +92,10 @@ def fit_masses(
                 f"limit of the model, {servo:.4g} kg for a servo under a total of {total_mass:g} kg; check "
                 "the measured frequencies and the total."
             )
-        pitot = total_mass - 2.0 * servo
-        pairs.append(frequencies(factor, servo, pitot))
-        samples.append((factor, servo, pitot, *damping_coefficients(pairs[-1], modal.damping_ratio)))
+        masses = factor, servo, total_mass - 2.0 * servo
+        pairs.append(frequencies(np.array([masses]))[0])
+        ratios = measured[MODAL[2]], measured[MODAL[3]]
+        samples.append((*masses, *damping_coefficients(tuple(pairs[-1].tolist()), ratios)))
     return PaperSamples(np.array(samples), np.array(pairs))
 
 
@@ -168,7 +134,7 @@ def read_published_results(path: Path) -> PaperSamples:
     ExperimentDataError
         If a value is not positive and finite.
     """
-    table = read_table(find_lab_file(Path(path), STEP_FOLDER / RESULTS_FILE), LAB_ERRORS)
+    table = lab_table(path, STEP_FOLDER / RESULTS_FILE)
     columns = np.array([table.positive_numbers(name, "the authors' step 3") for name in _RESULT_COLUMNS])
     first, second = columns[5:7, 0].tolist()
     pairs = columns[3:5].T

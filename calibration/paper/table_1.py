@@ -1,13 +1,12 @@
 """Table 1 of the paper with our figures beside it: prior and posterior of the whole digital state."""
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 from calibration.paper.particle_filter import ParticlePosterior
 from calibration.result.record import Calibration
 from reporting.files import atomic_write_text
+from reporting.table_file import table_text
 
 PAPER_MEAN, PAPER_STANDARD_DEVIATION = 1.0073, 0.0103
 """Posterior of e in the paper (Kapteyn et al. 2021, Table 1)."""
@@ -16,6 +15,11 @@ PRINTED = "Kapteyn et al. 2021, Table 1"
 SAMPLES = "the authors' published samples (step 3), mean over 100"
 EQ_25 = "the authors' published frequencies (step 3) by eq. (25), mean over 100"
 
+_CSV_COLUMNS = (
+    "figure", "prior_mean", "prior_standard_deviation", "mean", "standard_deviation",
+    "paper_procedure_mean", "paper_procedure_standard_deviation", "paper_mean", "paper_standard_deviation",
+    "difference", "paper_procedure_difference", "source_of_the_papers",
+)  # fmt: skip
 HEADINGS = ("figure", "prior", "this wing", "the paper's procedure", "in the paper", "difference")
 
 
@@ -81,14 +85,9 @@ class TableRow:
     paper: PaperFigure
 
     @property
-    def difference(self) -> float:
-        """The mean of the kept samples less the paper's."""
-        return self.found[0] - self.paper.mean
-
-    @property
-    def paper_way_difference(self) -> float:
-        """The mean by the paper's own procedure less the paper's."""
-        return self.paper_way[0] - self.paper.mean
+    def differences(self) -> tuple[float, float]:
+        """The means of the kept samples and by the paper's own procedure, less the paper's."""
+        return self.found[0] - self.paper.mean, self.paper_way[0] - self.paper.mean
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -98,7 +97,7 @@ class TableRow:
             f"{paper.title}, {paper.unit}" if paper.unit else paper.title,
             *(paper.printed(*pair) for pair in (self.prior, self.found, self.paper_way)),
             paper.printed(paper.mean, paper.standard_deviation),
-            paper.printed(self.difference, sign="+"),
+            paper.printed(self.differences[0], sign="+"),
         )
 
 
@@ -132,19 +131,13 @@ def write_table_1(rows: tuple[TableRow, ...], path: Path) -> Path:
     reporting.errors.FileNotWrittenError
         If the file cannot be written.
     """
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(
-        ("figure", "prior_mean", "prior_standard_deviation", "mean", "standard_deviation",
-         "paper_procedure_mean", "paper_procedure_standard_deviation", "paper_mean",
-         "paper_standard_deviation", "difference", "paper_procedure_difference", "source_of_the_papers")
-    )  # fmt: skip
+    columns: list[list[str]] = [[] for _ in _CSV_COLUMNS]
     for row in rows:
         paper = row.paper
-        figures = (
-            *row.prior, *row.found, *row.paper_way, paper.mean, paper.standard_deviation,
-            row.difference, row.paper_way_difference,
+        values = (
+            *row.prior, *row.found, *row.paper_way, paper.mean, paper.standard_deviation, *row.differences,
         )  # fmt: skip
-        numbers = ["" if value is None else f"{value:.10g}" for value in figures]
-        table.writerow([row.name, *numbers, paper.source])
-    return atomic_write_text(path, text.getvalue())
+        numbers = ["" if value is None else f"{value:.10g}" for value in values]
+        for column, cell in zip(columns, (row.name, *numbers, paper.source), strict=True):
+            column.append(cell)
+    return atomic_write_text(path, table_text(_CSV_COLUMNS, columns))

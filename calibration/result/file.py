@@ -8,44 +8,36 @@ provenance and, of a wing, its tailored design.
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from calibration.errors import CalibrationError, CalibrationRecordError
-from calibration.result.record import (
-    FROM_CAMPAIGN,
-    FROM_LABORATORY,
-    CalibratedFigure,
-    Calibration,
-    ChannelFit,
-    ParameterPrior,
-    Reading,
-)
-from fe.runtime.errors import InvalidDesignError
-from fe.wing.design import parse_design
+from calibration.result.record import FROM_CAMPAIGN, FROM_LABORATORY, Calibration
 from reporting.errors import DamagedFileError, FileNotWrittenError
 from reporting.files import atomic_write_bytes
 from reporting.netcdf import read_groups
-from reporting.record_json import record_of
+from reporting.words import one_line
 
 FILE_NAME = "calibration.nc"
 SCHEMA = "uav-twin calibration 2"
 """Value of the attribute `schema` of the root."""
 
 _HASH = "content_sha256"
-_LISTS = {
-    "priors": ParameterPrior,
-    "quantities": CalibratedFigure,
-    "readings": Reading,
-    "channels": ChannelFit,
+_WORDS = ("asset", "model", "model_hash", "design_hash", "procedure", "source", "seed")
+_IN_GROUPS = ("samples", "prior_samples", "measured")
+_AS_JSON = {
+    item.name: TypeAdapter(get_type_hints(Calibration)[item.name])
+    for item in fields(Calibration)
+    if item.name not in (*_WORDS, *_IN_GROUPS)
 }
-"""Fields of a calibration that are records, kept as JSON."""
+"""What writes and reads the fields of a calibration that are no words, no seed and no array."""
 
 Groups = Mapping[str, xr.Dataset]
 Root = Mapping[str, Any]
@@ -69,24 +61,18 @@ def result_bytes(calibration: Calibration) -> bytes:
         "posterior": _samples(calibration, calibration.samples, "posterior sample"),
         "observed_data": calibration.measured,
     }
-    design = calibration.design
     root = {
         "schema": SCHEMA,
         "title": f"Calibration of {calibration.asset}",
         **{name: getattr(calibration, name) for name in _WORDS},
-        "seed": calibration.seed,
-        **{name: _json([asdict(item) for item in getattr(calibration, name)]) for name in _LISTS},
-        "explained": _json(calibration.explained),
-        "findings": _json(list(calibration.findings)),
-        "provenance": _json(dict(calibration.provenance)),
-        "design": _json(None if design is None else design.model_dump(mode="json")),
+        **{
+            name: _json(adapter.dump_python(getattr(calibration, name), mode="json"))
+            for name, adapter in _AS_JSON.items()
+        },
     }
     attributes = {**root, _HASH: _content_hash(groups, root)}
     tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **groups})
     return bytes(tree.to_netcdf(engine="h5netcdf"))
-
-
-_WORDS = ("asset", "model", "model_hash", "design_hash", "procedure", "source")
 
 
 def _samples(calibration: Calibration, values: NDArray[np.float64], what: str) -> xr.Dataset:
@@ -122,10 +108,10 @@ def load_calibration(path: Path | str) -> Calibration:
         if root[_HASH] != _content_hash(groups, root):
             raise CalibrationRecordError("its content does not match its hash")
         return _calibration(groups, root)
-    except (CalibrationError, InvalidDesignError) as error:
+    except CalibrationError as error:
         reason = str(error).rstrip(".")
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
-        reason = f"{type(error).__name__}: {error}"
+        reason = f"{type(error).__name__}: {one_line(error)}"
     raise CalibrationRecordError(f"{path} is damaged ({reason}); calibrate again.")
 
 
@@ -159,26 +145,13 @@ def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
 
 
 def _calibration(groups: Groups, root: Root) -> Calibration:
-    design = json.loads(root["design"])
-    lists: dict[str, Any] = {
-        name: tuple(record_of(kind, item) for item in json.loads(root[name])) for name, kind in _LISTS.items()
-    }
-    names = [item.name for item in (*lists["priors"], *lists["quantities"])]
+    head: dict[str, Any] = {name: adapter.validate_json(root[name]) for name, adapter in _AS_JSON.items()}
+    names = [item.name for item in (*head["priors"], *head["quantities"])]
     samples, prior = (
         np.column_stack([groups[group][name].values[0] for name in names]) for group in ("posterior", "prior")
     )
-    found = Calibration(
-        **{name: root[name] for name in _WORDS},
-        **lists,
-        seed=int(root["seed"]),
-        samples=samples,
-        prior_samples=prior,
-        explained=json.loads(root["explained"]),
-        findings=tuple(json.loads(root["findings"])),
-        provenance=json.loads(root["provenance"]),
-        measured=groups["observed_data"],
-        design=None if design is None else parse_design(design, "the design in it"),
-    )
+    head |= {name: root[name] for name in _WORDS} | {"seed": int(root["seed"])}
+    found = Calibration(**head, samples=samples, prior_samples=prior, measured=groups["observed_data"])
     if found.design is not None and found.design.hash != found.design_hash:
         raise CalibrationRecordError("its design does not match its hash")
     return found
@@ -217,15 +190,10 @@ def _content_hash(groups: Groups, root: Root) -> str:
     for name in sorted(set(root) - {_HASH}):
         digest.update(f"{name}\0{root[name]}\0".encode())
     for group in sorted(groups):
-        dataset = groups[group]
-        for name in sorted(str(name) for name in dataset.variables):
-            values = dataset.variables[name].values
-            kind = "f" if values.dtype.kind == "f" else "i" if values.dtype.kind in "iu" else "s"
-            digest.update(f"{group}/{name}\0{values.shape}\0{kind}\0".encode())
-            if kind == "s":
-                digest.update("\0".join(str(value) for value in values.ravel()).encode())
-            else:
-                digest.update(np.ascontiguousarray(values, "<f8" if kind == "f" else "<i8").tobytes())
-            attributes = dataset[name].attrs
-            digest.update(_json({key: str(attributes[key]) for key in attributes}).encode())
+        for label, variable in sorted(groups[group].variables.items(), key=lambda item: str(item[0])):
+            values = np.asarray(variable.values)
+            kind = "f" if values.dtype.kind == "f" else "i"
+            digest.update(f"{group}/{label}\0{values.shape}\0{kind}\0".encode())
+            digest.update(np.ascontiguousarray(values, "<f8" if kind == "f" else "<i8").tobytes())
+            digest.update(_json({str(key): str(value) for key, value in variable.attrs.items()}).encode())
     return digest.hexdigest()

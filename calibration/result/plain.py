@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.result.file import SCHEMA, result_bytes
-from calibration.result.record import STATE, CalibratedFigure, Calibration, moments
+from calibration.result.record import STATE, Calibration
 from fe.runtime.state import DigitalState
 from reporting.provenance import hash_bytes
 
@@ -60,26 +60,31 @@ def description(calibration: Calibration) -> str:
 
 def plain_record(calibration: Calibration) -> dict[str, Any]:
     """Return the figures of a calibration with intervals, and the correlation of its parameters."""
-    count = len(calibration.priors)
-    wing = calibration.design is not None
+    figures = {
+        figure.name: {
+            "title": figure.title,
+            "unit": figure.unit,
+            "mean": calibration.mean(figure.name),
+            "standard_deviation": calibration.standard_deviation(figure.name),
+            "interval_95": list(calibration.interval(figure.name, 0.95)),
+        }
+        for figure in calibration.figures
+    }
+    parameters = [prior.name for prior in calibration.priors]
+    quantities = [figure.name for figure in calibration.quantities]
+    words = ("asset", "procedure", "seed", "model", "design_hash")
     return {
         "schema": SCHEMA,
-        **{
-            name: getattr(calibration, name)
-            for name in ("asset", "procedure", "seed", "model", "design_hash")
-        },
+        **{name: getattr(calibration, name) for name in words},
         "samples": len(calibration.samples),
         "calibration_sha256": hash_bytes(result_bytes(calibration)),
-        "laboratory" if wing else "campaign": calibration.source,
+        "campaign" if calibration.design is None else "laboratory": calibration.source,
         "findings": list(calibration.findings),
-        "state": _figures(calibration, calibration.figures[:count]),
-        "quantities": _figures(calibration, calibration.quantities),
-        "correlation": {
-            "names": [prior.name for prior in calibration.priors],
-            "matrix": calibration.correlation.tolist(),
-        },
+        "state": {name: figures[name] for name in parameters},
+        "quantities": {name: figures[name] for name in quantities},
+        "correlation": {"names": parameters, "matrix": calibration.correlation.tolist()},
         # JSON is written with sorted keys, and pages list the quantities in the order of the calibration
-        "names": {"quantities": [figure.name for figure in calibration.quantities]},
+        "names": {"quantities": quantities},
     }
 
 
@@ -87,13 +92,8 @@ def run_record(calibration: Calibration, parameter: str) -> dict[str, Any]:
     """Return what `calibration.json` of a run folder holds, with the parameter that the twin draws."""
     mean, deviation = calibration.prior_moments(parameter)
     prior: dict[str, Any] = {"mean": mean, "standard_deviation": deviation}
-    for item in calibration.priors:
-        if item.name == parameter:
-            prior = {
-                "mean": item.mean,
-                "standard_deviation": item.deviation,
-                "range": [item.low, item.high],
-            }
+    for item in (item for item in calibration.priors if item.name == parameter):
+        prior = {"mean": item.mean, "standard_deviation": item.deviation, "range": [item.low, item.high]}
     measured = calibration.measured
     return {
         **plain_record(calibration),
@@ -102,20 +102,6 @@ def run_record(calibration: Calibration, parameter: str) -> dict[str, Any]:
         "posterior": _density(calibration.draws_of(parameter)),
         "data": {str(name): measured[name].values.tolist() for name in measured},
     }
-
-
-def _figures(calibration: Calibration, figures: tuple[CalibratedFigure, ...]) -> dict[str, Any]:
-    found = {}
-    for figure in figures:
-        mean, deviation = moments(calibration.draws_of(figure.name))
-        found[figure.name] = {
-            "title": figure.title,
-            "unit": figure.unit,
-            "mean": mean,
-            "standard_deviation": deviation,
-            "interval_95": list(calibration.interval(figure.name, 0.95)),
-        }
-    return found
 
 
 def _density(values: NDArray[np.float64]) -> dict[str, list[float]]:

@@ -1,6 +1,5 @@
 """The static load experiment: tip loads and tip displacements, published or read from the authors' folder."""
 
-import hashlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError
-from calibration.lab_folder import LAB_ERRORS, find_lab_file
-from reporting.table_file import read_table
+from calibration.lab_folder import lab_table
+from reporting.provenance import hash_record
 
 STANDARD_GRAVITY = 9.81
 """Gravity by which the authors turn a mass on the scale into a load [m/s^2]."""
@@ -113,12 +112,9 @@ class LoadDisplacementData:
     @property
     def sha256(self) -> str:
         """Hash of the figures and their uncertainty (not of `source`), the same on every platform."""
-        columns = zip(self.load.tolist(), self.displacement.tolist(), self.run.tolist(), strict=True)
-        lines = [f"{load!r},{displacement!r},{run}" for load, displacement, run in columns]
-        lines.append(
-            f"{float(self.load_standard_deviation)!r},{float(self.displacement_standard_deviation)!r}"
-        )
-        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+        deviations = self.load_standard_deviation, self.displacement_standard_deviation
+        columns = self.load, self.displacement, self.run
+        return hash_record([*map(float, deviations), *(column.tolist() for column in columns)])
 
 
 def published_measurements() -> LoadDisplacementData:
@@ -155,10 +151,9 @@ def read_measurements(path: Path) -> LoadDisplacementData:
     ExperimentDataError
         If a value is not positive and finite, or load over displacement shows other units.
     """
-    file = find_lab_file(Path(path), MEASUREMENTS_FILE)
-    table = read_table(file, LAB_ERRORS)
+    table = lab_table(path, MEASUREMENTS_FILE)
     load, displacement = (table.positive_numbers(name, "a load test") for name in ("load", "displacement"))
-    _refuse_other_units(file, load, displacement)
+    _refuse_other_units(table.name, load, displacement)
     run = np.concatenate([[0], np.cumsum(np.diff(load) < 0.0)])
     rest = [table.columns[name] for name in table.columns if name not in ("load", "displacement")]
     table.refuse_repeated(
@@ -166,10 +161,12 @@ def read_measurements(path: Path) -> LoadDisplacementData:
         "row",
         "leave one out, or number repeated readings in a further column",
     )
-    return LoadDisplacementData(load=load, displacement=displacement * 1e-3, run=run, source=file.name)
+    return LoadDisplacementData(
+        load=load, displacement=displacement * 1e-3, run=run, source=Path(table.name).name
+    )
 
 
-def _refuse_other_units(file: Path, load: NDArray[np.float64], displacement_mm: NDArray[np.float64]) -> None:
+def _refuse_other_units(file: str, load: NDArray[np.float64], displacement_mm: NDArray[np.float64]) -> None:
     stiffness = float(np.median(load / displacement_mm))  # N/mm
     expected = EXPECTED_TIP_STIFFNESS * 1e-3
     ratio = stiffness / expected

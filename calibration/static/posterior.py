@@ -34,9 +34,6 @@ def check_count(count: int, error: type[Exception], *, most: int = MOST_SAMPLES)
         raise error(f"at most {most:,} samples can be drawn at once, but {count:,} were asked for.")
 
 
-_NORMALISED = 1e-12
-
-
 @dataclass(frozen=True)
 class GaussianPrior:
     """A Gaussian prior; by default that of the paper, e ~ N(1, (0.05 / 1.96)^2).
@@ -78,7 +75,7 @@ class GaussianPrior:
 
 @dataclass(frozen=True, eq=False)
 class ScalarPosterior:
-    """p(value | measurements) on a grid; the density is linear between grid points and zero outside.
+    """p(value | measurements) on a grid; the density is zero outside, and within a cell its mean.
 
     Attributes
     ----------
@@ -102,44 +99,32 @@ class ScalarPosterior:
     _cumulative: NDArray[np.float64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        grid = np.array(self.grid, dtype=float)
-        density = np.array(self.density, dtype=float)
-        if grid.ndim != 1 or grid.size < 3 or grid.shape != density.shape:
+        grid, density = np.array(self.grid, dtype=float), np.array(self.density, dtype=float)
+        good = grid.ndim == 1 and grid.size > 2 and grid.shape == density.shape
+        good = good and bool(np.all(np.isfinite(grid)) and np.all(np.diff(grid) > 0.0))
+        if not (good and np.all(np.isfinite(density)) and density.min() >= 0.0 and density.max() > 0.0):
             raise PosteriorError(
-                "a posterior needs a grid and a density of one length with at least three points, but their "
-                f"shapes are {grid.shape} and {density.shape}."
+                "a posterior needs a grid of three finite values or more that ascend, and a density that "
+                f"is finite, not negative, and positive somewhere; {grid.shape} and {density.shape} came."
             )
-        if not np.all(np.isfinite(grid)) or np.any(np.diff(grid) <= 0.0):
-            raise PosteriorError("the grid of a posterior must be finite and ascend.")
-        if not np.all(np.isfinite(density)) or np.any(density < 0.0) or not np.any(density > 0.0):
-            raise PosteriorError(
-                "the density of a posterior must be finite, not negative, and positive somewhere."
-            )
-        integral = float(np.trapezoid(density / density.max(), grid)) * float(density.max())
-        if abs(integral - 1.0) > _NORMALISED:  # so that a stored posterior comes back bit for bit
-            density /= density.max()  # guards the integral against overflow
-            density /= np.trapezoid(density, grid)
+        density /= density.max()  # guards the integral against overflow
+        density /= np.trapezoid(density, grid)
         cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(grid))])
-        cumulative /= cumulative[-1]
-        for array in (grid, density, cumulative):
-            array.setflags(write=False)
-        object.__setattr__(self, "grid", grid)
-        object.__setattr__(self, "density", density)
-        object.__setattr__(self, "_cumulative", cumulative)
-        if math.isnan(self.mean):
-            object.__setattr__(self, "mean", float(np.trapezoid(density * grid, grid)))
-        if math.isnan(self.standard_deviation):
-            variance = float(np.trapezoid(density * (grid - self.mean) ** 2, grid))
-            object.__setattr__(self, "standard_deviation", math.sqrt(variance))
+        mean = float(np.trapezoid(density * grid, grid)) if math.isnan(self.mean) else self.mean
+        variance = float(np.trapezoid(density * (grid - mean) ** 2, grid))
+        given = self.standard_deviation
+        found = {
+            "grid": grid, "density": density, "_cumulative": cumulative / cumulative[-1], "mean": mean,
+            "standard_deviation": math.sqrt(variance) if math.isnan(given) else given,
+        }  # fmt: skip
+        for name, value in found.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(self, name, value)
 
     def cumulative(self, value: ArrayLike) -> NDArray[np.float64]:
-        """Return the distribution function, elementwise (exact for the piecewise linear density)."""
-        inside = np.clip(np.asarray(value, dtype=float), self.grid[0], self.grid[-1])
-        cell = np.clip(np.searchsorted(self.grid, inside, side="right") - 1, 0, self.grid.size - 2)
-        step = inside - self.grid[cell]
-        left = self.density[cell]
-        gradient = (self.density[cell + 1] - left) / (self.grid[cell + 1] - self.grid[cell])
-        return np.asarray(np.clip(self._cumulative[cell] + step * (left + 0.5 * gradient * step), 0.0, 1.0))
+        """Return the distribution function, elementwise."""
+        return np.asarray(np.interp(np.asarray(value, dtype=float), self.grid, self._cumulative))
 
     def quantile(self, probability: ArrayLike) -> NDArray[np.float64]:
         """Return quantiles, elementwise: the inverse of `cumulative`.
@@ -152,14 +137,7 @@ class ScalarPosterior:
         wanted = np.asarray(probability, dtype=float)
         if not np.all((wanted >= 0.0) & (wanted <= 1.0)):
             raise PosteriorError("a quantile needs probabilities from 0 to 1.")
-        cell = np.clip(np.searchsorted(self._cumulative, wanted, side="right") - 1, 0, self.grid.size - 2)
-        width = self.grid[cell + 1] - self.grid[cell]
-        left = self.density[cell]
-        gradient = (self.density[cell + 1] - left) / width
-        rest = np.maximum(wanted - self._cumulative[cell], 0.0)
-        root = left + np.sqrt(np.maximum(left**2 + 2.0 * gradient * rest, 0.0))
-        step = np.divide(2.0 * rest, root, out=np.zeros_like(root), where=root > 0.0)
-        return np.asarray(self.grid[cell] + np.minimum(step, width))
+        return np.asarray(np.interp(wanted, self._cumulative, self.grid))
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
         """Return the central interval that holds `probability`."""

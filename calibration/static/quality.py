@@ -1,13 +1,11 @@
 """How well one stiffness explains the measured pairs, run by run."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincc
 
 from .errors_in_variables import residual_variance
 from .experiments import LoadDisplacementData
@@ -16,113 +14,46 @@ NOTICEABLE_SCORE = 2.0
 """Standard deviations from which a difference between runs, or a pair, is pointed out."""
 
 
-@dataclass(frozen=True)
-class RunFit:
-    """One loading run against the calibrated stiffness.
-
-    Attributes
-    ----------
-    run : int
-        Index of the run.
-    count : int
-        Number of its pairs.
-    offset, offset_standard_deviation : float
-        Mean of x - f / k over the run at the calibrated stiffness k, and its standard deviation [m].
-    """
-
-    run: int
-    count: int
-    offset: float
-    offset_standard_deviation: float
-
-
-@dataclass(frozen=True, eq=False)
-class FitQuality:
+class FitQuality(NamedTuple):
     """Residuals of the measured pairs at one stiffness.
 
     Attributes
     ----------
-    stiffness : float
-        The stiffness judged: k at the exact posterior's mean of e [N/m].
-    displacement_residual : (N,) array
-        x - f / k [m].
     standardised_residual : (N,) array
         (k x - f) / sqrt(R_f + k^2 R_x) [1]; positive where the wing bends more than the model.
-    chi_square : float
-        Sum of their squares.
-    degrees_of_freedom : int
-        Number of pairs less one, for the one fitted factor.
-    tail_probability : float
-        Probability that chi-square with these degrees of freedom is larger; NaN without any.
-    runs : tuple of RunFit
-        The loading runs.
     remarks : tuple of str
         Sentences on what disagrees; empty if nothing does.
     """
 
-    stiffness: float
-    displacement_residual: NDArray[np.float64]
     standardised_residual: NDArray[np.float64]
-    chi_square: float
-    degrees_of_freedom: int
-    tail_probability: float
-    runs: tuple[RunFit, ...]
     remarks: tuple[str, ...]
 
 
 def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
-    """Judge the measured pairs at one stiffness [N/m].
-
-    Parameters
-    ----------
-    data : LoadDisplacementData
-        The measured pairs.
-    stiffness : float
-        The calibrated tip stiffness [N/m].
-    """
+    """Judge the measured pairs, run by run, at one stiffness [N/m]."""
     scatter = math.sqrt(float(residual_variance(data, stiffness)))
     residual = data.displacement - data.load / stiffness
     standardised = residual * stiffness / scatter
-    chi_square = float(np.sum(standardised**2))
-    degrees = data.count - 1
     runs = []
     for index in data.run_indices:
         of_run = residual[data.run == index]
-        error = scatter / stiffness / math.sqrt(of_run.size)
-        runs.append(RunFit(index, of_run.size, float(of_run.mean()), error))
-    return FitQuality(
-        stiffness=stiffness,
-        displacement_residual=residual,
-        standardised_residual=standardised,
-        chi_square=chi_square,
-        degrees_of_freedom=degrees,
-        tail_probability=float(gammaincc(0.5 * degrees, 0.5 * chi_square)) if degrees else math.nan,
-        runs=tuple(runs),
-        remarks=tuple(_remarks(data, standardised, runs)),
-    )
-
-
-def _remarks(
-    data: LoadDisplacementData, standardised: NDArray[np.float64], runs: Sequence[RunFit]
-) -> list[str]:
+        runs.append((index + 1, float(of_run.mean()), scatter / stiffness / math.sqrt(of_run.size)))
     remarks = []
-    for first, second in pairwise(runs):
-        difference = first.offset - second.offset
-        deviation = math.hypot(first.offset_standard_deviation, second.offset_standard_deviation)
-        if abs(difference) > NOTICEABLE_SCORE * deviation:
+    for (first, offset, error), (second, other, other_error) in pairwise(runs):
+        difference, deviation = abs(offset - other), math.hypot(error, other_error)
+        if difference > NOTICEABLE_SCORE * deviation:
             remarks.append(
-                f"Loading runs {first.run + 1} and {second.run + 1} differ by {abs(difference) * 1e3:.2f} mm "
-                f"({abs(difference) / deviation:.1f} standard deviations): their offsets are "
-                f"{_signed(first.offset * 1e3)} mm and {_signed(second.offset * 1e3)} mm, as if the zero of "
+                f"Loading runs {first} and {second} differ by {difference * 1e3:.2f} mm "
+                f"({difference / deviation:.1f} standard deviations): their offsets are "
+                f"{_signed(offset * 1e3)} mm and {_signed(other * 1e3)} mm, as if the zero of "
                 "the displacement had moved between them."
             )
-    large = np.flatnonzero(np.abs(standardised) > NOTICEABLE_SCORE)
     remarks.extend(
         f"Pair {pair + 1} ({data.load[pair]:.3g} N, {data.displacement[pair] * 1e3:.3g} mm) lies "
         f"{abs(standardised[pair]):.1f} standard deviations from the calibrated line."
-        for pair in large
+        for pair in np.flatnonzero(np.abs(standardised) > NOTICEABLE_SCORE)
     )
-    return remarks
+    return FitQuality(standardised, tuple(remarks))
 
 
 def _signed(value: float) -> str:

@@ -14,7 +14,7 @@ TABLE_TOLERANCE = 1e-7
 """Largest relative error of a curve between the nodes at which a model was asked."""
 
 _INVERSE_TABLE_SIZE = 4001
-_DEGREES = (8, 16, 32, 64)
+_DEGREE = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class TipStiffnessModel(Protocol):
 def stiffness_curve_of(model: TipStiffnessModel, name: str = "finite element model") -> StiffnessCurve:
     """Return the tip stiffness of a structural model over its range of e.
 
-    The degree grows until the polynomial meets the model between its nodes within `TABLE_TOLERANCE`.
+    A polynomial must meet the model between its nodes within `TABLE_TOLERANCE`.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def stiffness_curve_of(model: TipStiffnessModel, name: str = "finite element mod
     Raises
     ------
     StiffnessCurveError
-        If the curve is not positive and rising, or too rough for a polynomial of degree 64.
+        If the curve is not positive and rising, or too rough for a polynomial.
     """
     lower, upper = getattr(model, "validity", {}).get("young_modulus_factor", (0.9, 1.1))
     if not 0.0 < lower < upper < math.inf:
@@ -129,14 +129,12 @@ def stiffness_curve_of(model: TipStiffnessModel, name: str = "finite element mod
     def stiffness(factors: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array([model.tip_stiffness(float(factor)) for factor in factors])
 
-    error = math.inf
-    for degree in _DEGREES:
-        polynomial = Chebyshev.interpolate(stiffness, degree, domain=(lower, upper))
-        between = np.linspace(lower, upper, degree + 2)
-        error = float(np.max(np.abs(polynomial(between) / stiffness(between) - 1.0)))
-        if error <= TABLE_TOLERANCE:
-            return StiffnessCurve(polynomial, name)
-    raise StiffnessCurveError(
-        f"the tip stiffness of {name} over e in [{lower:g}, {upper:g}] is too rough for a polynomial: the "
-        f"relative error is {error:.1g} at degree {_DEGREES[-1]}."
-    )
+    polynomial = Chebyshev.interpolate(stiffness, _DEGREE, domain=(lower, upper))
+    between = np.linspace(lower, upper, 2 * _DEGREE)
+    error = float(np.max(np.abs(polynomial(between) / stiffness(between) - 1.0)))
+    if error > TABLE_TOLERANCE:
+        raise StiffnessCurveError(
+            f"the tip stiffness of {name} over e in [{lower:g}, {upper:g}] is too rough for a polynomial: "
+            f"the relative error is {error:.1g} at degree {_DEGREE}."
+        )
+    return StiffnessCurve(polynomial, name)

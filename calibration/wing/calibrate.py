@@ -9,36 +9,27 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from calibration.errors import OutsideValidityError
 from calibration.geometry import GeometryCalibration, tailored_design
-from calibration.joint.inference import joint_posterior
-from calibration.joint.measurement import (
-    ModalMeasurement,
-    modal_measurement,
-    published_modal_measurement,
-)
+from calibration.joint.posterior import joint_posterior
 from calibration.joint.prior import wing_priors
+from calibration.joint.wing_table import QUANTITIES, tabulate_wing
 from calibration.paper.load_test import StaticCalibration, calibrate_static
-from calibration.paper.procedure import calibrate_dynamics
+from calibration.paper.procedure import fit_masses
 from calibration.paper.table_1 import TableRow, table_1
 from calibration.result.file import save_calibration
 from calibration.result.record import (
-    STATE,
-    CalibratedFigure,
     Calibration,
     ChannelFit,
-    ParameterPrior,
     Procedure,
     Reading,
     check_name,
     prior_samples,
 )
-from calibration.static.experiments import HALF_WIDTH_95, LoadDisplacementData
+from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import child_seed
 from calibration.static.quality import assess_fit
-from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of
+from calibration.static.stiffness_curve import PUBLISHED_LINE
 from fe.reduction.model_cache import reduced_model
-from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress, SilentProgress
@@ -48,16 +39,6 @@ from .disagreements import disagreements
 from .lab_data import LabData, published_data, read_lab_folder
 
 Float = NDArray[np.float64]
-
-QUANTITIES = (
-    CalibratedFigure("tip_stiffness", "N/m", "tip stiffness"),
-    CalibratedFigure("frequency_1", "Hz", "natural frequency of the first flapwise bending mode"),
-    CalibratedFigure("frequency_2", "Hz", "natural frequency of the second flapwise bending mode"),
-    CalibratedFigure("damping_ratio_1", "1", "damping ratio of the first flapwise bending mode"),
-    CalibratedFigure("damping_ratio_2", "1", "damping ratio of the second flapwise bending mode"),
-    CalibratedFigure("weighed_mass", "kg", "mass of two servos and the pitot tube"),
-)
-"""Quantities of interest of a calibrated wing."""
 
 SAMPLE_COUNT = 1000
 """Samples of the joint posterior that a calibration keeps."""
@@ -150,20 +131,17 @@ def calibrate_wing(
     tailored = tailored_design(drawn, lab.lengths)
     model = reduced_model(tailored, progress=progress)
     with progress.stage("Step 2: Young's modulus factor"):
-        curve = stiffness_curve_of(model, "tip stiffness of the tailored model")
-        static = calibrate_static(curve, lab.pairs, seed)
+        table = tabulate_wing(model)
+        static = calibrate_static(table.stiffness, lab.pairs, seed)
         published = calibrate_static(PUBLISHED_LINE, lab.pairs, seed)
-    modal = published_modal_measurement() if lab.trials is None else modal_measurement(lab.trials)
     with progress.stage("Step 3: masses and damping, the paper's procedure"):
         factors = static.exact.samples(child_seed(seed, _PAPER_PURPOSE), PAPER_SAMPLE_COUNT, stratified=True)
-        paper = calibrate_dynamics(model, factors, modal, total_mass=lab.total_mass.mass)
+        paper = fit_masses(table.frequency, factors, table.validity, lab.readings)
     with progress.stage("Step 3: masses and damping, joint posterior"):
-        joint = joint_posterior(
-            model, lab.pairs, modal, total_mass=lab.total_mass, seed=seed, count=SAMPLE_COUNT
-        )
-    priors = (*wing_priors(model.validity), *_length_priors(lab.lengths))
+        joint = joint_posterior(table, lab.pairs, lab.readings, seed=seed, count=SAMPLE_COUNT)
+    priors = (*wing_priors(model.validity), *(length.prior for length in lab.lengths.lengths))
     prior = prior_samples(priors, SAMPLE_COUNT, seed)
-    prior = np.column_stack([prior, quantities_of(model, prior)])
+    prior = np.column_stack([prior, table.outputs(prior)])
 
     def record(way: Procedure, state: Float) -> Calibration:
         lengths = _lengths(lab.lengths, len(state), seed)
@@ -173,17 +151,17 @@ def calibrate_wing(
             model_hash=tailored.hash,
             procedure=way,
             priors=priors,
-            samples=np.column_stack([state, lengths, quantities_of(model, state)]),
+            samples=np.column_stack([state, lengths, table.outputs(state)]),
             prior_samples=prior,
             explained=None,
             findings=(),
-            channels=(_fit(static, float(state[:, 0].mean())),),
+            channels=_fits(static, float(state[:, 0].mean())),
             source="; ".join(origin.text for origin in lab.origins),
             seed=seed,
             provenance=_provenance(lab, drawn, seed),
             design_hash=tailored.hash,
             quantities=QUANTITIES,
-            readings=_readings(lab, modal),
+            readings=_readings(lab),
             measured=_measured(lab.pairs),
             design=tailored,
         )
@@ -203,47 +181,20 @@ def _provenance(lab: LabData, drawn: WingDesign, seed: int) -> Mapping[str, Any]
     ).as_dict()
 
 
-def _fit(static: StaticCalibration, factor: float) -> ChannelFit:
-    """Return how far the load test is from the model at the prior mean of e and at a calibrated one."""
+def _fits(static: StaticCalibration, factor: float) -> tuple[ChannelFit, ...]:
+    """Return how far each loading run is from the model at the prior mean of e and at a calibrated one."""
+    data = static.data
     before, after = (
-        float(np.sqrt(np.mean(assess_fit(static.data, stiffness).standardised_residual ** 2)))
+        assess_fit(data, stiffness).standardised_residual ** 2
         for stiffness in static.curve.stiffness([static.prior.mean, factor]).tolist()
     )
-    return ChannelFit("load test", "fitted", static.data.count, before, after)
-
-
-def quantities_of(model: ReducedModel, samples: Float) -> Float:
-    """Return `QUANTITIES` of a healthy wing at samples (N, 5 or more) of `STATE`, SI.
-
-    Raises
-    ------
-    OutsideValidityError
-        If a sample lies where the model does not hold.
-    """
-    for prior, column in zip(wing_priors(model.validity)[:3], samples.T, strict=False):
-        outside = column[~((column >= prior.low) & (column <= prior.high))]
-        if outside.size:
-            unit = "" if prior.unit == "1" else f" {prior.unit}"
-            raise OutsideValidityError(
-                f"a sample of the {prior.title} is {outside[0]:.4g}{unit}, but the model holds for "
-                f"{prior.low:g} to {prior.high:g}{unit}; check the measurements."
-            )
-    found = np.empty((len(samples), len(QUANTITIES)))
-    for row, (factor, servo, pitot, alpha, beta) in enumerate(samples[:, : len(STATE)].tolist()):
-        modes = model.modes(young_modulus_factor=factor, servo_mass=servo, pitot_mass=pitot)
-        frequency = modes.frequency[list(modes.followed)]
-        ratio = rayleigh_damping_ratio(alpha, beta, frequency)
-        found[row] = model.tip_stiffness(factor), *frequency, *ratio, 2.0 * servo + pitot
-    return found
-
-
-def _length_priors(lengths: GeometryCalibration) -> tuple[ParameterPrior, ...]:
     return tuple(
-        ParameterPrior(
-            length.name, "m", length.prior.mean, length.prior.standard_deviation,
-            0.9 * length.designed, 1.1 * length.designed, "design tolerance",
+        ChannelFit(
+            f"load test, run {run + 1}", "fitted", int(of_run.sum()),
+            float(np.sqrt(before[of_run].mean())), float(np.sqrt(after[of_run].mean())),
         )
-        for length in lengths.lengths
+        for run in data.run_indices
+        for of_run in [data.run == run]
     )  # fmt: skip
 
 
@@ -256,29 +207,15 @@ def _lengths(lengths: GeometryCalibration, count: int, seed: int) -> Float:
     )
 
 
-def _readings(lab: LabData, modal: ModalMeasurement) -> tuple[Reading, ...]:
+def _readings(lab: LabData) -> tuple[Reading, ...]:
     """Return every single number that was measured."""
     pairs = lab.pairs
     # The stiffness that the pairs show by themselves: least squares through the origin.
     square = float(pairs.displacement @ pairs.displacement)
     stiffness = float(pairs.load @ pairs.displacement) / square
     scatter = np.hypot(pairs.load_standard_deviation, stiffness * pairs.displacement_standard_deviation)
-    return (
-        *(
-            Reading(length.name, "planform", length.measured, length.reading_uncertainty / HALF_WIDTH_95)
-            for length in lab.lengths.lengths
-        ),
-        Reading("tip_stiffness", "load test", stiffness, float(scatter / np.sqrt(square))),
-        Reading("weighed_mass", "weighing", *lab.total_mass),
-        *(
-            Reading(
-                f"{kind}_{mode + 1}", "ring-down",
-                getattr(modal, kind)[mode], getattr(modal, f"{kind}_standard_deviation")[mode],
-            )
-            for kind in ("frequency", "damping_ratio")
-            for mode in (0, 1)
-        ),
-    )  # fmt: skip
+    load_test = Reading("tip_stiffness", "load test", stiffness, float(scatter / np.sqrt(square)))
+    return *(length.reading for length in lab.lengths.lengths), load_test, *lab.readings
 
 
 def _measured(pairs: LoadDisplacementData) -> xr.Dataset:

@@ -1,8 +1,8 @@
 """What a lab folder holds for the three steps of the calibration, and what is published instead."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from calibration.dynamics.extremes import refine_by_extremes
 from calibration.dynamics.records import STEP_FOLDER, find_records, read_records
@@ -10,9 +10,11 @@ from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import RingDownTrials, fit_trials
 from calibration.errors import ExperimentFileError
 from calibration.geometry import GEOMETRY_FILE, GeometryCalibration, published_lengths, read_lengths
-from calibration.joint.prior import WeighedMass
-from calibration.lab_folder import places_of
+from calibration.joint.measurement import PUBLISHED_MODES, measured_modes
+from calibration.joint.prior import weighed
+from calibration.lab_folder import lab_place
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
+from calibration.result.record import Reading
 from calibration.static.experiments import (
     MEASUREMENTS_FILE,
     LoadDisplacementData,
@@ -45,8 +47,8 @@ class LabData:
         Step 1.
     pairs : LoadDisplacementData
         Step 2.
-    total_mass : WeighedMass
-        Weighed mass of two servos and the pitot tube.
+    readings : tuple of Reading
+        Weighed mass of two servos and the pitot tube, frequencies and damping ratios.
     trials : RingDownTrials or None
         Step 3, fitted; None where the published frequencies and damping ratios stand in.
     authors : PaperSamples or None
@@ -59,7 +61,7 @@ class LabData:
 
     lengths: GeometryCalibration
     pairs: LoadDisplacementData
-    total_mass: WeighedMass
+    readings: tuple[Reading, ...]
     trials: RingDownTrials | None
     authors: PaperSamples | None
     origins: tuple[StepOrigin, ...]
@@ -72,7 +74,7 @@ def published_data() -> LabData:
     return LabData(
         lengths=lengths,
         pairs=pairs,
-        total_mass=WeighedMass(),
+        readings=(weighed(), *PUBLISHED_MODES),
         trials=None,
         authors=None,
         origins=tuple(StepOrigin(step, False, text) for step, text in _PUBLISHED.items()),
@@ -109,52 +111,44 @@ def read_lab_folder(
             f"{path} is {'no folder' if path.exists() else 'not there'}; give the folder that holds "
             "step1, step2 and step3."
         )
-    steps = {step for step in (1, 2, 3) if _step_folder(path, step) is not None}
+    steps = {step for step in (1, 2, 3) if lab_place(path, Path(f"step{step}")) is not None}
     records = find_records(path)
     if not steps and not records:
         raise ExperimentFileError(
             f"{path} holds none of the folders step1, step2 and step3; give the authors' calibration folder "
             "or one laid out like it."
         )
-    published = published_data()
-    lengths, pairs, mass = published.lengths, published.pairs, published.total_mass
-    hashes = dict(published.input_hashes)
-    origins = {origin.step: origin for origin in published.origins}
-    if 1 in steps:
-        lengths = read_lengths(path)
-        hashes["lengths"] = _hash_of_lengths(lengths)
-        origins[1] = StepOrigin(1, True, f"{GEOMETRY_FILE.as_posix()} read")
-    if 2 in steps:
-        pairs = read_measurements(path)
-        hashes["load_test"] = pairs.sha256
-        origins[2] = StepOrigin(2, True, f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs")
-    weighed = _weighed(path)
-    if weighed is not None:
-        mass = weighed
-        hashes["weighed_mass"] = hash_record([*mass])
-    trials = None
     if targets == "measured" and not records:
         raise ExperimentFileError(
             f"{path} holds no ring-down record, and --measured asks for them; give --published instead."
         )
+    lab = published_data()
+    hashes, origins = lab.input_hashes, {origin.step: origin for origin in lab.origins}
+    found: dict[str, Any] = {}
+    mass, modes = lab.readings[0], lab.readings[1:]
+    if 1 in steps:
+        found["lengths"] = read_lengths(path)
+        hashes["lengths"] = _hash_of_lengths(found["lengths"])
+        origins[1] = StepOrigin(1, True, f"{GEOMETRY_FILE.as_posix()} read")
+    if 2 in steps:
+        found["pairs"] = pairs = read_measurements(path)
+        hashes["load_test"] = pairs.sha256
+        origins[2] = StepOrigin(2, True, f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs")
     if records and targets != "published":
-        trials = _fitted(path, frequencies)
+        found["trials"] = trials = _fitted(path, frequencies)
+        modes = measured_modes(trials)
         hashes |= {f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)}
         names = records[0].name if len(records) == 1 else f"{records[0].name} to {records[-1].name}"
         origins[3] = StepOrigin(3, True, f"{names} read")
     elif records:
         origins[3] = StepOrigin(3, False, "records left aside as asked; " + _PUBLISHED[3])
-    if weighed is not None:
+    if (file := lab_place(path, WEIGHED_MASS_FILE)) is not None:
+        mass = read_weighed_mass(file)
+        hashes["weighed_mass"] = hash_record([mass.value, mass.deviation])
         origins[3] = origins[3]._replace(text=f"{origins[3].text}; {WEIGHED_MASS_FILE.as_posix()} read")
-    return LabData(
-        lengths=lengths,
-        pairs=pairs,
-        total_mass=mass,
-        trials=trials,
-        authors=_authors(path),
-        origins=tuple(origins[step] for step in (1, 2, 3)),
-        input_hashes=hashes,
-    )
+    if (file := lab_place(path, STEP_FOLDER / RESULTS_FILE)) is not None:
+        found["authors"] = read_published_results(file)
+    return replace(lab, readings=(mass, *modes), origins=tuple(origins.values()), **found)
 
 
 _PUBLISHED = {
@@ -164,26 +158,11 @@ _PUBLISHED = {
 }
 
 
-def _step_folder(path: Path, step: int) -> Path | None:
-    return next((place for place in places_of(path, Path(f"step{step}")) if place.is_dir()), None)
-
-
 def _fitted(path: Path, frequencies: Frequencies) -> RingDownTrials:
     records = read_records(path)
     trials = fit_trials(records, frequencies)
     # Of a record read off a plot the extremes are averages of the signal; the middle of the ink is none.
     return refine_by_extremes(trials) if all(record.lowest is not None for record in records) else trials
-
-
-def _weighed(path: Path) -> WeighedMass | None:
-    file = next((place for place in places_of(path, WEIGHED_MASS_FILE) if place.is_file()), None)
-    return None if file is None else read_weighed_mass(file.parents[1])
-
-
-def _authors(path: Path) -> PaperSamples | None:
-    places = places_of(path, STEP_FOLDER / RESULTS_FILE)
-    file = next((place for place in places if place.is_file()), None)
-    return None if file is None else read_published_results(file)
 
 
 def _hash_of_lengths(lengths: GeometryCalibration) -> str:

@@ -9,11 +9,12 @@ import numpy as np
 from calibration.dynamics.records import STEP_FOLDER, RingDownRecord
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, GeometryCalibration
-from calibration.joint.prior import WeighedMass
-from calibration.lab_folder import LAB_ERRORS
+from calibration.joint.prior import weighed
+from calibration.lab_folder import lab_table
+from calibration.result.record import Reading
 from calibration.static.experiments import MEASUREMENTS_FILE, LoadDisplacementData
 from reporting.files import atomic_write_text
-from reporting.table_file import read_table, table_text
+from reporting.table_file import table_text
 
 WEIGHED_MASS_FILE = STEP_FOLDER / "weighed_mass.csv"
 """The weighed total of servos and pitot tube [g]; the authors give theirs in the paper alone."""
@@ -27,7 +28,7 @@ def write_lab_folder(
     lengths: GeometryCalibration,
     load_test: LoadDisplacementData,
     records: Sequence[RingDownRecord],
-    total_mass: WeighedMass | None = None,
+    total_mass: Reading | None = None,
 ) -> tuple[Path, ...]:
     """Write measurements as the readers of `calibration` take them; every file is whole or not there.
 
@@ -42,7 +43,7 @@ def write_lab_folder(
     records : sequence of RingDownRecord
         Records, to `step3/initialconditiondata_N.DAT`: time [s], spanwise signal [V], and a chordwise column
         of zeros, because the wing model has no chordwise gauge.
-    total_mass : WeighedMass, optional
+    total_mass : Reading, optional
         Weighed total, to `step3/weighed_mass.csv` [g].
 
     Returns
@@ -76,13 +77,13 @@ def write_lab_folder(
         file = folder / STEP_FOLDER / f"initialconditiondata_{number}.DAT"
         files.append(atomic_write_text(file, lines.getvalue()))
     if total_mass is not None:
-        columns = [[f"{kilograms * 1e3:.10g}"] for kilograms in total_mass]
+        columns = [[f"{kilograms * 1e3:.10g}"] for kilograms in (total_mass.value, total_mass.deviation)]
         files.append(atomic_write_text(folder / WEIGHED_MASS_FILE, table_text(_WEIGHED_COLUMNS, columns)))
     return tuple(files)
 
 
-def read_weighed_mass(folder: Path) -> WeighedMass:
-    """Read the weighed total of a laboratory folder; the paper's 472 g where there is no such file.
+def read_weighed_mass(file: Path) -> Reading:
+    """Read the weighed total of a laboratory.
 
     Raises
     ------
@@ -91,10 +92,7 @@ def read_weighed_mass(folder: Path) -> WeighedMass:
     ExperimentDataError
         If a figure is not a positive finite number of grams, or looks like kg.
     """
-    file = Path(folder) / WEIGHED_MASS_FILE
-    if not file.exists():
-        return WeighedMass()
-    table = read_table(file, LAB_ERRORS)
+    table = lab_table(file, WEIGHED_MASS_FILE)
     if len(table) != 1:
         raise ExperimentFileError(
             f"{file} needs a header `mass,standard_deviation` and one row in grams, and {len(table)} came."
@@ -107,4 +105,4 @@ def read_weighed_mass(folder: Path) -> WeighedMass:
         raise ExperimentDataError(
             f"{file}: the standard deviation, {deviation:g} g, must be less than the mass, {mass:g} g."
         )
-    return WeighedMass(1e-3 * mass, 1e-3 * deviation)
+    return weighed(1e-3 * mass, 1e-3 * deviation)

@@ -6,7 +6,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from calibration.dynamics.figures import ring_down_figure
-from calibration.paper.figures import calibration_figure, residual_figure
+from calibration.paper.figures import calibration_figure
+from calibration.paper.load_test import push_forward
 from calibration.paper.table_1 import HEADINGS, write_table_1
 from calibration.result.figures import corner_figure
 from calibration.result.folder import drawing_names, write_calibration_folder
@@ -21,10 +22,10 @@ from .calibrate import WingCalibration
 from .figures import modes_figure
 
 WORDS = Words("calibration.wing")
-FIGURE_NAMES = ("load_test", "residuals", "procedure", "modes", "ring_down")
+FIGURE_NAMES = ("load_test", "procedure", "modes", "ring_down")
 """All that a wing's page has beyond that of any calibration, the last where there are records."""
 
-_EARLIER_FIGURES = ("masses", "quantities")
+_EARLIER_FIGURES = ("masses", "quantities", "residuals")
 """What earlier versions drew; it would show another calibration than the file beside it."""
 
 LOAD_FACTOR = 3.0
@@ -84,7 +85,6 @@ def _figures(calibration: WingCalibration, fields: WingFields) -> Mapping[str, F
         sets.append(("authors' model", calibration.lab.authors.samples))
     drawn = [
         calibration_figure(calibration.static),
-        residual_figure(calibration.static),
         corner_figure(names, sets),
         modes_figure(fields, modes, titles),
     ]
@@ -111,13 +111,15 @@ def _add_sections(page: Page, calibration: WingCalibration, drawings: Mapping[st
         ("tailored model", calibration.static),
         ("line of the paper, eq. (14)", calibration.static_published),
     ):
-        for way, e, k in (
-            ("exact", found.exact, found.tip_stiffness_exact),
-            ("particle filter", found.particle, found.tip_stiffness_particle),
-        ):
-            rows.append((title, way, *(plus_minus(item.mean, item.standard_deviation) for item in (e, k))))
+        pairs = [("exact", found.exact, found.tip_stiffness_exact)]
+        pairs += [
+            (f"exact, {name}", e, push_forward(e, found.curve)) for name, e in found.alternatives.items()
+        ]
+        pairs.append(("particle filter", found.particle.posterior, found.tip_stiffness_particle))
+        for way, e, k in pairs:
+            told = (plus_minus(item.mean, item.standard_deviation) for item in (e, k))
+            rows.append((title, way, *told))
     WORDS.add_table(page, "two_models", rows)
-    show("residuals")
     show("procedure", authors=calibration.lab.authors is not None)
     page.add_section("Ring-down")
     if "ring_down" in drawings:

@@ -64,10 +64,11 @@ class Column:
         return self.head if self.quantity and INPUT not in self.role else self.role.removeprefix(INPUT)
 
     def in_si(self, decimal: str) -> tuple[str, ...]:
-        """Return its cells in SI, empty where too little is known; a power of ten moves the printed point."""
+        """Return its cells in SI, empty where too little is known."""
         if self.to_si is None or not decimal:
             return ("",) * len(self.sheet.lines)
-        return tuple(cell and self.to_si.text(cell) for cell in self.sheet.numbers(self.head, decimal))
+        cells = self.sheet.numbers(self.head, decimal)
+        return tuple(cell and repr(self.to_si.to_si(float(cell))) for cell in cells)
 
 
 class Understanding:
@@ -156,8 +157,8 @@ class Understanding:
         )
         if found := re.fullmatch(r"\s*([-+]?\d+\.?\d*(?:e[-+]?\d+)?)\s*(\S+)\s*", said, re.ASCII):
             for quantity in (item for item in _HELD if item in quantities_of(found[2])):
-                size = conversion_of(quantity, found[2]).text(found[1])
-                return {"displacement": float(size), "unit": UNITS[quantity].si}
+                size = conversion_of(quantity, found[2]).to_si(float(found[1]))
+                return {"displacement": size, "unit": UNITS[quantity].si}
         raise CampaignFileError(f"--release must be a length or a voltage such as 15.5mm, and {said!r} came.")
 
     # ---------------------------------------------------------------- columns
@@ -260,7 +261,7 @@ class Understanding:
         origin = hash_record([sheet.digest for sheet in self.sheets])
         section = parse_campaign(content, listing(tables))
         # whoever reads what is written remarks on it as it is by then
-        return replace(assemble(section, content, tables, origin), remarks=section.remarks)
+        return replace(assemble(section, tables, origin), remarks=section.remarks)
 
     def _trial(self, file: str) -> dict[str, Any]:
         places = self.answers.get("load-place", {})

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from math import inf
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,7 @@ from discrepancy.campaign.schema import (
     parse_campaign,
 )
 from discrepancy.campaign.table import read_table
-from discrepancy.campaign.units import conversion_of, difference, si_value
+from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.provenance import hash_file, hash_record
 from reporting.table_file import TextTable
@@ -72,7 +71,7 @@ def read_campaign(folder: str | Path) -> Campaign:
     folder = Path(folder)
     if folder.name == CAMPAIGN_FILE:
         folder = folder.parent
-    section, printed = _read_section(folder)
+    section = _read_section(folder)
     names = {CAMPAIGN_FILE, *(trial.file for trial in section.trial)}
     if section.noise is not None:
         names.add(section.noise.file)
@@ -85,30 +84,23 @@ def read_campaign(folder: str | Path) -> Campaign:
             )
     tables = {name: read_table(folder, name) for name in sorted(names - {CAMPAIGN_FILE})}
     data_hash = hash_record({name: hash_file(folder / name) for name in sorted(names)})
-    return assemble(section, printed, tables, data_hash)
+    return assemble(section, tables, data_hash)
 
 
-def assemble(
-    section: CampaignSection, printed: Mapping[str, Any], tables: Mapping[str, TextTable], data_hash: str
-) -> Campaign:
+def assemble(section: CampaignSection, tables: Mapping[str, TextTable], data_hash: str) -> Campaign:
     """Return the campaign that a description and its tables make; errors as `read_campaign`.
 
     Parameters
     ----------
     section : CampaignSection
         What `campaign.toml` says.
-    printed : mapping
-        The same as a plain table, its decimal numbers as printed.
     tables : mapping of str to TextTable
         By the names that the description has for them.
     data_hash : str
         SHA-256 of all that was read.
     """
     remarks = _unused(section, tables)
-    trials = tuple(
-        _trial(trial, raw, tables[trial.file], section, remarks)
-        for trial, raw in zip(section.trial, printed["trial"], strict=True)
-    )
+    trials = tuple(_trial(trial, tables[trial.file], section, remarks) for trial in section.trial)
     for channel in section.channel:
         if not any(channel.name in trial.channels for trial in trials):
             name = section.trial[0].file
@@ -116,7 +108,7 @@ def assemble(
                 f"The channel {channel.name!r} is in no trial: no table has a column "
                 f"{channel.table_column!r}; the columns of {name} are {', '.join(tables[name].columns)}."
             )
-    channels = _channels(section, printed, tables, trials, remarks)
+    channels = _channels(section, tables, trials, remarks)
     remarks += remarks_on(channels, trials)
     return Campaign(
         name=section.name,
@@ -162,27 +154,18 @@ def _events(section: CampaignSection, trials: tuple[Trial, ...]) -> Iterator[Eve
         yield found
 
 
-def _read_section(folder: Path) -> tuple[CampaignSection, Mapping[str, Any]]:
-    """Return the checked content, and the same with its decimal numbers as printed."""
+def _read_section(folder: Path) -> CampaignSection:
     path = folder / CAMPAIGN_FILE
     if not path.exists():
         missing = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
         raise CampaignFileError(f"There is no {missing}: give the folder of a campaign.")
-    table = read_toml(path, CampaignFileError, what="campaign")
-    printed = read_toml(path, CampaignFileError, what="campaign", parse_float=str)
-    return parse_campaign(table, str(path)), printed
+    return parse_campaign(read_toml(path, CampaignFileError, what="campaign"), str(path))
 
 
 # ---------------------------------------------------------------- trials
 
 
-def _trial(
-    section: TrialSection,
-    printed: Mapping[str, Any],
-    table: TextTable,
-    campaign: CampaignSection,
-    remarks: list[str],
-) -> Trial:
+def _trial(section: TrialSection, table: TextTable, campaign: CampaignSection, remarks: list[str]) -> Trial:
     user = f"the trial {section.name!r}"
     time, start = _times(section, table, user)
     zeros = np.zeros(len(table))
@@ -210,9 +193,7 @@ def _trial(
         health=health,
         regions=regions,
         health_deviation=health_deviation,
-        release=None
-        if section.release is None
-        else _release(section.release, str(printed["release"]["displacement"])),
+        release=None if section.release is None else _release(section.release),
         held_out=section.held_out,
         noise_factor=section.noise_factor,
         begins=section.begins or Start.SETTLED,
@@ -232,7 +213,7 @@ def _inputs(
     return tuple(
         RecordedInput(
             item.name, item.quantity, _numbers(table, item, user), item.holds,
-            si_value(repr(item.offset_deviation), item.quantity, item.unit), item.unit,
+            conversion_of(item.quantity, item.unit).to_si(item.offset_deviation), item.unit,
         )
         for item in campaign.input
         if item.table_column in table.columns
@@ -240,10 +221,8 @@ def _inputs(
 
 
 def _numbers(table: TextTable, item: ColumnSection, user: str, *, empty_allowed: bool = False) -> FloatArray:
-    to_si = conversion_of(item.quantity, item.unit)
-    return table.numbers(
-        item.table_column, user, lambda text: float(to_si.text(text)), empty_allowed=empty_allowed
-    )
+    numbers = table.numbers(item.table_column, user, empty_allowed=empty_allowed)
+    return conversion_of(item.quantity, item.unit).to_si(numbers)
 
 
 def _times(section: TrialSection, table: TextTable, user: str) -> tuple[FloatArray, float]:
@@ -325,8 +304,8 @@ def _temperature(section: TrialSection, table: TextTable, campaign: CampaignSect
             "give it, in degC."
         )
     if column:
-        return table.numbers("temperature", user, lambda text: difference(text, reference))
-    return np.full(len(table), difference(repr(section.temperature), reference))
+        return table.numbers("temperature", user) - reference
+    return np.full(len(table), (section.temperature or 0.0) - reference)
 
 
 def _health(
@@ -368,10 +347,10 @@ def _within(
     return values
 
 
-def _release(section: ReleaseSection, displacement: str) -> Release:
+def _release(section: ReleaseSection) -> Release:
     quantity = Quantity.DISPLACEMENT if section.unit in ("m", "mm", "um") else Quantity.SIGNAL
     given = section.model_dump(exclude={"displacement", "unit"})
-    return Release(si_value(displacement, quantity, section.unit), **given)
+    return Release(conversion_of(quantity, section.unit).to_si(section.displacement), **given)
 
 
 # ---------------------------------------------------------------- channels
@@ -379,23 +358,21 @@ def _release(section: ReleaseSection, displacement: str) -> Release:
 
 def _channels(
     section: CampaignSection,
-    printed: Mapping[str, Any],
     tables: Mapping[str, TextTable],
     trials: tuple[Trial, ...],
     remarks: list[str],
 ) -> dict[str, Channel]:
     recorded = _recorded_noise(section, tables)
     channels = {}
-    for item, raw in zip(section.channel, printed["channel"], strict=True):
+    for item in section.channel:
+        to_si = conversion_of(item.quantity, item.unit).to_si
         channel = Channel(
             name=item.name,
             quantity=item.quantity,
             output=item.output,
             noise=None,
             gain_deviation=inf if item.gain_deviation == "free" else item.gain_deviation,
-            offset_deviation=inf
-            if item.offset_deviation == "free"
-            else si_value(str(raw.get("offset_deviation", 0.0)), item.quantity, item.unit),
+            offset_deviation=inf if item.offset_deviation == "free" else to_si(item.offset_deviation),
             station=item.station,
             chord=item.chord,
             column=item.table_column,
@@ -403,11 +380,8 @@ def _channels(
         )
         stated = None
         if item.noise is not None:
-            stated = NoiseRecord(
-                si_value(str(raw["noise"]["standard_deviation"]), item.quantity, item.unit),
-                item.noise.degrees_of_freedom,
-                source=item.noise.source,
-            )
+            deviation = to_si(item.noise.standard_deviation)
+            stated = NoiseRecord(deviation, item.noise.degrees_of_freedom, source=item.noise.source)
         noise, remark = with_noise(channel, recorded, stated, trials)
         remarks += [remark] if remark else []
         channels[item.name] = replace(channel, noise=noise)

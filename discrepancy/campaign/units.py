@@ -1,24 +1,22 @@
-"""Units of a campaign's files as pint knows them, and their conversion to SI without a rounding of its own.
-
-A power of ten is applied to the decimal text of a number before it becomes binary, so a value that is written
-in microstrain comes back to the last bit; any other factor is a fraction of integers, rounded once.
-"""
+"""Units of a campaign's files as pint knows them, and their conversion to SI."""
 
 import re
 import unicodedata
 from contextlib import suppress
-from decimal import Decimal, localcontext
+from decimal import Decimal
 from fractions import Fraction
 from functools import cache
-from math import isfinite, log10, pi
+from math import pi
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from discrepancy.campaign.records import Quantity
+from discrepancy.campaign.records import FloatArray, Quantity
 from reporting.words import listing
 
 if TYPE_CHECKING:
     from pint import UnitRegistry
+
+_Value = TypeVar("_Value", float, FloatArray)
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2 in one g, exact by definition."""
@@ -82,19 +80,23 @@ UNITS = {
 
 
 class Conversion(NamedTuple):
-    """What makes SI of a unit: a factor, and the power of ten that it is (None: it is none)."""
+    """What makes SI of a unit: a fraction, so that a power of ten rounds once."""
 
-    factor: float
-    power: int | None
+    numerator: float = 1.0
+    denominator: float = 1.0
 
-    def text(self, number: str) -> str:
-        """Return the text of a number in SI; raises ValueError if it is no number."""
-        if self.power is None:
-            return repr(float(number) * self.factor)
-        if self.power == 0:
-            return number
-        mantissa, letter, exponent = number.lower().partition("e")
-        return f"{mantissa}e{(int(exponent) if letter else 0) + self.power}"
+    @property
+    def factor(self) -> float:
+        """What one of the unit is in SI."""
+        return self.numerator / self.denominator
+
+    def to_si(self, value: _Value) -> _Value:
+        """Return numbers of the unit in SI."""
+        return value * self.numerator / self.denominator
+
+    def from_si(self, value: _Value) -> _Value:
+        """Return numbers of SI in the unit."""
+        return value * self.denominator / self.numerator
 
 
 @cache
@@ -134,7 +136,7 @@ def conversion(unit: str, si: str) -> Conversion:
         pint does not know the unit, or it is of another quantity.
     """
     if unit == si:
-        return Conversion(1.0, 0)  # pint takes a third of a second to load
+        return Conversion()  # pint takes a third of a second to load
     from pint.errors import PintError
 
     known = _known_units()
@@ -150,8 +152,7 @@ def conversion(unit: str, si: str) -> Conversion:
     if roots[0] != roots[1]:
         raise ValueError(f"{unit!r} cannot become {si}")
     factor = factors[0] / factors[1]
-    power = round(log10(factor))
-    return Conversion(float(factor), power if factor == Fraction(10) ** power else None)
+    return Conversion(float(factor.numerator), float(factor.denominator))
 
 
 @cache
@@ -159,7 +160,7 @@ def conversion_of(quantity: Quantity, unit: str) -> Conversion:
     """Return what makes SI of a quantity's unit; raises ValueError with what is expected."""
     try:
         if quantity is Quantity.TEMPERATURE and unit in _NEVER_CONVERTED:
-            return Conversion(1.0, 0)
+            return Conversion()
         if quantity is Quantity.TEMPERATURE:
             raise ValueError
         if quantity is Quantity.STRAIN and re.search(r"V|[Vv]olt", unit):
@@ -183,41 +184,3 @@ def quantities_of(unit: str) -> tuple[Quantity, ...]:
             conversion_of(quantity, unit)
             found.append(quantity)
     return tuple(found)
-
-
-def si_value(text: str, quantity: Quantity, unit: str) -> float:
-    """Return the SI value of a number's text in a unit, correctly rounded.
-
-    Raises
-    ------
-    ValueError
-        The text is no number, or the unit none of the quantity.
-    """
-    return float(conversion_of(quantity, unit).text(text))
-
-
-def in_unit(value: float, quantity: Quantity, unit: str) -> str:
-    """Return the text of an SI value in a unit; `si_value` gives it back, exactly for a power of ten."""
-    factor, power = conversion_of(quantity, unit)
-    if power is None:
-        return repr(value / factor)
-    if not isfinite(value) or power == 0:
-        return repr(float(value))
-    return _text(Decimal(repr(float(value))).scaleb(-power))
-
-
-def sum_text(first: float, second: float) -> str:
-    """Return the exact decimal sum of two numbers as written; `difference` undoes it."""
-    with localcontext(prec=1200):
-        return _text(Decimal(repr(float(first))) + Decimal(repr(float(second))))
-
-
-def difference(text: str, second: float) -> float:
-    """Return a number's text less a number, rounded once; raises ValueError if the text is no number."""
-    with localcontext(prec=1200):
-        return float(Decimal(text.strip()) - Decimal(repr(float(second))))
-
-
-def _text(value: Decimal) -> str:
-    text = str(value)
-    return text if "." in text or "E" in text else f"{text}.0"

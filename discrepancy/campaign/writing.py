@@ -1,4 +1,4 @@
-"""Writing a campaign as a folder that `campaign.reading.read_campaign` reads back to the last bit."""
+"""Writing a campaign as a folder that `campaign.reading.read_campaign` reads back."""
 
 import re
 from dataclasses import asdict
@@ -21,18 +21,18 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.campaign.schema import FORMAT, OF_REGION, input_columns
-from discrepancy.campaign.units import UNITS, in_unit, sum_text
+from discrepancy.campaign.units import UNITS, conversion_of
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
-from reporting.toml_file import Printed, toml_text
+from reporting.toml_file import toml_text
 
 NOISE_FILE = "noise.csv"
 """Name of the table of samples at rest."""
 
 
 def write_campaign(campaign: Campaign, folder: str | Path, *, si: bool = False) -> Path:
-    """Write a campaign; `read_campaign` gives it back, equal to the last bit but for its hash.
+    """Write a campaign; `read_campaign` gives it back, equal to rounding but for its hash.
 
     Strain is written in microstrain, displacement in mm, the rest in SI (all, if asked for). `campaign.toml`
     comes last, so that a folder that was not finished is no campaign.
@@ -97,7 +97,7 @@ def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
                 "temperature to write them with."
             )
         reference = campaign.reference_temperature
-        columns["temperature"] = [sum_text(reference, value) for value in trial.temperature.tolist()]
+        columns["temperature"] = _plain(reference + trial.temperature)
     for index, region in enumerate(trial.regions):
         name = region if region in USUAL_REGIONS else f"{OF_REGION}{region}"
         if np.any(trial.health[:, index] != 0.0):
@@ -120,8 +120,7 @@ def _unit(channel: Channel, si: bool) -> str:
 
 
 def _in_unit(values: FloatArray, channel: Channel, si: bool) -> list[str]:
-    unit = _unit(channel, si)
-    return [in_unit(value, channel.quantity, unit) for value in values.tolist()]
+    return _plain(conversion_of(channel.quantity, _unit(channel, si)).from_si(values))
 
 
 def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
@@ -183,8 +182,8 @@ def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float |
 def _channel(channel: Channel, si: bool) -> dict[str, Any]:
     unit, record, noise = _unit(channel, si), channel.noise, None
 
-    def printed(deviation: float) -> str:
-        return "free" if isinf(deviation) else Printed(in_unit(deviation, channel.quantity, unit))
+    def printed(deviation: float) -> float | str:
+        return "free" if isinf(deviation) else conversion_of(channel.quantity, unit).from_si(deviation)
 
     if record is not None and record.samples is None:
         freedom, source = record.degrees_of_freedom, record.source

@@ -9,7 +9,7 @@ from statistics import median
 from typing import NamedTuple
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
-from discrepancy.campaign.units import STANDARD_GRAVITY, UNITS, si_value
+from discrepancy.campaign.units import STANDARD_GRAVITY, UNITS, conversion_of
 from discrepancy.checks.fault import DataFault, FaultKind
 
 FOREIGN: Mapping[Quantity, Mapping[str, float]] = {
@@ -80,7 +80,7 @@ def slip_between(scale: float, quantity: Quantity, stated: str = "", *, drive: b
     if abs(log(abs(scale))) < log(LEAST / 1.1):
         return None
     units = {*UNITS[quantity].usual, *([stated] if stated else [])}
-    sizes = {unit: si_value("1.0", quantity, unit) for unit in sorted(units)}
+    sizes = {unit: conversion_of(quantity, unit).factor for unit in sorted(units)}
     sizes |= FOREIGN.get(quantity, {})
     slips = [
         Slip(sizes[meant] / size if drive else size / sizes[meant], meant, unit)

@@ -60,6 +60,10 @@ class Marginal:
         shared = self._problem.shared
         return shared.parameter_mean[self.free] + shared.parameter_scale[self.free] * u
 
+    def inside(self, u: FloatArray) -> NDArray[np.bool_]:
+        """Return which scaled parameters (..., P) lie within the model's range."""
+        return np.asarray(np.all((u >= self.low) & (u <= self.high), axis=-1))
+
     def fitted(
         self,
         u: FloatArray,
@@ -107,7 +111,7 @@ class Marginal:
 
     def __call__(self, u: FloatArray) -> float:
         """Return the energy at scaled parameters (P,); infinite outside the model's range."""
-        if np.any(u < self.low) or np.any(u > self.high):
+        if not self.inside(u):
             return np.inf
         try:
             found = self.fitted(u)

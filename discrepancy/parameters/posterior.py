@@ -80,30 +80,25 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     centres = [item.point.shared[free] for item in optima]
     spreads = [item.covariance[np.ix_(free, free)] for item in optima]
     trial = generator.multivariate_normal(centres[0], spreads[0], 4000, method="cholesky")
-    cut = float(np.mean(~_inside(marginal, trial)))
-    procedure: Procedure
-    if len(free) > 1 and len(optima) > 1:
-        procedure = "several optima"
-        inside = [
-            mass_inside(centre, spread, marginal.low, marginal.high)
-            for centre, spread in zip(centres, spreads, strict=True)
+    cut = float(np.mean(~marginal.inside(trial)))
+    procedure: Procedure = "several optima" if len(optima) > 1 else "Gaussian"
+    if len(free) == 1 or (
+        len(optima) == 1 and not (cut < CUT and is_gaussian(marginal, centres[0], spreads[0]))
+    ):
+        procedure, draws = "quadrature", _along_the_widest(marginal, optima, count, generator)
+    else:
+        shares = [
+            mass_inside(*item, marginal.low, marginal.high) for item in zip(centres, spreads, strict=True)
         ]
-        evidence = np.array([item.log_evidence for item in optima]) + np.log(np.maximum(inside, 1e-300))
+        evidence = np.array([item.log_evidence for item in optima]) + np.log(np.maximum(shares, 1e-300))
         weight = np.exp(evidence - evidence.max())
         chosen = generator.choice(len(optima), count, p=weight / weight.sum())
-        draws = np.concatenate(
-            [
-                _gaussian(marginal, centre, spread, int(np.sum(chosen == at)), generator)
-                for at, (centre, spread) in enumerate(zip(centres, spreads, strict=True))
-            ]
-        )
-        draws = generator.permutation(draws)
-    elif len(free) > 1 and cut < CUT and is_gaussian(marginal, centres[0], spreads[0]):
-        procedure = "Gaussian"
-        draws = _gaussian(marginal, centres[0], spreads[0], count, generator)
-    else:
-        procedure = "quadrature"
-        draws = _along_the_widest(marginal, optima, count, generator)
+        draws = np.empty((count, len(free)))
+        for at, (centre, spread) in enumerate(zip(centres, spreads, strict=True)):
+            rows = chosen == at
+            draws[rows] = cut_off(
+                np.tile(centre, (int(rows.sum()), 1)), spread, marginal.low, marginal.high, generator
+            )
     return ParameterPosterior(procedure, draws, optima, marginal, cut)
 
 
@@ -132,20 +127,22 @@ def mass_inside(centre: FloatArray, covariance: FloatArray, low: FloatArray, hig
     )
 
 
-def _inside(marginal: Marginal, u: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(np.all((u >= marginal.low) & (u <= marginal.high), axis=-1))
-
-
-def _gaussian(
-    marginal: Marginal, centre: FloatArray, covariance: FloatArray, count: int, generator: np.random.Generator
+def cut_off(
+    centres: FloatArray,
+    covariance: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    generator: np.random.Generator,
 ) -> FloatArray:
-    """Return draws (count, P) of a Gaussian, cut off at the model's range."""
-    kept: list[FloatArray] = [np.empty((0, len(centre)))]
-    while sum(map(len, kept)) < count:
-        drawn = generator.multivariate_normal(centre, covariance, count, method="cholesky")
-        inside = drawn[_inside(marginal, drawn)]
-        kept.append(inside if len(inside) else np.clip(drawn[:1], marginal.low, marginal.high))
-    return np.concatenate(kept)[:count]
+    """Return a draw about each of the centres (N, P), anew where it is beyond the range."""
+    drawn, rows = np.full_like(centres, np.inf), np.arange(len(centres))
+    for _ in range(REDRAWN):
+        if not len(rows):
+            break
+        shift = generator.multivariate_normal(np.zeros(len(low)), covariance, len(rows), method="cholesky")
+        drawn[rows] = centres[rows] + shift
+        rows = rows[np.any((drawn[rows] < low) | (drawn[rows] > high), axis=1)]
+    return np.clip(drawn, low, high)
 
 
 def _along_the_widest(
@@ -250,18 +247,10 @@ class Slices:
         centres = np.array([self._rest(found[node])[0] for node in nodes.tolist()])
         centre = Akima1DInterpolator(nodes, centres)(np.clip(values, nodes[0], nodes[-1]))
         nearest = np.abs(values[:, None] - nodes).argmin(axis=1)
-        low, high = marginal.low[rest], marginal.high[rest]
-        drawn = np.full_like(centre, np.inf)
         for at, node in enumerate(nodes.tolist()):
             rows = np.flatnonzero(nearest == at)
             block = self._rest(found[node])[1]
-            for _ in range(REDRAWN):
-                if not len(rows):
-                    break
-                shift = generator.multivariate_normal(
-                    np.zeros(len(rest)), block, len(rows), method="cholesky"
-                )
-                drawn[rows] = centre[rows] + shift
-                rows = rows[np.any((drawn[rows] < low) | (drawn[rows] > high), axis=1)]
-        draws[:, rest] = np.clip(drawn, low, high)
+            draws[np.ix_(rows, rest)] = cut_off(
+                centre[rows], block, marginal.low[rest], marginal.high[rest], generator
+            )
         return draws

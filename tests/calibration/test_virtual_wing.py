@@ -14,7 +14,7 @@ from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import published_lengths, read_lengths
-from calibration.joint.prior import WeighedMass
+from calibration.joint.prior import weighed
 from calibration.static.experiments import published_measurements, read_measurements
 from calibration.virtual_wing import (
     RECORDED_GAUGE,
@@ -149,9 +149,9 @@ def test_experiments_repeat_with_the_seed() -> None:
     assert one[1].signal.tobytes() != other[1].signal.tobytes()
     assert one[0].signal.tobytes() != one[1].signal.tobytes()
     assert measure_load_test(Beam(), 4).sha256 == measure_load_test(Beam(), 4).sha256
-    weighed = [weigh(TRUTH, seed).mass for seed in range(400)]
-    assert np.mean(weighed) == pytest.approx(2.0 * TRUTH.servo_mass + TRUTH.pitot_mass, abs=2e-4)
-    assert np.std(weighed) == pytest.approx(1e-3, rel=0.15)
+    total = [weigh(TRUTH, seed).value for seed in range(400)]
+    assert np.mean(total) == pytest.approx(2.0 * TRUTH.servo_mass + TRUTH.pitot_mass, abs=2e-4)
+    assert np.std(total) == pytest.approx(1e-3, rel=0.15)
     lengths = [measure_lengths(Geometry(), seed).semi_span.measured for seed in range(400)]
     assert np.mean(lengths) == pytest.approx(1.828, abs=2e-5)
     assert np.std(lengths) == pytest.approx(0.2e-3 / 1.96, rel=0.15)
@@ -178,7 +178,7 @@ def test_the_laboratory_folder_is_read_back(tmp_path: Path, rate: float) -> None
     records = measure_ring_down(Beam(), 2, trials=2, duration=1.0, sampling_rate=rate)
     lengths = measure_lengths(Geometry(), 2)
     files = write_lab_folder(
-        tmp_path, lengths=lengths, load_test=load_test, records=records, total_mass=WeighedMass(0.4711, 2e-3)
+        tmp_path, lengths=lengths, load_test=load_test, records=records, total_mass=weighed(0.4711, 2e-3)
     )
     assert all(file.is_file() for file in files)
     seen = read_measurements(tmp_path)
@@ -192,11 +192,11 @@ def test_the_laboratory_folder_is_read_back(tmp_path: Path, rate: float) -> None
     measured = read_lengths(tmp_path)
     assert measured.root_chord.measured == pytest.approx(lengths.root_chord.measured, rel=1e-9)
     assert measured.root_chord.designed == published_lengths().root_chord.designed
-    assert read_weighed_mass(tmp_path) == pytest.approx((0.4711, 2e-3))
+    scale = read_weighed_mass(tmp_path)
+    assert (scale.value, scale.deviation) == pytest.approx((0.4711, 2e-3))
 
 
 def test_the_weighed_mass_file(tmp_path: Path) -> None:
-    assert read_weighed_mass(tmp_path) == WeighedMass()
     file = tmp_path / WEIGHED_MASS_FILE
     file.parent.mkdir()
     for text, error, words in (

@@ -35,7 +35,7 @@ def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert (truth["damping_alpha"], truth["damping_beta"], truth["seed"]) == (0.9, 5e-4, 3)
     assert read_measurements(out).count == 8
     assert read_lengths(out).semi_span.measured == pytest.approx(1.828, abs=5e-4)
-    assert read_weighed_mass(out).mass == pytest.approx(0.47, abs=4e-3)
+    assert read_weighed_mass(out).value == pytest.approx(0.47, abs=4e-3)
     records = read_records(out)
     assert len(records) == 5
     trials = fit_trials(records, Frequencies.FITTED)

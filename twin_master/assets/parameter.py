@@ -76,32 +76,30 @@ def draw_parameter(
     CalibrationError
         The measurements do not fit the model, or the calibration file cannot be read.
     """
+    name, count = calibration.parameter, calibration.draws
     if calibration.source == "file":
-        return _draws_of_file(calibration, seed)
-    if calibration.source == "fixed":
-        assert calibration.mean is not None  # the schema asks for it
+        found = _read(calibration)
+        assert found is not None  # the schema asks for it
+        values = found.stratified_draws(name, count, seed_sequence(seed, "calibration"))
+        from calibration.result.plain import run_record
+
         return ParameterDraws(
-            calibration.parameter,
-            np.array([calibration.mean]),
-            calibration.mean,
-            0.0,
-            "fixed in the scenario",
-        )
-    if calibration.source == "normal":
-        assert calibration.mean is not None
-        assert calibration.standard_deviation is not None
+            name, values, found.mean(name), found.standard_deviation(name),
+            f"calibration of {found.asset}, {found.procedure}, {len(found.samples)} samples",
+            run_record(found, name), found.given(name, values) if found.design is None else {},
+        )  # fmt: skip
+    if calibration.source in ("fixed", "normal"):
+        mean, deviation = calibration.mean, calibration.standard_deviation or 0.0
+        assert mean is not None  # the schema asks for it
+        if calibration.source == "fixed":
+            return ParameterDraws(name, np.array([mean]), mean, 0.0, "fixed in the scenario")
         from scipy.special import ndtri
 
         random = generator(seed, "calibration")
-        strata = (np.arange(calibration.draws) + random.random(calibration.draws)) / calibration.draws
-        values = calibration.mean + calibration.standard_deviation * ndtri(strata)
-        return ParameterDraws(
-            calibration.parameter,
-            random.permutation(values),
-            calibration.mean,
-            calibration.standard_deviation,
-            "normal distribution of the scenario",
+        values = random.permutation(
+            mean + deviation * ndtri((np.arange(count) + random.random(count)) / count)
         )
+        return ParameterDraws(name, values, mean, deviation, "normal distribution of the scenario")
     if calibration.curve == "design" and model is None:
         raise MissingObservationModelError(
             "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
@@ -152,24 +150,6 @@ def _draws_of_load_test(calibration: Calibration, seed: int, model: "ReducedMode
     )
 
 
-def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
-    from calibration.result.file import load_calibration
-    from calibration.result.plain import run_record
-
-    name = calibration.parameter
-    found = load_calibration(Path(calibration.file or ""))
-    values = found.stratified_draws(name, calibration.draws, seed_sequence(seed, "calibration"))
-    return ParameterDraws(
-        name=name,
-        values=values,
-        mean=found.mean(name),
-        standard_deviation=found.standard_deviation(name),
-        source=f"calibration of {found.asset}, {found.procedure}, {len(found.samples)} samples",
-        record=run_record(found, name),
-        others=found.given(name, values) if found.design is None else {},
-    )
-
-
 def read_calibration(calibration: Calibration) -> None:
     """Read the calibration file, if there is one.
 
@@ -178,11 +158,18 @@ def read_calibration(calibration: Calibration) -> None:
     CalibrationRecordError
         It is damaged or of another kind, or has no samples of the parameter.
     """
+    _read(calibration)
+
+
+def _read(calibration: Calibration) -> "Calibrated | None":
+    """Return the calibration that a scenario names; None if it names none."""
     if calibration.file is None:
-        return
+        return None
     from calibration.result.file import load_calibration
 
-    load_calibration(Path(calibration.file)).draws_of(calibration.parameter)
+    found = load_calibration(Path(calibration.file))
+    found.draws_of(calibration.parameter)
+    return found
 
 
 def check_calibration(
@@ -220,9 +207,8 @@ def check_calibration(
         It has a parameter that is not known, or one whose posterior mean lies outside its range; or it is of
         another design.
     """
-    read_calibration(calibration)
-    found = _parameters_in(calibration)
-    if found is None:
+    found = _read(calibration)
+    if found is None or found.design is not None:
         return
     names = {prior.name for prior in found.priors}
     rows = [("parameter", names, known)]
@@ -254,15 +240,7 @@ def is_of_parameters(file: Path | str) -> bool:
 
 def calibrated_means(calibration: Calibration) -> dict[str, float]:
     """Return the posterior means of the parameters of a model that were calibrated from a campaign, SI."""
-    found = _parameters_in(calibration)
-    return {} if found is None else {prior.name: found.mean(prior.name) for prior in found.priors}
-
-
-def _parameters_in(calibration: Calibration) -> "Calibrated | None":
-    """Return the calibration from a campaign that a scenario names; None if it names none."""
-    if calibration.file is None:
-        return None
-    from calibration.result.file import load_calibration
-
-    found = load_calibration(Path(calibration.file))
-    return found if found.design is None else None
+    found = _read(calibration)
+    if found is None or found.design is not None:
+        return {}
+    return {prior.name: found.mean(prior.name) for prior in found.priors}

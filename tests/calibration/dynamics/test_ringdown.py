@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from calibration.dynamics.damped_cosine import DampedCosines, natural_mode
+from calibration.dynamics.damped_cosine import DampedCosines, RingDownMode
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.ringdown import FIRST_PEAK, Frequencies, fit_ring_down, prepare, spectrum
 from calibration.dynamics.trials import amplitude_dependence, fit_trials
@@ -178,11 +178,13 @@ def test_errors_of_frequency_and_damping_ratio_carry_the_covariance() -> None:
     here = np.array([decay, damped])
     jacobian = np.column_stack([(natural(here + s) - natural(here - s)) / 2e-5 for s in steps])
     expected = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
-    mode = natural_mode(decay, damped, covariance)
-    assert mode[::2] == pytest.approx(natural(here))
-    assert mode[1::2] == pytest.approx(expected, rel=1e-8)
+    mode = RingDownMode(decay, damped, 0.0j, covariance)
+    assert [mode.frequency, mode.damping_ratio] == pytest.approx(natural(here))
+    errors = mode.frequency_standard_error, mode.damping_ratio_standard_error
+    assert errors == pytest.approx(tuple(expected), rel=1e-8)
     # Without the covariance the ratio's error would be a fifth too large: the bound above sees that.
-    assert natural_mode(decay, damped, np.diag(np.diag(covariance)))[3] > 1.2 * expected[1]
+    apart = RingDownMode(decay, damped, 0.0j, np.diag(np.diag(covariance)))
+    assert apart.damping_ratio_standard_error > 1.2 * expected[1]
 
 
 def test_a_fit_hands_the_covariance_on() -> None:
@@ -195,7 +197,7 @@ def test_a_fit_hands_the_covariance_on() -> None:
     assert abs(found[0, 2]) > 0.1 * math.sqrt(found[0, 0] * found[2, 2])
     for place, mode in enumerate(fit.modes):
         pair = np.ix_([place, 2 + place], [place, 2 + place])
-        expected = natural_mode(decay[place], damped[place], found[pair])
+        expected = RingDownMode(decay[place], damped[place], 0.0j, found[pair])
         assert mode.damping_ratio_standard_error == pytest.approx(expected.damping_ratio_standard_error)
         assert mode.frequency_standard_error == pytest.approx(expected.frequency_standard_error)
 

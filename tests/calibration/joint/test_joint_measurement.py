@@ -11,12 +11,18 @@ from numpy.typing import NDArray
 
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.ringdown import Frequencies
-from calibration.dynamics.trials import fit_trials
-from calibration.joint.measurement import _mean, modal_measurement, published_modal_measurement
+from calibration.dynamics.trials import RingDownTrials, fit_trials
+from calibration.joint.measurement import PUBLISHED_MODES, _mean, measured_modes
+from calibration.result.record import Reading
 
 REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 TIME = np.arange(0.0, 6.4, 1.0 / 250.0)
 F1, F2, ZETA1, ZETA2 = 5.65, 29.0, 0.028, 0.05
+
+
+def by_name(trials: RingDownTrials) -> dict[str, Reading]:
+    """What `measured_modes` reads, by name."""
+    return {item.name: item for item in measured_modes(trials)}
 
 
 def second_mode(time: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -46,40 +52,40 @@ def test_a_linear_wing_is_given_its_statistical_error_alone() -> None:
     scores = []
     for seed in range(3):
         fitted = fit_trials(trials(0.0, seed), Frequencies.FITTED, start=None)
-        found = modal_measurement(fitted)
+        found = by_name(fitted)
         scores.append(
             (
-                (found.frequency[1] - F2) / found.frequency_standard_deviation[1],
-                (found.damping_ratio[0] - ZETA1) / found.damping_ratio_standard_deviation[0],
-                (found.damping_ratio[1] - ZETA2) / found.damping_ratio_standard_deviation[1],
+                (found["frequency_2"].value - F2) / found["frequency_2"].deviation,
+                (found["damping_ratio_1"].value - ZETA1) / found["damping_ratio_1"].deviation,
+                (found["damping_ratio_2"].value - ZETA2) / found["damping_ratio_2"].deviation,
             )
         )
         errors = [fit.modes[0].frequency_standard_error for fit in fitted.fits]
         expected = math.sqrt(sum(error**2 for error in errors)) / 5.0
         # Five trials in a row seldom scatter, and windows seldom slope, beyond chance.
-        assert found.frequency_standard_deviation[0] < 6.0 * expected
-        assert found.frequency_standard_deviation[0] >= 0.999 * expected
+        assert found["frequency_1"].deviation < 6.0 * expected
+        assert found["frequency_1"].deviation >= 0.999 * expected
     assert 0.4 < math.sqrt(float(np.mean(np.square(scores)))) < 1.6
 
 
 def test_a_wing_that_softens_is_given_its_spread() -> None:
     slope = 0.07
-    found = modal_measurement(fit_trials(trials(slope, 1), Frequencies.FITTED, start=None))
+    found = by_name(fit_trials(trials(slope, 1), Frequencies.FITTED, start=None))
     # Windows of 0.8 s from 0.4 s on, as far as the mode stands above the noise; spread of the log amplitude.
     decay = 2.0 * math.pi * F1 * ZETA1
     last = min(5.6, math.log(0.012 / (4.0 * 1e-4)) / decay)
     middles = np.arange(0.8, last + 0.4, 0.4)
-    assert found.frequency_standard_deviation[0] == pytest.approx(slope * decay * middles.std(), rel=0.25)
+    assert found["frequency_1"].deviation == pytest.approx(slope * decay * middles.std(), rel=0.25)
 
 
 def test_frequencies_of_spectral_peaks_carry_their_bias() -> None:
     """Skirts of the first mode move the second peak: the authors' procedure is off, and says so."""
-    found = modal_measurement(fit_trials(trials(0.0, 2), Frequencies.PEAKS, start=None))
-    fitted = modal_measurement(fit_trials(trials(0.0, 2), Frequencies.FITTED, start=None))
-    bias = abs(found.frequency[1] - F2)
-    assert bias > 5.0 * fitted.frequency_standard_deviation[1]
-    assert found.frequency_standard_deviation[1] > 0.5 * bias
-    assert found.frequency_standard_deviation[1] < 2.0 * bias
+    found = by_name(fit_trials(trials(0.0, 2), Frequencies.PEAKS, start=None))
+    fitted = by_name(fit_trials(trials(0.0, 2), Frequencies.FITTED, start=None))
+    bias = abs(found["frequency_2"].value - F2)
+    assert bias > 5.0 * fitted["frequency_2"].deviation
+    assert found["frequency_2"].deviation > 0.5 * bias
+    assert found["frequency_2"].deviation < 2.0 * bias
 
 
 def test_mean_over_trials() -> None:
@@ -94,8 +100,8 @@ def test_mean_over_trials() -> None:
 def test_the_published_records() -> None:
     if not REFERENCE.is_dir():
         pytest.skip("the reference data are not beside the project")
-    found = modal_measurement(fit_trials(read_records(REFERENCE)))
-    published = published_modal_measurement()
-    assert found.frequency == pytest.approx(published.frequency, rel=3e-3)
-    for name in ("frequency_standard_deviation", "damping_ratio_standard_deviation"):
-        assert getattr(found, name) == pytest.approx(getattr(published, name), rel=0.02)
+    found = measured_modes(fit_trials(read_records(REFERENCE)))
+    for read, published in zip(found, PUBLISHED_MODES, strict=True):
+        assert read.deviation == pytest.approx(published.deviation, rel=0.02), read.name
+        if read.name.startswith("frequency"):
+            assert read.value == pytest.approx(published.value, rel=3e-3)

@@ -1,11 +1,12 @@
 """Calibration step 2 as a whole: record, quality of fit, report, files."""
 
 import dataclasses
-import math
 
+import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from calibration.paper.figures import calibration_figure, residual_figure
+from calibration.paper.figures import calibration_figure
 from calibration.paper.load_test import StaticCalibration, calibrate_static
 from calibration.static.experiments import published_measurements
 from calibration.static.quality import assess_fit
@@ -39,12 +40,10 @@ def test_tip_stiffness_of_figure_5(result):
 
 
 def test_the_offset_between_the_runs_is_noticed(result):
-    first, second = result.quality.runs
-    assert first.offset - second.offset == pytest.approx(0.47e-3, abs=0.01e-3)
     assert "differ by 0.47 mm" in result.quality.remarks[0]
-    assert result.quality.chi_square == pytest.approx(11.76, abs=0.05)
-    assert result.quality.degrees_of_freedom == 7
-    assert result.quality.tail_probability == pytest.approx(0.109, abs=0.002)
+    chi_square = float(np.sum(result.quality.standardised_residual**2))
+    assert chi_square == pytest.approx(11.76, abs=0.05)
+    assert chi2.sf(chi_square, 7) == pytest.approx(0.109, abs=0.002)
 
 
 def test_a_perfect_fit_has_no_remarks():
@@ -52,21 +51,20 @@ def test_a_perfect_fit_has_no_remarks():
     data = dataclasses.replace(data, displacement=data.load / 680.0)
     quality = assess_fit(data, 680.0)
     assert quality.remarks == ()
-    assert quality.chi_square == pytest.approx(0.0, abs=1e-20)
+    assert quality.standardised_residual == pytest.approx(np.zeros(8), abs=1e-10)
 
 
 def test_an_alternative_that_leaves_the_model_is_left_out():
     """Only the assumption of a shared offset is wide enough to reach the end of this curve."""
     line = stiffness_line(575.2, 101.8, "short", 0.9, 1.06)
     found = calibrate_static(line, particle_count=20_000)
-    assert [alternative.name.split()[0] for alternative in found.alternatives] == ["prior", "density"]
-    assert len(residual_figure(found).axes) == 2
+    assert [*found.alternatives] == ["flat in load", "ratio"]
     assert len(calibrate_static(particle_count=20_000).alternatives) == 3
 
 
 def test_alternatives_stay_near(result):
-    means = {alternative.name: alternative.mean for alternative in result.alternatives}
-    assert list(means.values()) == pytest.approx([1.00868, 1.00730, 1.01337], abs=1e-4)
+    means = [posterior.mean for posterior in result.alternatives.values()]
+    assert means == pytest.approx([1.00868, 1.00730, 1.01337], abs=1e-4)
 
 
 def test_our_own_model_as_curve():
@@ -80,7 +78,5 @@ def test_a_single_pair_will_do():
     data = published_measurements()
     one = dataclasses.replace(data, load=data.load[:1], displacement=data.displacement[:1], run=data.run[:1])
     calibrated = calibrate_static(data=one, particle_count=COUNT)
-    assert calibrated.quality.degrees_of_freedom == 0
     assert 0.02 < calibrated.exact.standard_deviation < 0.0256
-    assert math.isnan(calibrated.quality.tail_probability)
     assert len(calibration_figure(calibrated).axes) == 3

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from calibration.errors import (
     ExperimentDataError,
@@ -17,32 +18,35 @@ from calibration.errors import (
     MassConstraintError,
     OutsideValidityError,
 )
-from calibration.joint.measurement import published_modal_measurement
-from calibration.joint.prior import TOTAL_MASS
-from calibration.paper.procedure import (
-    calibrate_dynamics,
-    damping_coefficients,
-    fit_masses,
-    read_published_results,
-)
+from calibration.joint.measurement import PUBLISHED_MODES
+from calibration.joint.prior import TOTAL_MASS, weighed
+from calibration.joint.wing_table import tabulate_wing
+from calibration.paper.procedure import damping_coefficients, fit_masses, read_published_results
+from calibration.result.record import Reading
 from fe.runtime.modal_system import rayleigh_damping_ratio
 
 REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
-MODAL = published_modal_measurement()
+READ = (weighed(), *PUBLISHED_MODES)
 
 
-def line_model(factor: float, servo: float, pitot: float) -> tuple[float, float]:
+def read(**changed: float) -> tuple[Reading, ...]:
+    """What is published, some of it changed."""
+    return tuple(replace(item, value=changed.get(item.name, item.value)) for item in READ)
+
+
+def line_model(states: NDArray[np.float64]) -> NDArray[np.float64]:
     """Frequencies of a wing whose logarithms are linear, with the reference model's slopes [Hz]."""
+    factor, servo, pitot = states.T
     assert pitot == pytest.approx(TOTAL_MASS - 2.0 * servo)
-    first = 5.632 * factor**0.4114 * math.exp(-0.5075 * (pitot - 0.1345))
-    second = 28.544 * factor**0.3244 * math.exp(-0.2925 * (pitot - 0.1345))
-    return first, second
+    first = 5.632 * factor**0.4114 * np.exp(-0.5075 * (pitot - 0.1345))
+    second = 28.544 * factor**0.3244 * np.exp(-0.2925 * (pitot - 0.1345))
+    return np.column_stack([first, second])
 
 
 @given(factor=st.floats(0.97, 1.05))
 def test_masses_of_a_closed_solution(factor: float) -> None:
-    result = fit_masses(line_model, np.array([factor]), MASSES, MODAL)
+    result = fit_masses(line_model, np.array([factor]), MASSES, READ)
     # The first frequency answers more strongly, so the error of (19), (20) is least where it is met exactly.
     pitot = 0.1345 + math.log(5.632 * factor**0.4114 / 5.6492) / 0.5075
     assert result.samples[0, 2] == pytest.approx(pitot, abs=1e-6)
@@ -85,27 +89,28 @@ def test_our_wing_on_the_published_targets() -> None:
     from fe.reduction.model_cache import reduced_model
 
     authors = read_published_results(REFERENCE)
-    ours = calibrate_dynamics(reduced_model(), authors.samples[:, 0], MODAL)
+    wing = tabulate_wing(reduced_model())
+    ours = fit_masses(wing.frequency, authors.samples[:, 0], wing.validity, READ)
     mean, deviation = ours.samples.mean(axis=0), ours.samples.std(axis=0, ddof=1)
     assert mean[1] == pytest.approx(authors.samples[:, 1].mean(), abs=1e-3)
     assert deviation[1] == pytest.approx(0.0039, abs=2e-4)
     assert mean[3] == pytest.approx(1.030, rel=0.01)
     assert mean[4] == pytest.approx(7.66e-4, rel=0.01)
     assert ours.frequency[:, 0] == pytest.approx(np.full(100, 5.6492), rel=1e-6)
-    with pytest.raises(OutsideValidityError, match=r"sample of e is 1\.5"):
-        calibrate_dynamics(reduced_model(), np.array([1.0, 1.5]), MODAL)
+    with pytest.raises(OutsideValidityError, match=r"modulus of the skin, e is 1\.5"):
+        fit_masses(wing.frequency, np.array([1.0, 1.5]), wing.validity, READ)
 
 
 def test_refusals() -> None:
     one = np.ones(1)
     with pytest.raises(MassConstraintError, match="cannot weigh 2 kg"):
-        fit_masses(line_model, one, MASSES, MODAL, total_mass=2.0)
+        fit_masses(line_model, one, MASSES, read(weighed_mass=2.0))
     with pytest.raises(MassConstraintError, match="cannot weigh nan"):
-        fit_masses(line_model, one, MASSES, MODAL, total_mass=math.nan)
+        fit_masses(line_model, one, MASSES, read(weighed_mass=math.nan))
     with pytest.raises(MassConstraintError, match="at the limit of the model"):
-        fit_masses(line_model, one, MASSES, replace(MODAL, frequency=(7.0, 29.9)))
+        fit_masses(line_model, one, MASSES, read(frequency_1=7.0))
     with pytest.raises(ExperimentDataError, match="neither may be negative"):
-        fit_masses(line_model, one, MASSES, replace(MODAL, damping_ratio=(0.02, 0.5)))
+        fit_masses(line_model, one, MASSES, read(damping_ratio_1=0.02, damping_ratio_2=0.5))
 
 
 def test_bad_files(tmp_path: Path) -> None:

@@ -99,9 +99,3 @@ def test_senseless_requests_are_refused():
     for mean, deviation in ((np.nan, 1.0), (1.0, 0.0), (1.0, np.inf)):
         with pytest.raises(PosteriorError, match="prior"):
             GaussianPrior(mean, deviation)
-
-
-def test_a_stored_density_comes_back_bit_for_bit():
-    _, posterior = gaussian(size=997)
-    again = ScalarPosterior(posterior.grid, posterior.density)
-    assert np.array_equal(again.density, posterior.density)

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
-import numpy as np
 import pytest
 
-from calibration.errors import ExperimentFileError, OutsideValidityError
-from calibration.result.record import STATE
-from calibration.wing.calibrate import quantities_of
+from calibration.errors import ExperimentFileError
 from calibration.wing.lab_data import published_data, read_lab_folder
-from fe.runtime.reduced import ReducedModel
 
 AUTHORS = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 
@@ -68,7 +62,7 @@ def test_parts_of_a_folder(tmp_path: Path, above: str) -> None:
     assert lab.lengths.semi_span.measured == pytest.approx(1.829)
     assert lab.pairs.sha256 == published_data().pairs.sha256
     assert lab.input_hashes["lengths"] != published_data().input_hashes["lengths"]
-    assert lab.total_mass.mass == 0.472
+    assert lab.readings[0].value == 0.472
 
 
 def test_a_weighed_mass(tmp_path: Path) -> None:
@@ -76,7 +70,7 @@ def test_a_weighed_mass(tmp_path: Path) -> None:
     file = folder / "datafiles" / "step3" / "weighed_mass.csv"
     file.write_text("mass,standard_deviation\n455,2\n", encoding="utf-8")
     lab = read_lab_folder(folder)
-    assert (lab.total_mass.mass, lab.total_mass.standard_deviation) == pytest.approx((0.455, 2e-3))
+    assert (lab.readings[0].value, lab.readings[0].deviation) == pytest.approx((0.455, 2e-3))
     assert "weighed_mass" in lab.input_hashes
     assert "weighed_mass.csv read" in lab.origins[2].text
 
@@ -84,12 +78,3 @@ def test_a_weighed_mass(tmp_path: Path) -> None:
 def test_records_that_are_asked_for_must_be_there(tmp_path: Path) -> None:
     with pytest.raises(ExperimentFileError, match="no ring-down record, and --measured asks for them"):
         read_lab_folder(folder_with(tmp_path, "", 1, 2), "measured")
-
-
-def test_a_sample_beyond_the_model_is_told_with_its_unit() -> None:
-    model = cast(
-        ReducedModel,
-        SimpleNamespace(validity=dict.fromkeys(STATE[:3], (0.1, 0.2)) | {STATE[0]: (0.85, 1.15)}),
-    )
-    with pytest.raises(OutsideValidityError, match=r"mass of each servo is 0\.25 kg, .* 0\.1 to 0\.2 kg"):
-        quantities_of(model, np.array([[1.0, 0.25, 0.15, 1.0, 1e-3]]))

@@ -1,0 +1,146 @@
+"""What a healthy wing shows, as polynomials of its parameters, so that many states cost little."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.chebyshev import chebval3d, chebvander3d
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.errors import OutsideValidityError, PosteriorError
+from calibration.joint.prior import wing_priors
+from calibration.result.record import CalibratedFigure
+from calibration.static.stiffness_curve import StiffnessCurve, stiffness_curve_of
+from fe.runtime.modal_system import rayleigh_damping_ratio
+from fe.runtime.reduced import ReducedModel
+
+FloatArray = NDArray[np.float64]
+
+QUANTITIES = (
+    CalibratedFigure("tip_stiffness", "N/m", "tip stiffness"),
+    CalibratedFigure("frequency_1", "Hz", "natural frequency of the first flapwise bending mode"),
+    CalibratedFigure("frequency_2", "Hz", "natural frequency of the second flapwise bending mode"),
+    CalibratedFigure("damping_ratio_1", "1", "damping ratio of the first flapwise bending mode"),
+    CalibratedFigure("damping_ratio_2", "1", "damping ratio of the second flapwise bending mode"),
+    CalibratedFigure("weighed_mass", "kg", "mass of two servos and the pitot tube"),
+)
+"""What is measured of a wing and follows from its parameters."""
+
+TOLERANCE = 1e-5
+"""Largest relative error of a tabulated frequency that is accepted; 0.1 % of f1 is 1 g of servo mass."""
+
+_DEGREES = ((5, 7, 7), (8, 11, 11))
+_CHECKS = 128
+_NAMES = ("young_modulus_factor", "servo_mass", "pitot_mass")
+
+
+@dataclass(frozen=True, eq=False)
+class WingTable:
+    """Chebyshev polynomials of ln f1 and ln f2 over the range of a model, and its tip stiffness.
+
+    Attributes
+    ----------
+    limits : (3, 2) array
+        Range of e [1], servo mass and pitot mass [kg].
+    coefficient : (I, J, K, 2) array
+        Of the products of Chebyshev polynomials in the three scaled parameters.
+    stiffness : StiffnessCurve
+        k(e) of the tip.
+    error : float
+        Largest relative error of a frequency, found at points between the nodes [1].
+    """
+
+    limits: FloatArray
+    coefficient: FloatArray
+    stiffness: StiffnessCurve
+    error: float = 0.0
+
+    @property
+    def validity(self) -> dict[str, tuple[float, float]]:
+        """Range of e and the masses in which the table holds."""
+        return {name: (low, high) for name, (low, high) in zip(_NAMES, self.limits.tolist(), strict=True)}
+
+    def frequency(self, states: ArrayLike) -> FloatArray:
+        """Return f1 and f2 (N, 2) [Hz] at rows (N, 3 or more) of e [1] and the masses [kg].
+
+        Raises
+        ------
+        OutsideValidityError
+            If a state lies outside the range of the model or is not finite.
+        """
+        points = np.atleast_2d(np.asarray(states, dtype=np.float64))[:, :3]
+        inside = (points >= self.limits[:, 0]) & (points <= self.limits[:, 1])
+        if not inside.all():
+            row, place = np.argwhere(~inside)[0]
+            prior = wing_priors(self.validity)[place]
+            unit = "" if prior.unit == "1" else f" {prior.unit}"
+            raise OutsideValidityError(
+                f"the {prior.title} is {points[row, place]:.4g}{unit}, but the model holds for "
+                f"{prior.low:g} to {prior.high:g}{unit}; check the measurements, or build a model with a "
+                "wider range."
+            )
+        scaled = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
+        return _values(scaled, self.coefficient)
+
+    def outputs(self, states: FloatArray) -> FloatArray:
+        """Return `QUANTITIES` (N, 6) of states (N, 5 or more), e, masses, alpha and beta first [SI].
+
+        Raises
+        ------
+        OutsideValidityError
+            As `frequency`.
+        """
+        frequency = self.frequency(states)
+        factor, servo, pitot, alpha, beta = states[:, :5].T[:, :, None]
+        ratio = rayleigh_damping_ratio(alpha, beta, frequency)
+        return np.hstack([self.stiffness.stiffness(factor), frequency, ratio, 2.0 * servo + pitot])
+
+
+def _values(scaled: FloatArray, coefficient: FloatArray) -> FloatArray:
+    first, second, third = scaled.T
+    return np.asarray(np.exp(chebval3d(first, second, third, coefficient)).T)
+
+
+def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTable:
+    """Tabulate a healthy model, its flapwise modes followed by their shape, and check between the nodes.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The wing.
+    tolerance : float
+        Largest relative error of a frequency at 128 points that fill the range evenly [1].
+
+    Raises
+    ------
+    PosteriorError
+        If no polynomial of the degrees tried meets the tolerance.
+    StiffnessCurveError
+        As `stiffness_curve_of`.
+    """
+    limits = np.array([model.validity[name] for name in _NAMES])
+    centre, half = limits.mean(axis=1), 0.5 * np.diff(limits, axis=1)[:, 0]
+    from scipy.stats import qmc  # takes a second to load
+
+    def exact(points: FloatArray) -> FloatArray:
+        # a node may leave the range by a rounding error
+        states = np.clip(centre + half * points, *limits.T)
+        found = (model.modes(**dict(zip(_NAMES, state, strict=True))) for state in states.tolist())
+        return np.array([modes.frequency[list(modes.followed)] for modes in found])
+
+    curve = stiffness_curve_of(model, "tip stiffness of the tailored model")
+    checks = 2.0 * qmc.Halton(3, scramble=False).random(_CHECKS + 1)[1:] - 1.0
+    expected = exact(checks)
+    error = np.inf
+    for degrees in _DEGREES:
+        nodes = [np.cos(np.pi * (np.arange(n + 1) + 0.5) / (n + 1)) for n in degrees]
+        grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+        first, second, third = grid.T
+        coefficient = np.linalg.solve(chebvander3d(first, second, third, degrees), np.log(exact(grid)))
+        coefficient = coefficient.reshape(*(degree + 1 for degree in degrees), 2)
+        error = float(np.abs(_values(checks, coefficient) / expected - 1.0).max())
+        if error <= tolerance:
+            return WingTable(limits, coefficient, curve, error)
+    raise PosteriorError(
+        f"the flapwise frequencies of the model are not smooth over its range: a polynomial errs by "
+        f"{error:.2g} where {tolerance:.2g} are allowed; build a model with a narrower range of masses."
+    )
