@@ -396,11 +396,8 @@ def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> t
 
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:
     """Return the most probable hypotheses with their probabilities, different sets of effects."""
-    found = []
-    for identifiers, probability in list(search.set_probabilities().items())[:count]:
-        options = [item for item in search.all().values() if item.candidate.identifiers == identifiers]
-        found.append((max(options, key=search.score), probability))
-    return found
+    ranked = list(search.set_probabilities().items())[:count]
+    return [(search.best_of(identifiers), probability) for identifiers, probability in ranked]
 
 
 def patch_draws(problem: Problem, fit: CandidateFit, seed: int, count: int = DRAWS) -> list[list[ModelPatch]]:

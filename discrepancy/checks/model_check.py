@@ -130,19 +130,18 @@ def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
     for trial in dynamic:
         periods = float(trial.time[-1] - trial.time[0]) * frequency
         if periods < LEAST_PERIODS:
-            told = {"periods": periods, "frequency": frequency, "least": LEAST_PERIODS}
-            yield fault(FaultKind.TOO_SHORT, trial=trial.name, **told)
+            yield fault(
+                FaultKind.TOO_SHORT, trial=trial.name, periods=periods, frequency=frequency,
+                least=LEAST_PERIODS,
+            )  # fmt: skip
         samples = 1.0 / (trial.interval * frequency)
         if samples < LEAST_SAMPLES:
-            taken = {
-                "samples": samples,
-                "more": 1e3 * samples,
-                "frequency": frequency,
-                "least": LEAST_SAMPLES,
-            }
             slip = samples < LEAST_SAMPLES / 10.0 and 1e3 * samples >= LEAST_SAMPLES
             say = "undersampled_in_milliseconds" if slip else ""
-            yield fault(FaultKind.UNDERSAMPLED, trial=trial.name, say=say, **taken)
+            yield fault(
+                FaultKind.UNDERSAMPLED, trial=trial.name, say=say, samples=samples, more=1e3 * samples,
+                frequency=frequency, least=LEAST_SAMPLES,
+            )  # fmt: skip
 
 
 # ---------------------------------------------------------------- scales

@@ -111,8 +111,7 @@ def _record_faults(trial: Trial, name: str, values: FloatArray, used: BoolArray)
     for extreme, side in ((kept.max(), "largest"), (kept.min(), "smallest")):
         run = clipped_run(kept[order], float(extreme), sorted_load)
         if run:
-            told = {"run": run, "side": side, "extreme": float(extreme)}
-            yield fault(FaultKind.CLIPPED, name, trial.name, **told)
+            yield fault(FaultKind.CLIPPED, name, trial.name, run=run, side=side, extreme=float(extreme))
 
 
 def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = None) -> int:

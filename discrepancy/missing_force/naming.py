@@ -94,8 +94,8 @@ class Explained:
     motions: Sequence[Motion]
 
     @property
-    def covariance(self) -> FloatArray:
-        """Of the effects' unknowns (E, E)."""
+    def effect_covariance(self) -> FloatArray:
+        """Of the effects' unknowns (E, E), beside the missing force as it is."""
         at = len(self.view.shared_precision)
         return self.solution.covariance[at:, at:]
 
@@ -110,7 +110,7 @@ class Explained:
         return np.asarray(mean[:at] + covariance[:at, at:] @ step)
 
     @cached_property
-    def told_covariance(self) -> FloatArray:
+    def covariance(self) -> FloatArray:
         """Of all unknowns, shared ones first, wide enough for what is left to lie along the laws in part.
 
         The process is a force in time that has nothing to do with the motion. What is left of another law
@@ -387,7 +387,7 @@ class ForceSearch:
             step = found.solution.mean[len(view.shared_precision) :] - effect
             far = np.where(np.abs(step) > SETTLED, step, 0.0)
             if far.any():  # a value that it cannot reach is not its own
-                loss = 0.5 * float(far @ np.linalg.lstsq(found.covariance, far, rcond=None)[0])
+                loss = 0.5 * float(far @ np.linalg.lstsq(found.effect_covariance, far, rcond=None)[0])
                 found = replace(found, evidence=found.evidence - loss)
             # along the motion of its base, which follows the readings, a hypothesis looks better than it is
             if best is None or turn == 1 or found.evidence > best.evidence:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from math import isfinite, isnan
 
-from discrepancy.judgement.conclusion import named_effects
+from discrepancy.judgement.conclusion import effects_text, named_effects
 from discrepancy.judgement.when import when_sentence
 from discrepancy.report import text as words
 from discrepancy.report.figures import ReportInput
@@ -114,7 +114,7 @@ def _what(verdict: Verdict) -> str:
     }  # fmt: skip
     named = verdict.effects if verdict.kind in words.NAMING else ()
     kept = [item for item in named if not (item.shape and verdict.family)]
-    found = [words.effects_text(kept), f"an effect of the family {verdict.family}" if verdict.family else ""]
+    found = [effects_text(kept), f"an effect of the family {verdict.family}" if verdict.family else ""]
     return without.get(verdict.kind) or listing(filter(None, found)) or "no name"
 
 

@@ -2,12 +2,13 @@
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from math import floor, isfinite, isnan, log10
 from pathlib import Path
 from typing import Any
 
 from discrepancy.catalogue.entry import Effect
+from discrepancy.judgement.conclusion import effects_text
 from discrepancy.verdict import (
     Estimate,
     ExplainedShare,
@@ -122,12 +123,6 @@ def headline(verdict: Verdict) -> str:
     if about is None:
         return text + "."
     return f"{text} ({about} {probability_text(verdict.probability)})."
-
-
-def effects_text(effects: Iterable[NamedEffect], joint: str = "and") -> str:
-    """Return effects with their places."""
-    found = (f"{item.name} at {item.place}" if item.place else item.name for item in effects)
-    return listing(dict.fromkeys(found), joint)
 
 
 def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
