@@ -8,8 +8,8 @@ SENTENCES: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").re
 """Sentences by table and name; braces stand for what the caller gives."""
 
 
-def said(name: str, **values: object) -> str:
+def said(sentence: str, /, **values: object) -> str:
     """Return a sentence by table and name, such as "faults.clipped", with its values."""
-    table, _, key = name.partition(".")
+    table, _, key = sentence.partition(".")
     text: str = SENTENCES[table][key]
     return text.format(**values)
