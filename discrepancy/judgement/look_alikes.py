@@ -54,7 +54,7 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     effects = {effect.identifier: effect for effect in compared}
     named = {effect.identifier: effect.name for effect in verdict.effects}
     alike = {
-        identifier for identifier, effect in effects.items() if not named.keys().isdisjoint(effect.confusable)
+        identifier for identifier, effect in effects.items() if not set(effect.confusable).isdisjoint(named)
     }
     alike |= {other for name in named.keys() & effects.keys() for other in effects[name].confusable}
     alike -= named.keys()
@@ -63,8 +63,8 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     tried, untried = sorted(alike & effects.keys()), sorted(alike - effects.keys())
     missed = said("remarks.not_compared", names=", ".join(untried), was=_was(untried)) if untried else ""
     if tried:
-        compared = said("remarks.compared", names=", ".join(tried), was=_was(tried))
-        return f"{text}{compared}{f'; {missed}' if missed else '.'}"
+        words = said("remarks.compared", names=", ".join(tried), was=_was(tried))
+        return f"{text}{words}{f'; {missed}' if missed else '.'}"
     return f"{text} Of what is known to look alike, {missed}" if missed else text
 
 

@@ -133,7 +133,7 @@ def _meaning(
     for name, shape in shapes.items():
         values = np.array([shape.get(channel, 0.0) for channel in channels]) / noise
         compared.append((values, "dynamics or load", said("location.shape", name=name)))
-    candidates = [(_squared_cosine(weights, values), *told) for values, *told in compared if np.any(values)]
+    candidates = [(_squared_cosine(weights, v), kind, words) for v, kind, words in compared if np.any(v)]
     best = max(candidates, key=lambda row: row[0])
     if best[0] < ALIKE:
         listed = np.argsort(-np.abs(weights))[:3]
