@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.judgement.naming import name
-from discrepancy.judgement.rules import Case
+from discrepancy.judgement.rules import SURE, UNSURE, Case
 from discrepancy.missing_force.hypotheses import key_of
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import VerdictKind
@@ -309,6 +310,12 @@ def test_what_all_probable_sets_hold_is_named_where_it_fits_alone(searched, few)
     assert outcome[0].probability == pytest.approx(1.0)
     for shares in ({Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}, {right: 0.8, (): 0.2}):
         assert Case(problem, found, shares).shared() is None
+
+
+def test_the_rules_stand_in_the_page_in_their_order() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "discrepancy.md").read_text(encoding="utf-8")
+    table = "".join(f"| {rule.kind} | {rule.when} |\n" for rule in (*UNSURE, *SURE))
+    assert f"| verdict | where |\n| --- | --- |\n{table}\n" in page
 
 
 # ---------------------------------------------------------------- families
