@@ -47,7 +47,7 @@ from reporting.progress import Progress, SilentProgress
 from reporting.words import be, listing
 
 from .errors import CampaignDataError
-from .force_told import shown_force, told_force
+from .force_told import seen_force
 from .model_choice import load_model
 from .search_settings import SEARCH
 from .verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
@@ -193,8 +193,7 @@ def investigate(
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in NO_GAP:
         with stage("Seeing the missing force", "force"):
-            missing = shown_force(problem, search, fit)
-            force = None if missing is None else told_force(problem, search, fit, missing)
+            missing, force = seen_force(problem, search, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, seed=seed)

@@ -18,9 +18,10 @@ from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.wider_noise import noise_levels, refitted
 from discrepancy.location.residuals import ResidualSet
+from discrepancy.missing_force.force import missing_force, told_force
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share, orders
+from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share
 from discrepancy.models.port_units import port_unit
 from discrepancy.search.starting_points import are_related
 from discrepancy.search.strategy import Search
@@ -100,20 +101,15 @@ class ByForce(Court[Explained]):
 
     def gap(self) -> str:
         """Return size and port of the missing force, and the variable that orders it."""
-        at = self.force.best()
-        (port,) = at.processes
-        rows = []
-        for trial, motion in zip(at.view.trials, at.motions, strict=True):
-            moving = motion.positions[:, port], motion.speeds[:, port]
-            rows.append(np.array([motion.forces[port], *moving, trial.fine_time])[:, :: trial.parts])
-        force, *variables = np.concatenate(rows, axis=1)
-        shares, ordered_by = orders(force, *variables)
+        missing = missing_force(self.force, self.force.best())
+        if missing is None:
+            return ""
+        told = told_force(missing, self.problem.model.inner)
         order = said("verdict.not_ordered")
-        if ordered_by:
-            most = 100.0 * max(shares.values())
-            order = said("verdict.ordered_by", names=" and ".join(ordered_by), share=most)
-        size, port_name = float(np.sqrt(np.mean(force**2))), self.force.ports[port]
-        return said("verdict.force", size=size, unit=self._unit(at), port=port_name, order=order)
+        if told.ordered_by:
+            most = 100.0 * max(told.orders.values())
+            order = said("verdict.ordered_by", names=" and ".join(told.ordered_by), share=most)
+        return said("verdict.force", told=told, order=order)
 
 
 class ByReadings(Court[CandidateFit]):

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
-from discrepancy.report.kit import heat_map, panels
+from discrepancy.report.kit import heat_map, panels, plain_powers
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.verdict import Scores
 from reporting.figures import OBSERVED, PAST, PREDICTION, publication_style
@@ -50,7 +50,7 @@ def _map_of_names(
     figure, ((axes,),) = panels(1, 1, 0.175 * len(rows) + 1.6)
     words = ([name.replace("_", " ") for name in names] for names in (rows, columns))
     image = heat_map(axes, values, (next(words), next(words)), norm, 55, texts)
-    axes.set_aspect("equal")
+    axes.set_aspect("equal", anchor="W")
     axes.tick_params(labelsize=6.5)
     return figure, axes, image
 
@@ -72,9 +72,10 @@ def separability_figure(found: Separability) -> Figure | None:
         for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
             if row != column:
                 axes.plot(column, row, "x", color=PREDICTION, ms=4.0, mew=1.1)
-        shrink = min(1.0, 2.2 / figure.get_figheight())
-        bar = figure.colorbar(image, ax=axes, shrink=shrink, fraction=0.03, pad=0.02)
-        bar.set_label("d², squared distance in noise deviations")
+        cell = 1.0 / len(names)
+        bar = figure.colorbar(image, cax=axes.inset_axes((1.0 + 0.4 * cell, 0.0, 0.4 * cell, 1.0)))
+        bar.set_label("squared distance d²")
+        plain_powers(bar.ax.yaxis, (1.0,))
         bar.outline.set_linewidth(0.5)
         bar.ax.axhline(CONFUSED, color=PREDICTION, lw=1.2)
         bar.ax.axhline(DETECTED, color="white", lw=1.2)
