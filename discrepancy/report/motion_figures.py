@@ -1,7 +1,7 @@
 """Motion before and after: histories, spectra, and frequency and damping over the amplitude."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -230,11 +230,8 @@ def _clear(curve: Backbone) -> Backbone | None:
     keep = curve.damping_ratio_error < limit
     if not keep.any():
         return None
-    fields = (
-        "time", "amplitude", "amplitude_error", "frequency", "frequency_error", "damping_ratio",
-        "damping_ratio_error",
-    )  # fmt: skip
-    return Backbone(curve.mode, *(getattr(curve, name)[keep] for name in fields))
+    names = [item.name for item in fields(Backbone)[1:]]
+    return Backbone(curve.mode, *(getattr(curve, name)[keep] for name in names))
 
 
 def _draw_points(axes: Axes, curves: Sequence[Backbone], name: str, factor: float, scale: float) -> None:
