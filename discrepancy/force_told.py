@@ -1,72 +1,53 @@
 """What a verdict tells of the missing force: size, motion, what orders it, and what share of it a law is."""
 
-from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.force import ForceCourse, MissingForce, missing_force
+from discrepancy.missing_force.force import MissingForce, missing_force, told_force
 from discrepancy.missing_force.hypotheses import key_of, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import OF_PREDICTIONS, ForceShares, Share, orders
-from discrepancy.models.port_units import port_unit
+from discrepancy.missing_force.shares import OF_PREDICTIONS, ForceShares, Share
 from discrepancy.search.strategy import Search
-from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
+from discrepancy.verdict import ForceAtPort, ShareOfForce
+
+CANNOT = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
+"""What keeps a picture or a share from being told: it is left out."""
 
 
-def told_force(problem: Problem, search: Search, fit: CandidateFit, missing: MissingForce) -> ForceAtPort:
-    """Return what is told of a missing force beside the fit that stands for a verdict.
-
-    Parameters
-    ----------
-    problem : Problem
-        Campaign and model.
-    search : Search
-        With its hypotheses along the missing force, if it has any.
-    fit : CandidateFit
-        What stands for the verdict.
-    missing : MissingForce
-        As it is drawn.
-    """
-    force, position, speed, time = (
-        np.concatenate([getattr(item, name) for item in missing.courses])
-        for name in ("force", "position", "speed", "time")
-    )
-    by_variable, ordered_by = orders(force, position, speed, time)
-    rms, displacement, velocity = (float(np.sqrt(np.mean(item**2))) for item in (force, position, speed))
-    shares = _shares(problem, search, fit) if missing.law else (None, None)
-    ports = problem.model.ports()
-    laws = [(term.effect.name, term.place) for term in fit.candidate.terms if term.place in ports]
-    several = missing.law and len({place for _, place in laws}) > 1
-    return ForceAtPort(
-        missing.port, port_unit(missing.port, problem.model.inner), rms, displacement, velocity,
-        _largest(missing.courses), missing.evidence, missing.correlation_time, by_variable, ordered_by,
-        " and ".join(f"{name} at {place}" for name, place in laws) if several else missing.law, *shares,
-    )  # fmt: skip
-
-
-def _largest(courses: Sequence[ForceCourse]) -> ForceMoment:
-    item = max(courses, key=lambda one: float(np.abs(one.force).max()))
-    at = int(np.abs(item.force).argmax())
-    course = (item.time, item.force, item.position, item.speed)
-    return ForceMoment(item.trial, *(float(values[at]) for values in course))
-
-
-def _shares(
+def seen_force(
     problem: Problem, search: Search, fit: CandidateFit
-) -> tuple[ShareOfForce | None, ShareOfForce | None]:
-    """Return the shares that a hypothesis is of the missing force, in fitted and in held-out trials."""
+) -> tuple[MissingForce | None, ForceAtPort | None]:
+    """Return the missing force beside the fit of a verdict, its law drawn through it, and what is told of it.
+
+    None where no force can be seen. `search`: with its hypotheses along the missing force, if it has any.
+    """
+    terms = fit.candidate.terms
     try:
-        force, found = _along(problem, search, fit)
-        if found is None:
+        ports = problem.model.ports()
+        if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
             return None, None
+        force, found = _along(problem, search, fit)
+        missing = missing_force(force, force.whole if found is None else found)
+    except CANNOT:
+        return None, None
+    if missing is None:
+        return None, None
+    told = told_force(missing, problem.model.inner)
+    laws = [(term.effect.name, term.place) for term in terms if term.place in ports]
+    if missing.law and len({place for _, place in laws}) > 1:
+        told = replace(told, law=" and ".join(f"{name} at {place}" for name, place in laws))
+    if not missing.law or found is None:
+        return missing, told
+    try:
         shares = ForceShares(force)
         outside = _share(shares.of(found, held_out=True)) if shares.has_held_out else None
-        return _share(shares.of(found, held_out=False)), outside
-    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # a share that cannot be told is left out
-        return None, None
+        return missing, replace(told, fitted=_share(shares.of(found, held_out=False)), held_out=outside)
+    except CANNOT:
+        return missing, told
 
 
 def _along(problem: Problem, search: Search, fit: CandidateFit) -> tuple[ForceSearch, Explained | None]:
@@ -84,16 +65,3 @@ def _along(problem: Problem, search: Search, fit: CandidateFit) -> tuple[ForceSe
 def _share(share: Share) -> ShareOfForce:
     sizes = (share.value, *share.interval, share.left, share.whole)
     return ShareOfForce(*sizes, ahead=share.of == OF_PREDICTIONS, trials=share.trials, tested=share.tested)
-
-
-def shown_force(problem: Problem, search: Search, fit: CandidateFit) -> MissingForce | None:
-    """Return the missing force, with the law of a verdict drawn through it; None where none can be seen."""
-    terms = fit.candidate.terms
-    try:
-        ports = problem.model.ports()
-        if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
-            return None
-        force, found = _along(problem, search, fit)
-        return missing_force(force, force.whole if found is None else found)
-    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # a picture that cannot be is left out
-        return None

@@ -1,12 +1,11 @@
 """The whole way from a campaign to a verdict: check, locate, name, prove, propose the next experiment."""
 
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import isnan, nan
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -39,13 +38,16 @@ from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wrapped import innermost
+from discrepancy.search.hypotheses import Tell
 from discrepancy.search.strategy import Search
+from discrepancy.sentences import said
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from fe.runtime.patch import ModelPatch
-from reporting.words import be
+from reporting.progress import Progress, SilentProgress
+from reporting.words import be, listing
 
 from .errors import CampaignDataError
-from .force_told import shown_force, told_force
+from .force_told import seen_force
 from .model_choice import load_model
 from .search_settings import SEARCH
 from .verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
@@ -53,6 +55,7 @@ from .verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKi
 DRAWS = 400
 IMPLAUSIBLE = 4.0
 """Prior deviations from which on a parameter or a gain is remarked on."""
+NO_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
 OPEN_KINDS = (
     VerdictKind.GROUP,
     VerdictKind.UNEXPLAINED,
@@ -60,22 +63,6 @@ OPEN_KINDS = (
     VerdictKind.NAMED_IN_PART,
     VerdictKind.BELOW_LIMIT,
 )
-
-
-class Stage(Protocol):
-    """A stretch of work under way."""
-
-    def advance(self, amount: int = 1, detail: str | None = None) -> None:
-        """Report so many parts done, and what is done now."""
-
-
-class Progress(Protocol):
-    """Where the work reports how far it is; `reporting.progress` has implementations."""
-
-    def stage(
-        self, description: str, total: int | None = None, unit: str = ""
-    ) -> AbstractContextManager[Stage]:
-        """Open a stretch of work."""
 
 
 @dataclass(frozen=True)
@@ -159,46 +146,42 @@ def investigate(
         If the campaign cannot be compared with the model at all.
     """
     campaign, model = _given(campaign, model)
-    seconds: dict[str, float] = {}
+    shown, seconds = progress or SilentProgress(), {}
 
-    def stage(description: str, key: str) -> "_Timed":
-        return _Timed(progress, description, key, seconds)
+    @contextmanager
+    def stage(description: str, key: str) -> Iterator[Tell]:
+        began = time.perf_counter()
+        with shown.stage(description) as under_way:
+            yield lambda what: under_way.advance(0, what)
+        seconds[key] = time.perf_counter() - began
 
     with stage("Checking the data", "check"):
         campaign, faults = checked(campaign, model)
+    remarks = [fault.sentence for fault in faults]
     fatal = [fault for fault in faults if fault.fatal]
     if fatal:
-        verdict = Verdict(
-            VerdictKind.DATA_ERROR,
-            fatal[0].sentence,
-            float("nan"),
-            float("nan"),
-            remarks=tuple(fault.sentence for fault in faults),
-        )
+        kind = VerdictKind.DATA_ERROR
+        verdict = Verdict(kind, fatal[0].sentence, nan, nan, remarks=tuple(remarks))
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
     setting = Setting(campaign, model, model.scales(campaign))
-    with stage("Fitting what is known, and searching the catalogue", "name") as searching:
+    with stage("Fitting what is known, and searching the catalogue", "name") as tell:
         problem = Problem(campaign, model, setting)
         cleaned = without_wrong_ends(problem)
         if cleaned is not campaign:
             campaign, setting = cleaned, replace(setting, campaign=cleaned)
             problem = Problem(campaign, model, setting)
         catalogue = load_catalogue() if effects is None else effects
-        verdict, search, fit = name(problem, catalogue, tell=searching.tell)
+        verdict, search, fit = name(problem, catalogue, tell=tell)
         verdict = with_untested(verdict, setting, catalogue)
-    remarks = [fault.sentence for fault in faults]
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
         share = solver_share(problem, fit)
         if share > SEARCH.solver_share:
-            remarks.append(
-                f"The time steps cost up to {share:.2g} of the noise (rms), more than the "
-                f"{SEARCH.solver_share:g} that is wanted: probabilities may be too sharp."
-            )
+            remarks.append(said("remarks.time_steps", share=share, wanted=SEARCH.solver_share))
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.none, sensitivities=thorough)
         after = residual_set(problem, fit, sensitivities=False) if fit is not search.none else before
-    location = None
+    location, missing, force, proof = None, None, None, None
     windows: tuple[GapWindow, ...] = ()
     if thorough:
         with stage("Locating the gap", "locate"):
@@ -208,12 +191,9 @@ def investigate(
                 windows += residual_windows(after, seed=seed, with_effect=True)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
-    missing, force = None, None
-    if thorough and verdict.kind not in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT):
+    if thorough and verdict.kind not in NO_GAP:
         with stage("Seeing the missing force", "force"):
-            missing = shown_force(problem, search, fit)
-            force = None if missing is None else told_force(problem, search, fit, missing)
-    proof = None
+            missing, force = seen_force(problem, search, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, seed=seed)
@@ -227,51 +207,31 @@ def investigate(
         parameters=calibrated_parameters(problem, fit), force=force,
     )  # fmt: skip
     return Investigation(
-        campaign,
-        model,
-        faults,
-        verdict,
-        location,
-        proof,
-        before,
-        after,
-        problem,
-        search,
-        fit,
-        seconds,
+        campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds,
         missing,
-    )
+    )  # fmt: skip
 
 
 def _dated(verdict: Verdict, windows: tuple[GapWindow, ...]) -> str:
     """Return the sentence of a verdict, with when the gap is there where that tells something."""
-    acting = acting_sentence(verdict.effects)
-    if acting:
-        return f"{verdict.sentence} {acting}"
-    known = verdict.kind is VerdictKind.NOTHING_MISSING or verdict.kind is VerdictKind.BELOW_LIMIT
-    if known or not (begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED):
-        return verdict.sentence
-    return f"{verdict.sentence} {when_sentence(windows)}".strip()
+    when = acting_sentence(verdict.effects)
+    dated = begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
+    if not when and verdict.kind not in NO_GAP and dated:
+        when = when_sentence(windows)
+    return f"{verdict.sentence} {when}".strip()
 
 
 def _remarks(
     problem: Problem, catalogue: Sequence[Effect], verdict: Verdict, search: Search, fit: CandidateFit
 ) -> list[str]:
     """Return what has to be said beside a verdict."""
-    remarks = list(problem.campaign.remarks)
-    remarks += strained(problem, fit)
-    remarks += without_port(problem.setting, catalogue)
+    remarks = [*problem.campaign.remarks, *strained(problem, fit), *without_port(problem.setting, catalogue)]
     alike = look_alike_remark(verdict, search.effects)
     remarks += [] if alike is None else [alike]
     if not problem.model.parameters:
-        remarks.append(
-            f"The model {problem.model.name!r} has no uncertain parameter, so a stiffness or damping a "
-            "little off can be taken for an effect: give it some with their deviations."
-        )
+        remarks.append(said("remarks.no_parameter", model=problem.model.name))
     if fit.candidate.terms and not fit.converged:
-        remarks.append(
-            "The fit of the verdict had not settled when it ended: its intervals may be too narrow."
-        )
+        remarks.append(said("remarks.not_settled"))
     return remarks
 
 
@@ -301,10 +261,8 @@ def checked(
     known = [item.name for item in model.parameters]
     for parameter in campaign.parameters:
         if parameter not in known:
-            raise CampaignDataError(
-                f"The campaign states the parameter {parameter!r}, which {model.name} does not have; it has "
-                f"{', '.join(known) or 'none'}: correct the name, or leave [parameters.{parameter}] out."
-            )
+            told = {"model": model.name, "known": ", ".join(known) or "none"}
+            raise CampaignDataError(said("remarks.unknown_parameter", parameter=parameter, **told))
     faults = check_data(campaign)
     campaign = mark_outliers(campaign)
     faults = (*faults, *check_against_model(campaign, model))
@@ -333,10 +291,8 @@ def without_wrong_ends(problem: Problem) -> Campaign:
             found = wrong_ends(residual, data.weight > 0.0)
             for number in np.flatnonzero(found.any(axis=0)):
                 count = int(found[:, number].sum())
-                remarks.append(
-                    f"{count} of {len(found)} readings of {trial.channels[number]!r} in the trial "
-                    f"{trial.name!r}, at its ends, {be(count)} far off model and neighbours and left out."
-                )
+                told = {"channel": trial.channels[number], "trial": trial.name, "are": be(count)}
+                remarks.append(said("remarks.wrong_ends", count=count, total=len(found), **told))
             trials[trial.name] = replace(trial, used=trial.used & ~found)
     if len(remarks) == len(problem.campaign.remarks):
         return problem.campaign
@@ -353,8 +309,7 @@ def strained(problem: Problem, fit: CandidateFit) -> list[str]:
     names += [f"The gain of the channel {name!r}" for name in problem.shared.gain_channels]
     rows = zip(names, fit.point.shared, problem.shared.precision, strict=True)
     return [
-        f"{name} lies {abs(u):.1f} of its stated deviations off in the hypothesis of the verdict, which "
-        "rests on that deviation: check it."
+        said("remarks.strained", name=name, off=abs(u))
         for name, u, precision in rows
         if precision > 0.0 and abs(u) > IMPLAUSIBLE
     ]
@@ -365,14 +320,12 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
     names = [effect.name for effect in effects if NO_PORT in (effect.unavailable(setting) or "")]
     if not names:
         return []
-    what = "a [[port]] in the model's file"
-    model = innermost(setting.model)
+    model, such_as = innermost(setting.model), ""
     if isinstance(model, LumpedModel) and model.description.input:
         first = model.description.input[0]
         vector = ", ".join(f"{value:g}" for value in first.vector)
-        what += f", such as vector = [{vector}] between the ground and {first.name!r}"
-    listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-    return [f"Not tested for lack of a port: {listed}; declare {what} where such a force may act."]
+        such_as = said("remarks.such_as", vector=vector, first=first.name)
+    return [said("remarks.no_port", names=listing(names), such_as=such_as)]
 
 
 def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> tuple[NotFitted, ...]:
@@ -385,22 +338,21 @@ def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> t
             rows.append(NotFitted(effect.identifier, unavailable))
         elif effect.identifier not in fitted:
             gain = search.promised.get(effect.identifier, nan)
-            why = f"screened out: {gain:.1f} nat at most beside the model as it is"
-            if effect.identifier in search.problem.refusals and not 0.0 < gain < SEARCH.worth_fitting:
-                why = f"could not be fitted: {search.problem.refusals[effect.identifier]}"
+            why = said("remarks.screened_out", gain=gain)
+            cause = search.problem.refusals.get(effect.identifier)
+            if cause is not None and not 0.0 < gain < SEARCH.worth_fitting:
+                why = said("remarks.could_not", cause=cause)
             elif isnan(gain):
-                why = f"less promising than others {'along the missing force' if along else 'at first sight'}"
+                where = "along the missing force" if along else "at first sight"
+                why = said("remarks.less_promising", where=where)
             rows.append(NotFitted(effect.identifier, why, gain))
     return tuple(rows)
 
 
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:
     """Return the most probable hypotheses with their probabilities, different sets of effects."""
-    found = []
-    for identifiers, probability in list(search.set_probabilities().items())[:count]:
-        options = [item for item in search.all().values() if item.candidate.identifiers == identifiers]
-        found.append((max(options, key=search.score), probability))
-    return found
+    ranked = list(search.set_probabilities().items())[:count]
+    return [(search.best_of(identifiers), probability) for identifiers, probability in ranked]
 
 
 def patch_draws(problem: Problem, fit: CandidateFit, seed: int, count: int = DRAWS) -> list[list[ModelPatch]]:
@@ -412,34 +364,8 @@ def patch_draws(problem: Problem, fit: CandidateFit, seed: int, count: int = DRA
         size = fit.candidate.size
         root = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))
         draws = fit.point.effect + generator.standard_normal((count, size)) @ root.T
-    patches: list[list[ModelPatch]] = []
-    at = 0
-    for term in fit.candidate.terms:
-        width = len(term.parameters)
-        alone = Candidate((term,))
-        patches.append([alone.patch(problem.setting, draw[at : at + width]) for draw in draws])
-        at += width
-    return patches
-
-
-class _Timed:
-    def __init__(
-        self, progress: Progress | None, description: str, key: str, seconds: dict[str, float]
-    ) -> None:
-        self._stage = nullcontext() if progress is None else progress.stage(description)
-        self._key, self._seconds = key, seconds
-        self._under_way: Stage | None = None
-
-    def __enter__(self) -> "_Timed":
-        self._began = time.perf_counter()
-        self._under_way = self._stage.__enter__()
-        return self
-
-    def tell(self, what: str) -> None:
-        """Say what is done now."""
-        if self._under_way is not None:
-            self._under_way.advance(0, what)
-
-    def __exit__(self, *error: object) -> None:
-        self._stage.__exit__(*error)  # type: ignore[arg-type]
-        self._seconds[self._key] = time.perf_counter() - self._began
+    parts = [fit.candidate.parts(draw) for draw in draws]
+    return [
+        [Candidate((term,)).patch(problem.setting, part[number]) for part in parts]
+        for number, term in enumerate(fit.candidate.terms)
+    ]

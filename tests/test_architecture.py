@@ -52,8 +52,8 @@ ROOMS = {
         "command", "plan_command", "watch_command", "view_command", "__main__",
     ),
     "discrepancy": (
-        "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",
-        "files", "search_settings", "fits", "missing_force", "search", "judgement", "force_told", "checks",
+        "errors", "sentences", "campaign", "models", "lumped_models", "location", "catalogue",
+        "document_types", "verdict", "files", "search_settings", "fits", "missing_force", "search", "judgement", "force_told", "checks",
         "sources", "model_choice", "workflow", "parameters", "application", "self_calibration", "report",
         "verdict_folder",
     ),

@@ -52,8 +52,8 @@ from pydantic import ConfigDict, Field
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Number, Setting, ShapeParameter
-from discrepancy.catalogue.needs import NEEDS, USUAL, Needing, first_reason
-from discrepancy.catalogue.places import PLACES, Asked, Kinds, Target, targets_of
+from discrepancy.catalogue.needs import NEEDS, USUAL, first_reason
+from discrepancy.catalogue.places import PLACES, Entry, Kinds, Target, targets_of
 from discrepancy.catalogue.scales import SCALES, Here, names_with
 from discrepancy.errors import CatalogueError
 from fe.runtime.errors import InvalidPatchError
@@ -125,15 +125,16 @@ def _effect(row: object, where: str) -> Effect:
         for n, item in enumerate(section.primitives, start=1)
     )
     _check_in_time(recipes, section.acts_on)
-    word = section.places if isinstance(section.places, str) else ""
-    primitives = tuple(PRIMITIVES[recipe.kind] for recipe in recipes)
-    used = frozenset().union(*(recipe.moments for recipe in recipes))
-    needing = Needing(section.id, section.acts_on, primitives, used, word)
+    entry = Entry(
+        section.id, section.acts_on, section.places if isinstance(section.places, str) else "",
+        section.preferred, tuple(PRIMITIVES[recipe.kind] for recipe in recipes),
+        frozenset().union(*(recipe.moments for recipe in recipes)),
+    )  # fmt: skip
     return Effect(
         identifier=section.id,
-        build=partial(_build, recipes, section.acts_on, word),
-        places=partial(_places, section.places, section.acts_on, section.preferred),
-        unavailable=partial(first_reason, section.needs, needing),
+        build=partial(_build, recipes, entry),
+        places=partial(_places, section.places, entry),
+        unavailable=partial(first_reason, section.needs, entry),
         **{key: getattr(section, key) for key in _AS_WRITTEN},
     )
 
@@ -161,11 +162,9 @@ def _check_words(section: EffectSection, names: frozenset[str], where: str) -> N
             )
 
 
-def _places(
-    places: str | tuple[str, ...] | None, kinds: Kinds, preferred: tuple[str, ...], setting: Setting
-) -> tuple[str, ...]:
+def _places(places: str | tuple[str, ...] | None, entry: Entry, setting: Setting) -> tuple[str, ...]:
     if isinstance(places, str):
-        return PLACES[places][0](Asked(setting, kinds, preferred))
+        return PLACES[places][0](setting, entry)
     return ("",) if places is None else places
 
 
@@ -280,16 +279,11 @@ def _check_in_time(recipes: tuple[_Recipe, ...], acts_on: Kinds) -> None:
 
 
 def _build(
-    recipes: tuple[_Recipe, ...],
-    kinds: Kinds,
-    word: str,
-    setting: Setting,
-    values: Mapping[str, float],
-    place: str,
+    recipes: tuple[_Recipe, ...], entry: Entry, setting: Setting, values: Mapping[str, float], place: str
 ) -> ModelPatch:
     primitives: list[Primitive] = []
-    for target in targets_of(word, place, setting):
-        here = Here(setting, target, kinds, values)
+    for target in targets_of(entry.word, place, setting):
+        here = Here(setting, target, entry.kinds, values)
         for recipe in recipes:
             try:
                 primitives += recipe.built(here)

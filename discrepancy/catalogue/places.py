@@ -2,15 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from math import isinf
 
 import numpy as np
 
 from discrepancy.campaign.noise import MAINS, aliased
-from discrepancy.campaign.records import Campaign, Channel, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Channel, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
-from fe.runtime.patch import EVERY_CHANNEL
+from discrepancy.sentences import said
+from fe.runtime.patch import EVERY_CHANNEL, Primitive
 from fe.runtime.planform_forces import PLANFORM
 
 Kinds = frozenset[TrialKind]
@@ -40,100 +40,100 @@ def channels(setting: Setting, kinds: Kinds = EVERY_TRIAL) -> tuple[Channel, ...
     return tuple(channel for name, channel in setting.campaign.channels.items() if name in recorded)
 
 
-@dataclass(frozen=True, eq=False)
-class _Same:
-    """A campaign, equal to itself only; it holds arrays, so it has no hash of its own."""
-
-    campaign: Campaign
-
-    def __hash__(self) -> int:
-        return id(self.campaign)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.campaign is other.campaign
-
-
 def largest_reading(setting: Setting, names: Names, kinds: Kinds) -> float:
     """Return the largest magnitude among the used readings of channels [its unit], 1 if all are zero."""
-    return _largest_reading(_Same(setting.campaign), names, kinds)
-
-
-@lru_cache(maxsize=512)  # patches are built at every step of a fit
-def _largest_reading(same: _Same, names: Names, kinds: Kinds) -> float:
-    read = [
-        np.abs(trial.values[trial.used[:, column], column])
-        for trial in same.campaign.fitted
-        for column, name in enumerate(trial.channels)
-        if trial.kind in kinds and name in names
-    ]
-    largest = float(max((np.max(values) for values in read if values.size), default=0.0))
-    return largest if largest > 0.0 and np.isfinite(largest) else 1.0
+    if (names, kinds) not in setting.largest:
+        read = [
+            np.abs(trial.values[trial.used[:, column], column])
+            for trial in trials(setting, kinds)
+            for column, name in enumerate(trial.channels)
+            if name in names
+        ]
+        largest = float(max((np.max(values) for values in read if values.size), default=0.0))
+        setting.largest[names, kinds] = largest if largest > 0.0 and np.isfinite(largest) else 1.0
+    return setting.largest[names, kinds]
 
 
 # ---------------------------------------------------------------- places
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What places are asked for: the setting, the trials that the effect changes, and the ports to prefer.
+class Entry:
+    """What an effect asks of a setting, as its file says.
 
-    `preferred` are ports that stand for all where the model has one of them. The port "planform" of a force
-    that is spread over an area is "span" in a model without one.
+    Attributes
+    ----------
+    identifier : str
+        Of the effect.
+    kinds : frozenset of TrialKind
+        Trials that it changes.
+    word : str
+        For its places, empty where they are given.
+    preferred : tuple of str
+        Ports that stand for all where the model has one of them. The port "planform" of a force that is
+        spread over an area is "span" in a model without one.
+    primitives : tuple of type
+        What it is made of.
+    moments : frozenset of str
+        Events of which a trial must have all.
     """
 
-    setting: Setting
+    identifier: str = ""
     kinds: Kinds = EVERY_TRIAL
+    word: str = ""
     preferred: Names = ()
+    primitives: tuple[type[Primitive], ...] = ()
+    moments: frozenset[str] = frozenset()
 
 
-def _all_ports(asked: Asked) -> Names:
-    return asked.setting.model.ports()
+ANY = Entry()
+"""An effect of any kind."""
 
 
-def state_ports(asked: Asked) -> Names:
+def state_ports(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the ports of states, at which laws are flows."""
-    return tuple(name for name, scale in asked.setting.scales.ports.items() if scale.of_state)
+    return tuple(name for name, scale in setting.scales.ports.items() if scale.of_state)
 
 
-def force_ports(asked: Asked) -> Names:
+def force_ports(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the ports where forces act: those of `preferred` that the model has, else all."""
-    flows, spread = state_ports(asked), PLANFORM in asked.setting.scales.ports
-    known = tuple(port for port in asked.setting.model.ports() if port not in flows)
-    wanted = ["span" if name == PLANFORM and not spread else name for name in asked.preferred]
+    flows, spread = state_ports(setting, entry), PLANFORM in setting.scales.ports
+    known = tuple(port for port in setting.model.ports() if port not in flows)
+    wanted = ["span" if name == PLANFORM and not spread else name for name in entry.preferred]
     return tuple(name for name in wanted if name in known or name == PLANFORM) or known
 
 
-def _held_ports(asked: Asked) -> Names:
+def _held_ports(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the ports that something holds, for forces that depend on where a port is."""
-    free = {name for name, scale in asked.setting.scales.ports.items() if scale.free}
-    return tuple(port for port in force_ports(asked) if port not in free)
+    free = {name for name, scale in setting.scales.ports.items() if scale.free}
+    return tuple(port for port in force_ports(setting, entry) if port not in free)
 
 
-def turning_ports(asked: Asked) -> Names:
+def turning_ports(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the ports whose motion turns or is held, for forces with a memory or a zero.
 
     What moves one way only, a body that falls, cannot tell such a force from drag: speed and way grow as one.
     """
-    ports = asked.setting.scales.ports
-    return tuple(name for name in force_ports(asked) if name not in ports or ports[name].turns)
+    ports = setting.scales.ports
+    return tuple(name for name in force_ports(setting, entry) if name not in ports or ports[name].turns)
 
 
-def _skins(asked: Asked) -> Names:
-    return tuple(f"{port}, {skin}" for port in force_ports(asked) for skin in SKINS)
+def _skins(setting: Setting, entry: Entry = ANY) -> Names:
+    return tuple(f"{port}, {skin}" for port in force_ports(setting, entry) for skin in SKINS)
 
 
-def _stores(asked: Asked) -> Names:
-    found = state_ports(asked)
+def _stores(setting: Setting, entry: Entry = ANY) -> Names:
+    found = state_ports(setting, entry)
     return (*found, EVERY_PORT) if len(found) > 1 else found
 
 
-def _channels(asked: Asked) -> Names:
-    return tuple(channel.name for channel in channels(asked.setting, asked.kinds))
+def _channels(setting: Setting, entry: Entry = ANY) -> Names:
+    return tuple(channel.name for channel in channels(setting, entry.kinds))
 
 
-def strain_channels(asked: Asked) -> Names:
+def strain_channels(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the strain channels."""
-    recorded = channels(asked.setting, asked.kinds)
+    recorded = channels(setting, entry.kinds)
     return tuple(channel.name for channel in recorded if channel.quantity is Quantity.STRAIN)
 
 
@@ -141,19 +141,19 @@ def _or_all(names: Names) -> Names:
     return (EVERY_CHANNEL, *names) if len(names) > 1 else names
 
 
-def _calibrated_channels(asked: Asked) -> Names:
+def _calibrated_channels(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the channels whose gain is known at all: a free gain absorbs an error of it."""
-    recorded = channels(asked.setting, asked.kinds)
+    recorded = channels(setting, entry.kinds)
     return tuple(channel.name for channel in recorded if not isinf(channel.gain_deviation))
 
 
-def _timed_gauges(asked: Asked) -> Names:
+def _timed_gauges(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the gauges, else channels, that were read at more than one time since the campaign's start."""
     places = []
-    for name in strain_channels(asked) or _channels(asked):
+    for name in strain_channels(setting, entry) or _channels(setting, entry):
         times = [
             trial.time + (trial.start if trial.is_dynamic else 0.0)
-            for trial in trials(asked.setting)
+            for trial in trials(setting)
             if name in trial.channels and trial.time.size
         ]
         if times and max(map(np.max, times)) > max(min(map(np.min, times)), 0.0):
@@ -161,24 +161,24 @@ def _timed_gauges(asked: Asked) -> Names:
     return tuple(places)
 
 
-def _all_runs(asked: Asked) -> Names:
-    return tuple(dict.fromkeys(trial.run for trial in trials(asked.setting)))
+def _all_runs(setting: Setting, entry: Entry = ANY) -> Names:
+    return tuple(dict.fromkeys(trial.run for trial in trials(setting)))
 
 
-def _zeroed_runs(asked: Asked) -> Names:
+def _zeroed_runs(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the runs whose trials have a displacement channel with a zero that is known at all."""
     names = {
         channel.name
-        for channel in channels(asked.setting, asked.kinds)
+        for channel in channels(setting, entry.kinds)
         if channel.quantity is Quantity.DISPLACEMENT and not isinf(channel.offset_deviation)
     }
-    measured = trials(asked.setting, asked.kinds)
+    measured = trials(setting, entry.kinds)
     return tuple(dict.fromkeys(trial.run for trial in measured if names.intersection(trial.channels)))
 
 
-def _loggers(asked: Asked) -> Names:
+def _loggers(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the loggers of a campaign; no choice where one records everything."""
-    loggers = tuple(asked.setting.campaign.loggers)
+    loggers = tuple(setting.campaign.loggers)
     return loggers if len(loggers) > 1 else ("",)
 
 
@@ -205,28 +205,28 @@ def mains_lines(setting: Setting) -> Names:
     return tuple(" or ".join(f"{frequency:g}" for frequency in group) + " Hz" for group in groups)
 
 
-def _seen_lines(asked: Asked) -> Names:
+def _seen_lines(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the mains lines at channels, and at "all strain" and the like for several of a quantity."""
-    quantities = [channel.quantity.value for channel in channels(asked.setting, asked.kinds)]
+    quantities = [channel.quantity.value for channel in channels(setting, entry.kinds)]
     several = dict.fromkeys(ALL + quantity for quantity in quantities if quantities.count(quantity) > 1)
-    seen = (*several, *_channels(asked))
-    return tuple(f"{line}, {name}" for line in mains_lines(asked.setting) for name in seen)
+    seen = (*several, *_channels(setting, entry))
+    return tuple(f"{line}, {name}" for line in mains_lines(setting) for name in seen)
 
 
 _NO_STRAIN = "The campaign has no strain channel."
 _NO_STATE = "The model has no port of a state (a level, a charge), at which a flow could act."
-PLACES: dict[str, tuple[Callable[[Asked], Names], str]] = {
-    "ports": (_all_ports, ""),
+PLACES: dict[str, tuple[Callable[[Setting, Entry], Names], str]] = {
+    "ports": (lambda setting, entry: setting.model.ports(), ""),
     "channels": (_channels, ""),
-    "channels, or all": (lambda asked: _or_all(_channels(asked)), ""),
+    "channels, or all": (lambda setting, entry: _or_all(_channels(setting, entry)), ""),
     "strain channels": (strain_channels, _NO_STRAIN),
-    "strain channels, or all": (lambda asked: _or_all(strain_channels(asked)), _NO_STRAIN),
+    "strain channels, or all": (lambda setting, entry: _or_all(strain_channels(setting, entry)), _NO_STRAIN),
     "runs": (_all_runs, ""),
     "ports of forces": (force_ports, ""),
     "held ports": (_held_ports, "Nothing holds a port of the model, so that no place is its zero."),
     "turning ports": (
         turning_ports,
-        "No port has a motion that turns: one that goes one way shows no memory and no zero.",
+        said("needs.no_turning_port"),
     ),
     "skins at ports": (_skins, ""),
     "ports of states": (state_ports, _NO_STATE),
@@ -261,11 +261,11 @@ def targets_of(word: str, place: str, setting: Setting) -> tuple[Target, ...]:
         port, _, skin = place.rpartition(", ")
         return (Target(port, number=SKINS[skin]),)
     if word == "ports of states, or all" and place == EVERY_PORT:
-        return tuple(Target(port) for port in state_ports(Asked(setting)))
+        return tuple(Target(port) for port in state_ports(setting))
     if word == "mains lines":
         line, _, name = place.partition(", ")
         frequency = float(line.split()[0])
-        if name.startswith(ALL) and name not in _channels(Asked(setting, DYNAMIC)):
+        if name.startswith(ALL) and name not in _channels(setting, Entry(kinds=DYNAMIC)):
             return (Target(EVERY_CHANNEL, name.removeprefix(ALL), frequency),)
         return (Target(name, number=frequency),)
     return (Target(place or EVERY_CHANNEL),)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from discrepancy.campaign.records import Channel, Trial
+from discrepancy.sentences import said
 
 
 class FaultKind(StrEnum):
@@ -68,6 +69,12 @@ class DataFault:
     def fatal(self) -> bool:
         """Whether conclusions from these data would be wrong, not only limited."""
         return self.kind not in HARMLESS
+
+
+def fault(kind: FaultKind, channel: str = "", trial: str = "", say: str = "", **values: object) -> DataFault:
+    """Return a fault with the sentence of its kind, or with that called `say`, filled in with values."""
+    name = say or kind.name.lower()
+    return DataFault(kind, said(f"faults.{name}", channel=channel, trial=trial, **values), channel, trial)
 
 
 def place_of(channel: Channel, trial: Trial, start: int = 0, stop: int | None = None) -> str:

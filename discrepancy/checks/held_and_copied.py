@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Trial
-from discrepancy.checks.fault import DataFault, FaultKind, place_of
+from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -53,14 +53,8 @@ def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
         noise = channel.noise_in(trial)
         others = np.delete(series, column, axis=1)
         for start, stop in held_spans(trial.values[:, column], trial.used[:, column], others, noise):
-            yield DataFault(
-                FaultKind.FROZEN,
-                f"The channel {name!r} holds one value over {stop - start} samples within a motion, in "
-                f"{place_of(channel, trial, start, stop)}: empty these cells, or leave the channel out of "
-                "the trial, and check sensor and logger.",
-                name,
-                trial.name,
-            )
+            place = place_of(channel, trial, start, stop)
+            yield fault(FaultKind.FROZEN, name, trial.name, count=stop - start, place=place)
 
 
 def held_spans(
@@ -136,14 +130,8 @@ def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
     for (one, other), where in found.items():
         trial, how = where[0]
         more = f", and so in {len(where) - 1} more of its trials" if len(where) > 1 else ""
-        yield DataFault(
-            FaultKind.COPIED,
-            f"The channel {other!r} is the channel {one!r} {how} in "
-            f"{place_of(campaign.channels[other], trial)}{more}: two sensors never share their noise, so "
-            "correct `column` or the table, or leave one of them out.",
-            other,
-            trial.name,
-        )
+        place = place_of(campaign.channels[other], trial)
+        yield fault(FaultKind.COPIED, other, trial.name, one=one, how=how, place=place, more=more)
 
 
 def _copies(trial: Trial) -> Iterator[tuple[str, str, str]]:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
-from discrepancy.checks.fault import DataFault, FaultKind
-from discrepancy.checks.holds import hold_sentence
+from discrepancy.campaign.records import Campaign, Hold, Quantity, Trial, TrialKind
+from discrepancy.checks.fault import DataFault, FaultKind, fault
 from discrepancy.checks.observability import unobservable
 from discrepancy.checks.rest import rest_faults
 from discrepancy.checks.unit_slips import unit_slips
@@ -27,6 +27,8 @@ LEAST_PERIODS = 3.0
 """Fewest periods of the first mode in a record in time."""
 LEAST_SAMPLES = 4.0
 _FROM_MOTION = {Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION}
+MATTERS = 0.3
+"""Difference between two readings of an input from which on it is said, in deviations of the noise (rms)."""
 _VISIBLE = 0.01  # share of the largest prediction of its kind below which a channel tells nothing
 _ABOVE_NOISE = 5.0
 _FLOOR = 0.02  # of a prediction: what any model may be off without the channel being another one
@@ -62,12 +64,11 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     faults += unit_slips(campaign, scales)
     faults += _signs(campaign, scales)
     for trial in campaign.trials:
-        said = hold_sentence(campaign, model, trial, prior_mean(campaign, model, trial))
-        faults += [] if said is None else [DataFault(FaultKind.BETWEEN_SAMPLES, said, trial=trial.name)]
+        faults += _holds(campaign, model, trial)
     if any(trial.kind is TrialKind.DRIVEN for trial in campaign.fitted) and model.parameters:
         sentence = unobservable(campaign, model)
         faults += [] if sentence is None else [DataFault(FaultKind.UNOBSERVABLE, sentence)]
-    return (*faults, *(fault for _, fault in swaps))
+    return (*faults, *(found for _, found in swaps))
 
 
 def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
@@ -80,6 +81,31 @@ def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
     return Conditions(np.array(values), initial, (0.0, 0.0), trial.health)
 
 
+def _holds(campaign: Campaign, model: Model, trial: Trial) -> Iterator[DataFault]:
+    """Yield a limit where straight lines and curves between an input's samples are not the same.
+
+    None if no channel with a noise record sees a difference, or of every input it is said what it did.
+    """
+    forced = trial.kind is TrialKind.FORCED and trial.hold is None
+    straight = ["force"] if forced else [item.name for item in trial.inputs if item.hold is None]
+    if trial.kind not in (TrialKind.FORCED, TrialKind.DRIVEN) or not straight or len(trial.time) < 4:
+        return
+    inputs = tuple(replace(i, hold=Hold.SMOOTH) if i.name in straight else i for i in trial.inputs)
+    curved = replace(trial, inputs=inputs, hold=Hold.SMOOTH if forced else trial.hold)
+    conditions = prior_mean(campaign, model, trial)
+    one, other = (observe(model, campaign, i, ModelPatch(), conditions).values for i in (trial, curved))
+    sizes = np.sqrt(np.mean((one - other) ** 2, axis=0))
+    noises = [campaign.channels[name].noise for name in trial.channels]
+    known = [np.inf if noise is None else noise.standard_deviation for noise in noises]
+    worst = int(np.argmax(sizes / known))
+    if sizes[worst] / known[worst] > MATTERS:
+        yield fault(
+            FaultKind.BETWEEN_SAMPLES, trial=trial.name, names=", ".join(map(repr, straight)),
+            worst=sizes[worst] / known[worst], where=trial.channels[worst],
+            table="[[trial]]" if forced else "[[input]]",
+        )  # fmt: skip
+
+
 # ---------------------------------------------------------------- outputs and length
 
 
@@ -87,21 +113,12 @@ def _missing_outputs(campaign: Campaign, model: Model) -> Iterator[DataFault]:
     for name, channel in campaign.channels.items():
         quantity = model.output_quantity(channel.output)
         if quantity is None:
-            yield DataFault(
-                FaultKind.MISSING_OUTPUT,
-                f"The channel {name!r} is compared with the output {channel.output!r}, which {model.name} "
-                "does not have: correct `output`, or leave the channel out.",
-                name,
-            )
+            yield fault(FaultKind.MISSING_OUTPUT, name, output=channel.output, model=model.name)
         elif channel.quantity is not Quantity.SIGNAL and not (
             channel.quantity is quantity or {channel.quantity, quantity} <= _FROM_MOTION
         ):
-            yield DataFault(
-                FaultKind.WRONG_QUANTITY,
-                f"The channel {name!r} measures {channel.quantity.value}, but the output {channel.output!r} "
-                f"of {model.name} is {quantity.value}: correct `quantity` or `output`.",
-                name,
-            )
+            told = {"measured": channel.quantity.value, "given": quantity.value, "model": model.name}
+            yield fault(FaultKind.WRONG_QUANTITY, name, output=channel.output, **told)
 
 
 def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
@@ -113,28 +130,18 @@ def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
     for trial in dynamic:
         periods = float(trial.time[-1] - trial.time[0]) * frequency
         if periods < LEAST_PERIODS:
-            yield DataFault(
-                FaultKind.TOO_SHORT,
-                f"The trial {trial.name!r} holds {periods:.2g} periods of the first mode ({frequency:.3g} "
-                f"Hz), and at least {LEAST_PERIODS:.0f} are needed: record longer.",
-                trial=trial.name,
-            )
+            yield fault(
+                FaultKind.TOO_SHORT, trial=trial.name, periods=periods, frequency=frequency,
+                least=LEAST_PERIODS,
+            )  # fmt: skip
         samples = 1.0 / (trial.interval * frequency)
-        if samples < LEAST_SAMPLES / 10.0 and 1e3 * samples >= LEAST_SAMPLES:
-            yield DataFault(
-                FaultKind.UNDERSAMPLED,
-                f"The time of the trial {trial.name!r} looks like milliseconds: taken as seconds it gives "
-                f"{samples:.2g} samples per period of the first mode ({frequency:.3g} Hz), as milliseconds "
-                f"{1e3 * samples:.3g}; write it in seconds, as `uav-twin discrepancy import` does.",
-                trial=trial.name,
-            )
-        elif samples < LEAST_SAMPLES:
-            yield DataFault(
-                FaultKind.UNDERSAMPLED,
-                f"The trial {trial.name!r} has {samples:.2g} samples per period of the first mode "
-                f"({frequency:.3g} Hz), and at least {LEAST_SAMPLES:.0f} are needed: sample faster.",
-                trial=trial.name,
-            )
+        if samples < LEAST_SAMPLES:
+            slip = samples < LEAST_SAMPLES / 10.0 and 1e3 * samples >= LEAST_SAMPLES
+            say = "undersampled_in_milliseconds" if slip else ""
+            yield fault(
+                FaultKind.UNDERSAMPLED, trial=trial.name, say=say, samples=samples, more=1e3 * samples,
+                frequency=frequency, least=LEAST_SAMPLES,
+            )  # fmt: skip
 
 
 # ---------------------------------------------------------------- scales
@@ -216,19 +223,10 @@ def _signs(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator
             by_channel[name].append(scale)
     reversed_channels = [name for name, found in by_channel.items() if max(found) < 0.0]
     if len(reversed_channels) == len(by_channel) > 1:
-        yield DataFault(
-            FaultKind.SIGN,
-            "All channels move against the model: check the sign of the forces, which are positive upwards.",
-        )
+        yield fault(FaultKind.SIGN, say="sign_of_all")
         return
     for name in reversed_channels:
-        yield DataFault(
-            FaultKind.SIGN,
-            f"The channel {name!r} moves against the model in every trial: reverse its sign (as the "
-            "model has it: displacement upwards, the wing's strain positive where upward load compresses the "
-            "upper skin), or correct its `output`.",
-            name,
-        )
+        yield fault(FaultKind.SIGN, name)
 
 
 # ---------------------------------------------------------------- swapped channels
@@ -270,13 +268,8 @@ def _swaps_of(
             after = misfit[row, place], misfit[place, row]
             better = all(new < 0.5 * old for old, new in zip(before, after, strict=True))
             if better and sum(before) - sum(after) > 30.0:
-                fault = DataFault(
-                    FaultKind.SWAPPED,
-                    f"The channels {names[row]!r} and {names[place]!r} fit the model clearly better "
-                    "exchanged: see which wire or column is which, and exchange their `column` or `output`.",
-                    names[row],
-                )
-                yield (names[row], names[place]), fault
+                pair = names[row], names[place]
+                yield pair, fault(FaultKind.SWAPPED, pair[0], other=pair[1])
 
 
 def _misfit(

@@ -9,6 +9,7 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.separability import begun
 from discrepancy.models.interface import Model
+from discrepancy.sentences import said
 
 FloatArray = NDArray[np.float64]
 
@@ -50,8 +51,4 @@ def unobservable(campaign: Campaign, model: Model) -> str | None:
     if not left:
         return None
     names = ", ".join(f"{name!r} ({share:.0%})" for name, share in left.items())
-    return (
-        f"The records do not tell the calibrated {'parameters' if len(left) > 1 else 'parameter'} {names}, "
-        "which keep that share of the prior deviation: an effect that resembles them cannot be told from "
-        "them; record where they act, or state them more narrowly."
-    )
+    return said("faults.unobservable", parameters="parameters" if len(left) > 1 else "parameter", names=names)

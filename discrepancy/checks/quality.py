@@ -15,7 +15,7 @@ from scipy.stats import f as fisher
 
 from discrepancy.campaign.noise_records import repeat_record
 from discrepancy.campaign.records import Campaign, Channel, Trial
-from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.fault import DataFault, FaultKind, fault
 from discrepancy.checks.held_and_copied import copy_faults, held_faults, roughness
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers, mark_outliers
@@ -42,14 +42,7 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     faults: list[DataFault] = []
     for name, channel in campaign.channels.items():
         if channel.noise is None:
-            faults.append(
-                DataFault(
-                    FaultKind.NO_NOISE_RECORD,
-                    f"The channel {name!r} has no noise record, so whether a model explains it cannot be "
-                    "said: add samples at rest, repeats, or a standard deviation and its degrees of freedom.",
-                    name,
-                )
-            )
+            faults.append(fault(FaultKind.NO_NOISE_RECORD, name))
         else:
             faults += _noise_faults(campaign, channel)
     for trial in campaign.trials:
@@ -62,16 +55,8 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     for trial_name, name, found in find_outliers(campaign):
         trial = next(item for item in campaign.trials if item.name == trial_name)
         if trial.is_dynamic and found.sum() > LARGEST_SHARE * len(found):
-            faults.append(
-                DataFault(
-                    FaultKind.OUTLIERS,
-                    f"{found.mean():.1%} of the readings of {name!r} in the trial {trial_name!r} are "
-                    f"outliers, and at most {LARGEST_SHARE:.0%} may be left out: mend the cause (loose wire, "
-                    "radio link) and repeat the trial, or leave the channel out of it.",
-                    name,
-                    trial_name,
-                )
-            )
+            share = float(found.mean())
+            faults.append(fault(FaultKind.OUTLIERS, name, trial_name, share=share, most=LARGEST_SHARE))
     return tuple(faults)
 
 
@@ -106,12 +91,7 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
 
 
 def _noise_fault(channel: Channel, stated: float, found: float, what: str) -> DataFault:
-    return DataFault(
-        FaultKind.NOISE_LABEL,
-        f"The noise record of the channel {channel.name!r} says {stated:.3g} (SI), but its "
-        f"{what} by {found:.3g}: check the record and its unit, and whether the noise is coloured.",
-        channel.name,
-    )
+    return fault(FaultKind.NOISE_LABEL, channel.name, stated=stated, found=found, what=what)
 
 
 # ---------------------------------------------------------------- records
@@ -124,27 +104,14 @@ def _record_faults(trial: Trial, name: str, values: FloatArray, used: BoolArray)
     load = trial.load_factor if np.any(trial.load_factor) else trial.force
     excited = trial.is_dynamic or np.ptp(load[used]) > 0.0
     if excited and np.ptp(kept) == 0.0:
-        yield DataFault(
-            FaultKind.DEAD,
-            f"The channel {name!r} shows the same value throughout the trial {trial.name!r}: check its "
-            "wiring, or leave it out of the trial.",
-            name,
-            trial.name,
-        )
+        yield fault(FaultKind.DEAD, name, trial.name)
         return
     order = np.arange(len(kept)) if trial.is_dynamic else np.argsort(load[used], kind="stable")
     sorted_load = None if trial.is_dynamic else load[used][order]
     for extreme, side in ((kept.max(), "largest"), (kept.min(), "smallest")):
         run = clipped_run(kept[order], float(extreme), sorted_load)
         if run:
-            yield DataFault(
-                FaultKind.CLIPPED,
-                f"The channel {name!r} is clipped in the trial {trial.name!r}: {run} readings in a row are "
-                f"at its {side} value {extreme:.6g} (SI), reached in a jump; widen the range of the "
-                "amplifier and repeat the trial, or leave the channel out of it.",
-                name,
-                trial.name,
-            )
+            yield fault(FaultKind.CLIPPED, name, trial.name, run=run, side=side, extreme=float(extreme))
 
 
 def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = None) -> int:

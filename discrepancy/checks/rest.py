@@ -10,7 +10,7 @@ from scipy.stats import f as fisher
 
 from discrepancy.campaign.noise import MAINS, line_near, without_lines
 from discrepancy.campaign.records import Campaign, NoiseRecord
-from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.fault import DataFault, FaultKind, fault
 
 FloatArray = NDArray[np.float64]
 
@@ -36,13 +36,7 @@ def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[
         if channel.noise is None or channel.noise.interval is None or what is None:
             continue
         column = f"{(channel.column or name)!r}" + (f" of {channel.noise.file}" if channel.noise.file else "")
-        yield DataFault(
-            FaultKind.MOVES_AT_REST,
-            f"The noise record of the channel {name!r}, the column {column}, {what}: "
-            "what moves counts as noise and hides as much of an effect; leave those samples out, or record "
-            "it while nothing moves.",
-            name,
-        )
+        yield fault(FaultKind.MOVES_AT_REST, name, column=column, what=what)
 
 
 def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:

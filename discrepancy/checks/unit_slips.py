@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from math import log, pi
 from statistics import median
 from typing import NamedTuple
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.campaign.units import STANDARD_GRAVITY, UNITS, conversion_of
-from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.fault import DataFault, FaultKind, fault
 
 FOREIGN: Mapping[Quantity, Mapping[str, float]] = {
     Quantity.DISPLACEMENT: {"cm": 1e-2, "inch": 0.0254, "foot": 0.3048},
@@ -106,11 +107,7 @@ def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> I
     driven = {key: _of_drive(trials[key[1]], scale) for key, scale in scales.items()}
     slips = list(driven.values())
     if len(channels) > 1 and slips[0] is not None and all(slip == slips[0] for slip in slips):
-        yield from _faults(
-            FaultKind.INPUT_SLIP, slips[0], len(slips),
-            f"All channels of all trials are about {slips[0].factor:.6g} times what the model says {slips[0]}"
-            ": check the units of forces (N), load factors (1) and release displacements",
-        )  # fmt: skip
+        yield from _faults(FaultKind.INPUT_SLIP, slips[0], len(slips), say="input_slip_of_all")
         return
     wrong = set()
     for name, found in channels.items():
@@ -122,13 +119,7 @@ def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> I
         left = [key for key in scales if key[1] == trial.name and key[0] not in wrong]
         slips = [driven[key] for key in left]
         if slips and slips[0] is not None and all(slip == slips[0] for slip in slips):
-            yield from _faults(
-                FaultKind.INPUT_SLIP, slips[0], len(slips),
-                f"All channels of the trial {trial.name!r} are about {slips[0].factor:.6g} times what the "
-                f"model says {slips[0]}, and those of other trials are not: check the unit of its force, "
-                "load factor, release displacement or inputs",
-                trial=trial.name,
-            )  # fmt: skip
+            yield from _faults(FaultKind.INPUT_SLIP, slips[0], len(slips), trial=trial.name)
             continue
         for name, _ in left:
             slip = _own(campaign, name, [scales[name, trial.name]])
@@ -160,19 +151,14 @@ def _of_channel(campaign: Campaign, name: str, slip: Slip, trials: list[Trial]) 
     where = f" in the trial {first.name!r}" if alone else ""
     # what gravity is to an acceleration, a single record tells
     count = len(trials) + (channel.quantity is Quantity.ACCELERATION)
-    yield from _faults(
-        FaultKind.UNIT_SLIP, slip, count,
-        f"The channel {name!r}{column} shows about {slip.factor:.6g} times what the model says{where} {slip}"
-        ": correct its `unit`, or convert the column",
-        name, first.name if alone else "",
-    )  # fmt: skip
+    told = {"channel": name, "trial": first.name if alone else "", "column": column, "where": where}
+    yield from _faults(FaultKind.UNIT_SLIP, slip, count, **told)
 
 
-def _faults(
-    kind: FaultKind, slip: Slip, count: int, sentence: str, channel: str = "", trial: str = ""
-) -> Iterator[DataFault]:
+def _faults(kind: FaultKind, slip: Slip, count: int, **told: str) -> Iterator[DataFault]:
     """Yield a slip that so many records agree on as a fault, as a doubt, or not at all."""
+    found = fault(kind, slip=slip, **told)
     if slip.size >= SURE_SLIP or (slip.size >= DOUBT and count > 1):
-        yield DataFault(kind, f"{sentence}; no physical effect is that large.", channel, trial)
+        yield replace(found, sentence=f"{found.sentence}; no physical effect is that large.")
     elif slip.size >= DOUBT or count > 1:
-        yield DataFault(FaultKind.UNIT_DOUBT, f"{sentence}, or mend the model.", channel, trial)
+        yield replace(found, kind=FaultKind.UNIT_DOUBT, sentence=f"{found.sentence}, or mend the model.")

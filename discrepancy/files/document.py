@@ -76,12 +76,11 @@ def shipped_schema(name: str) -> dict[str, Any]:
 
 def json_schema(record: type, schema: str) -> str:
     """Return the JSON Schema (draft 2020-12) of a document as it is shipped: every key is always there."""
-    parts = [TypeAdapter(kind).json_schema() for kind in (Origin, record)]
-    properties = {"schema": {"const": schema, "type": "string"}}
-    definitions: dict[str, Any] = {}
-    for part in parts:
-        definitions |= part.get("$defs", {})
-        properties |= part["properties"]
+    found = TypeAdapter(record).json_schema()
+    definitions: dict[str, Any] = found["$defs"]
+    own = {name: table for name, table in found["properties"].items() if name != "origin"}
+    of_origin = definitions.pop("Origin")["properties"]
+    properties = {"schema": {"const": schema, "type": "string"}, **of_origin, **own}
     for table in definitions.values():
         table["description"] = table.get("description", "").split("\n")[0]
         if "properties" in table:
@@ -103,8 +102,8 @@ def plain(value: Any) -> Any:
     return json_of(value, lambda odd: None if isnan(odd) else "Infinity" if odd > 0.0 else "-Infinity")
 
 
-def write_document(path: Path, schema: str, origin: Origin, record: object) -> Path:
-    """Check a document and write it in one step.
+def write_document(path: Path, schema: str, record: object) -> Path:
+    """Check a document, a record with an `origin`, and write it in one step.
 
     Raises
     ------
@@ -115,7 +114,7 @@ def write_document(path: Path, schema: str, origin: Origin, record: object) -> P
     """
     content = plain(record)
     _checked(type(record), content, f"{Path(path).name} cannot be written: ", ".")
-    whole = {"schema": schema, **plain(origin), **content}
+    whole = {"schema": schema, **content.pop("origin"), **content}
     return atomic_write_text(path, json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
@@ -124,8 +123,8 @@ def read_document(
     schema: str,
     kind: type[_Record],
     older: Mapping[str, Callable[[dict[str, Any]], dict[str, Any]]] = MappingProxyType({}),
-) -> tuple[_Record, Origin]:
-    """Return the record of a document and its origin; `older` brings what older schemas hold up to this one.
+) -> _Record:
+    """Return the record of a document; `older` brings what older schemas hold up to this one.
 
     Raises
     ------
@@ -143,11 +142,9 @@ def read_document(
             "needed."
         )
     content = older.get(str(came), dict)(content)
-    of_origin = {item.name for item in fields(Origin)}
+    origin = {item.name: content.pop(item.name) for item in fields(Origin) if item.name in content}
     before, after = f"{path} does not fit its schema: ", "; write it again."
-    origin = _checked(Origin, {k: v for k, v in content.items() if k in of_origin}, before, after)
-    own = {k: v for k, v in content.items() if k not in of_origin}
-    return _checked(kind, own, before, after), origin
+    return _checked(kind, {**content, "origin": origin}, before, after)
 
 
 def _checked(kind: type[_Record], content: dict[str, Any], before: str, after: str) -> _Record:

@@ -59,8 +59,8 @@ def _patched(kind: VerdictKind) -> VerdictKind:
 
 
 @dataclass(frozen=True)
-class PatchDocument:
-    """Content of patch.json after its origin.
+class StoredPatch:
+    """Content of patch.json.
 
     Attributes
     ----------
@@ -75,6 +75,8 @@ class PatchDocument:
         Outputs of the wing FMU by the names of channels.
     parameters : tuple of CalibratedParameter
         Of the model, beside these effects.
+    origin : Origin
+        What it was reached from.
     """
 
     verdict: Annotated[
@@ -84,12 +86,6 @@ class PatchDocument:
     effects: tuple[PatchEffect, ...]
     channels: Mapping[str, str]
     parameters: tuple[CalibratedParameter, ...]
-
-
-@dataclass(frozen=True)
-class StoredPatch(PatchDocument):
-    """Content of patch.json."""
-
     origin: Origin
 
     @property
@@ -182,8 +178,7 @@ def write_patch(path: Path, stored: StoredPatch) -> Path:
     VerdictFileError, reporting.errors.FileNotWrittenError
         As `write_verdict`.
     """
-    content = {item.name: getattr(stored, item.name) for item in fields(PatchDocument)}
-    return write_document(path, PATCH_SCHEMA, stored.origin, PatchDocument(**content))
+    return write_document(path, PATCH_SCHEMA, stored)
 
 
 def fmu_outputs(channels: Mapping[str, Channel]) -> dict[str, str]:
@@ -221,5 +216,4 @@ def read_patch(path: Path) -> StoredPatch:
         As `read_verdict`.
     """
     older = {FIRST_SCHEMA: lambda content: {**content, "model_file": None, "parameters": []}}
-    found, origin = read_document(path, PATCH_SCHEMA, PatchDocument, older)
-    return StoredPatch(**vars(found), origin=origin)
+    return read_document(path, PATCH_SCHEMA, StoredPatch, older)

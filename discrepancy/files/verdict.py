@@ -27,17 +27,11 @@ LATER_KEYS = {f"uav-twin verdict {k + 1}": dict(ChainMap(*_NEW[k:])) for k in ra
 
 
 @dataclass(frozen=True)
-class VerdictDocument:
-    """Content of verdict.json after its origin."""
+class StoredVerdict:
+    """Content of verdict.json."""
 
     verdict: Verdict
     proof: Proof | None
-
-
-@dataclass(frozen=True)
-class StoredVerdict(VerdictDocument):
-    """Content of verdict.json."""
-
     origin: Origin
 
 
@@ -68,7 +62,7 @@ def write_verdict(path: Path, verdict: Verdict, proof: Proof | None, origin: Ori
     reporting.errors.FileNotWrittenError
         If the file cannot be written.
     """
-    return write_document(path, VERDICT_SCHEMA, origin, VerdictDocument(verdict, proof))
+    return write_document(path, VERDICT_SCHEMA, StoredVerdict(verdict, proof, origin))
 
 
 def read_verdict(path: Path) -> StoredVerdict:
@@ -80,8 +74,7 @@ def read_verdict(path: Path) -> StoredVerdict:
         If the file is missing, damaged, of another schema, or holds something else than it should.
     """
     older = {schema: partial(_with_later_keys, keys) for schema, keys in LATER_KEYS.items()}
-    found, origin = read_document(path, VERDICT_SCHEMA, VerdictDocument, older)
-    return StoredVerdict(found.verdict, found.proof, origin)
+    return read_document(path, VERDICT_SCHEMA, StoredVerdict, older)
 
 
 def _with_later_keys(keys: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
@@ -113,9 +106,7 @@ def read_verdict_folder(folder: Path | str) -> VerdictFolder:
     stored = read_verdict(place / VERDICT_NAME)
     patch, residuals = place / PATCH_NAME, place / RESIDUALS_NAME
     return VerdictFolder(
-        stored.verdict,
-        stored.proof,
-        stored.origin,
-        read_patch(patch).patch if patch.is_file() else None,
-        read_residuals(residuals) if residuals.is_file() else None,
+        **vars(stored),
+        patch=read_patch(patch).patch if patch.is_file() else None,
+        residuals=read_residuals(residuals) if residuals.is_file() else None,
     )

@@ -1,17 +1,19 @@
-"""What every verdict on a search says alike: hypotheses, estimates, and the record of each kind."""
+"""What every verdict on a search says alike: hypotheses, estimates, and the fit that stands for it."""
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.catalogue.entry import NINETY
+from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
 from discrepancy.fits.candidate import FREE_SHAPE, Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.posterior import with_draws
 from discrepancy.fits.problem import Problem
 from discrepancy.search.strategy import Search
+from discrepancy.sentences import said
 from discrepancy.verdict import (
     CalibratedParameter,
     Estimate,
@@ -21,69 +23,83 @@ from discrepancy.verdict import (
     Verdict,
     VerdictKind,
 )
+from reporting.words import listing
 
 FloatArray = NDArray[np.float64]
 
 
+class Hypothetic(Protocol):
+    """A hypothesis as it is compared."""
+
+    @property
+    def candidate(self) -> Candidate:
+        """Its effects."""
+
+    @property
+    def effect(self) -> FloatArray:
+        """Their scaled unknowns (E,)."""
+
+    @property
+    def shared(self) -> FloatArray:
+        """Scaled unknowns (Q,) that all trials share."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of all unknowns (Q + E, Q + E), shared ones first."""
+
+
+class Outcome(NamedTuple):
+    """A verdict, the search that it rests on, and the fit that stands for it."""
+
+    verdict: Verdict
+    search: Search
+    fit: CandidateFit
+
+
 @dataclass(frozen=True)
 class Conclusion:
-    """What every verdict on a search says alike, and the kinds of it."""
+    """What every verdict on a search says alike."""
 
-    problem: Problem
     found: Search
-    top: tuple[str, ...]
     log_bayes_factor: float
     hypotheses: tuple[Hypothesis, ...]
     inclusion: dict[str, float]
 
     @classmethod
     def of(
-        cls, problem: Problem, found: Search, best: CandidateFit, probabilities: dict[tuple[str, ...], float]
+        cls, found: Search, best: CandidateFit, probabilities: Mapping[tuple[str, ...], float]
     ) -> "Conclusion":
         """Return what is said of the hypotheses of a search, the best of them given."""
-        return cls(
-            problem,
-            found,
-            best.candidate.identifiers,
-            log_bayes_factor=single_evidence(found, best) - found.nothing.log_evidence,
-            hypotheses=compared(problem, found, probabilities),
-            inclusion={
-                effect.identifier: sum(
-                    p for names, p in probabilities.items() if effect.identifier in plain_names(names)
-                )
-                for effect in found.effects
-            },
-        )
+        problem = found.problem
+        places = sum(np.log(len(term.effect.places(problem.setting))) for term in best.candidate.terms)
+        rows = [(found.best_of(names), probability) for names, probability in probabilities.items()]
+        told = tuple(hypothesis(problem, item, p, *sizes(problem, item)) for item, p in rows)
+        names = [effect.identifier for effect in found.effects]
+        factor = best.log_evidence - places - found.nothing.log_evidence
+        return cls(found, float(factor), told, inclusion(rows, names))
 
-    def verdict(self, kind: VerdictKind, sentence: str, probability: float, **more: Any) -> Verdict:
-        """Return a verdict."""
-        return Verdict(
-            kind=kind,
-            sentence=sentence,
-            probability=probability,
-            log_bayes_factor=self.log_bayes_factor,
-            hypotheses=self.hypotheses,
-            inclusion=self.inclusion,
-            **more,
-        )
+    def outcome(
+        self,
+        kind: VerdictKind,
+        sentence: str,
+        probability: float,
+        fit: CandidateFit | None = None,
+        **more: Any,
+    ) -> Outcome:
+        """Return a verdict with the fit that stands for it: that without effect if none is given."""
+        alike = {"hypotheses": self.hypotheses, "inclusion": self.inclusion}
+        verdict = Verdict(kind, sentence, probability, self.log_bayes_factor, **alike, **more)  # type: ignore[arg-type]
+        return Outcome(verdict, self.found, self.found.none if fit is None else fit)
 
-    def family(
-        self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]
-    ) -> tuple[Verdict, Search, CandidateFit]:
+    def family(self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]) -> Outcome:
         """Return the verdict that names the family of a fit with a free shape."""
-        drawn = with_draws(self.problem, fit)
-        named = named_effects(self.problem, drawn)
-        text, sentence = family_words(named)
-        more = {"effects": named, "family": text, "gates": gates}
-        return self.verdict(VerdictKind.FAMILY, sentence, probability, **more), self.found, drawn
-
-    def unexplained(
-        self, sentence: str, probability: float, gates: tuple[Gate, ...]
-    ) -> tuple[Verdict, Search, CandidateFit]:
-        """Return the verdict that there is a gap without a name."""
-        more = {"gates": gates, "resembles": plain_names(self.top)}
-        verdict = self.verdict(VerdictKind.UNEXPLAINED, sentence, probability, **more)
-        return verdict, self.found, self.found.none
+        drawn = with_draws(self.found.problem, fit)
+        named = named_effects(self.found.problem, drawn)
+        family = ", ".join(sorted({effect.family for effect in named if effect.shape}))
+        beside = ", ".join(effect.name for effect in named if not effect.shape)
+        sentence = said("verdict.family", family=family, beside=f", beside {beside}" if beside else "")
+        more = {"effects": named, "family": family, "gates": gates}
+        return self.outcome(VerdictKind.FAMILY, sentence, probability, drawn, **more)
 
 
 def plain_names(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -91,116 +107,80 @@ def plain_names(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name.removesuffix(FREE_SHAPE) for name in names)
 
 
-def best_of(found: Search, identifiers: tuple[str, ...]) -> CandidateFit:
-    """Return the most probable fit of a set of effects, fitted exactly."""
-    options = [item for item in found.all().values() if item.candidate.identifiers == identifiers]
-    best = max(options, key=found.score)
-    return found.exactly(best)
+def inclusion(rows: Sequence[tuple[Hypothetic, float]], names: Iterable[str]) -> dict[str, float]:
+    """Return the probability that each effect takes part, from hypotheses with theirs."""
+    held = [(set(plain_names(item.candidate.identifiers)), probability) for item, probability in rows]
+    return {name: sum(probability for own, probability in held if name in own) for name in names}
 
 
-def single_evidence(found: Search, best: CandidateFit) -> float:
-    """Return the log evidence of the best set, averaged over its places."""
-    places = 0.0
-    for term in best.candidate.terms:
-        places += np.log(len(term.effect.places(found.problem.setting)))
-    return best.log_evidence - places
+def hypothesis(
+    problem: Problem, item: Hypothetic, probability: float, evidence: float, chi_square: float, freedom: float
+) -> Hypothesis:
+    """Return the record of a hypothesis."""
+    effects, parameters = named_effects(problem, item), calibrated_parameters(problem, item)
+    return Hypothesis(effects, evidence, probability, chi_square, freedom, parameters)
 
 
-def named_effects(problem: Problem, found: CandidateFit) -> tuple[NamedEffect, ...]:
-    """Return the effects of a fit with values and 90 % intervals of their parameters.
+def sizes(problem: Problem, item: CandidateFit) -> tuple[float, float, float]:
+    """Return log evidence [nat], chi^2 of the readings and its degrees of freedom."""
+    return item.log_evidence, item.chi_square, float(problem.counts.sum() - item.spent.sum())
 
-    Intervals are those of the fit's draws, else of its covariance.
+
+def named_effects(problem: Problem, found: Hypothetic) -> tuple[NamedEffect, ...]:
+    """Return the effects of a hypothesis with values and 90 % intervals of their parameters.
+
+    Intervals are those of its draws, where it has any, else of its covariance.
     """
-    deviation = np.sqrt(np.diag(found.effect_covariance))
-    low, high = found.point.effect - NINETY * deviation, found.point.effect + NINETY * deviation
-    if found.draws is not None:
-        low, high = np.quantile(found.draws, (0.05, 0.95), axis=0)
+    spread = NINETY * np.sqrt(np.diag(found.covariance)[len(found.shared) :])
+    low, high = found.effect - spread, found.effect + spread
+    draws = getattr(found, "draws", None)
+    if draws is not None:
+        ends = np.quantile(draws, (0.05, 0.95), axis=0)
         # the most probable value may be one of many optima along a ridge
-        low, high = np.minimum(low, found.point.effect), np.maximum(high, found.point.effect)
-    return effects_at(problem, found.candidate, found.point.effect, low, high)
-
-
-def effects_at(
-    problem: Problem, candidate: Candidate, effect: FloatArray, low: FloatArray, high: FloatArray
-) -> tuple[NamedEffect, ...]:
-    """Return the effects of a candidate at scaled values (E,) with the ends of their intervals (E,)."""
+        low, high = np.minimum(ends[0], found.effect), np.maximum(ends[1], found.effect)
+    bounds = iter(zip(low, high, strict=True))
     named = []
-    at = 0
-    for term, part in zip(candidate.terms, candidate.parts(effect), strict=True):
-        estimates = []
-        rows = slice(at, at + len(part))
-        for item, u, *interval in zip(term.parameters, part, low[rows], high[rows], strict=True):
-            ends = [item.prior.value(float(end)) for end in interval]
-            estimates.append(
-                Estimate(
-                    item.name,
-                    item.prior.value(float(u)),
-                    min(ends),
-                    max(ends),
-                    getattr(item, "unit", "1"),
-                    item.description,
-                )
-            )
-        count = len(term.effect.parameters)
-        named.append(
-            NamedEffect(
-                term.effect.identifier,
-                term.effect.name,
-                term.place,
-                term.effect.family,
-                tuple(estimates[:count]),
-                tuple(estimates[count:]),
-                Candidate((term,)).patch(problem.setting, part),
-            )
-        )
-        at += len(part)
+    for term, part in zip(found.candidate.terms, found.candidate.parts(found.effect), strict=True):
+        rows = [_estimate(item, u, *next(bounds)) for item, u in zip(term.parameters, part, strict=True)]
+        effect, count = term.effect, len(term.effect.parameters)
+        patch = Candidate((term,)).patch(problem.setting, part)
+        whose = (effect.identifier, effect.name, term.place, effect.family)
+        named.append(NamedEffect(*whose, tuple(rows[:count]), tuple(rows[count:]), patch))
     return tuple(named)
 
 
-def calibrated_parameters(problem: Problem, found: CandidateFit) -> tuple[CalibratedParameter, ...]:
-    """Return the calibrated parameters of the model as a fit has them, within the model's range."""
-    return parameters_at(problem, found.point.shared, found.covariance)
+def _estimate(item: EffectParameter | ShapeParameter, *scaled: float) -> Estimate:
+    """Return an estimate at a scaled value and the ends of its interval."""
+    value, *ends = (item.prior.value(float(u)) for u in scaled)
+    return Estimate(item.name, value, min(ends), max(ends), getattr(item, "unit", "1"), item.description)
 
 
-def parameters_at(
-    problem: Problem, shared: FloatArray, covariance: FloatArray
-) -> tuple[CalibratedParameter, ...]:
-    """Return the calibrated parameters at scaled shared unknowns (Q,), whose covariance comes first."""
+def calibrated_parameters(problem: Problem, found: Hypothetic) -> tuple[CalibratedParameter, ...]:
+    """Return the calibrated parameters of the model as a hypothesis has them, within the model's range."""
     layout = problem.shared
-    values = layout.parameters(shared)
-    spread = layout.parameter_scale * np.sqrt(np.maximum(np.diag(covariance)[: len(values)], 0.0))
+    values = layout.parameters(found.shared)
+    spread = layout.parameter_scale * np.sqrt(np.maximum(np.diag(found.covariance)[: len(values)], 0.0))
     return tuple(
         CalibratedParameter(item.name, float(value), float(deviation), item.unit)
         for item, value, deviation in zip(problem.model.parameters, values, spread, strict=True)
     )
 
 
-def compared(
-    problem: Problem, found: Search, probabilities: dict[tuple[str, ...], float]
-) -> tuple[Hypothesis, ...]:
-    """Return the records of all sets of effects that are compared, most probable first."""
-    rows = []
-    for identifiers, probability in probabilities.items():
-        options = [item for item in found.all().values() if item.candidate.identifiers == identifiers]
-        best = max(options, key=found.score)
-        rows.append(
-            Hypothesis(
-                named_effects(problem, best),
-                best.log_evidence,
-                probability,
-                best.chi_square,
-                float(problem.counts.sum() - best.spent.sum()),
-                calibrated_parameters(problem, best),
-            )
-        )
-    return tuple(rows)
+# ---------------------------------------------------------------- words
 
 
-def family_words(named: tuple[NamedEffect, ...]) -> tuple[str, str]:
-    """Return the families whose shape is free, and the sentence of the verdict."""
-    text = ", ".join(sorted({effect.family for effect in named if effect.shape}))
-    beside = ", ".join(effect.name for effect in named if not effect.shape)
-    return text, (
-        f"An effect of the family {text} is missing, with a shape of its own"
-        f"{f', beside {beside}' if beside else ''}."
-    )
+def effects_text(effects: Iterable[NamedEffect], joint: str = "and") -> str:
+    """Return effects with their places."""
+    found = (f"{item.name} at {item.place}" if item.place else item.name for item in effects)
+    return listing(dict.fromkeys(found), joint)
+
+
+def certain(probability: float) -> str:
+    """Return the probability of a name, which is never one."""
+    return "> 0.999" if probability > 0.9995 else f"{probability:.3f}"
+
+
+def below_limit(names: Sequence[str], coloured: str = "") -> str:
+    """Return the sentence on what is too small to tell from noise, and what is nearest to it."""
+    nearest = f"; the nearest are {', '.join(names[:4])}" if names else ""
+    return said("verdict.below_limit", coloured=coloured, nearest=nearest)

@@ -20,8 +20,10 @@ from discrepancy.fits.cholesky import Cholesky
 from discrepancy.fits.fitting import CandidateFit, trial_block
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.trial_data import TrialData
+from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 from fe.runtime.patch import SENSORS
+from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -83,22 +85,13 @@ def consistency_gate(problem: Problem, fit: CandidateFit) -> Gate:
     """
     tests = consistency_tests(problem, fit)
     if not tests:
-        return Gate(
-            "consistency", None, np.nan, CONSISTENCY_LEVEL,
-            "No trial under a stated load, or too few readings: what is left cannot be judged by load.",
-        )  # fmt: skip
+        return Gate("consistency", None, np.nan, CONSISTENCY_LEVEL, said("consistency.not_judged"))
     worst = min(tests, key=lambda test: test.p_value)
     statistic = min(1.0, worst.p_value * len(tests))
-    if statistic < CONSISTENCY_LEVEL:
-        reason = (
-            f"What is left follows the {worst.name}: χ² {worst.statistic:.0f} along {worst.count} "
-            f"direction{'s' if worst.count > 1 else ''}, most of all {worst.strongest}."
-        )
-        return Gate("consistency", False, statistic, CONSISTENCY_LEVEL, reason)
-    return Gate(
-        "consistency", True, statistic, CONSISTENCY_LEVEL,
-        "What is left follows neither loads, runs nor the effect's own channel.",
-    )  # fmt: skip
+    passed = statistic >= CONSISTENCY_LEVEL
+    along = counted(worst.count, "direction")
+    reason = said(f"consistency.{'passed' if passed else 'failed'}", worst=worst, along=along)
+    return Gate("consistency", passed, statistic, CONSISTENCY_LEVEL, reason)
 
 
 def consistency_tests(problem: Problem, fit: CandidateFit) -> list[ScoreTest]:
@@ -108,15 +101,7 @@ def consistency_tests(problem: Problem, fit: CandidateFit) -> list[ScoreTest]:
     slope over the span. Runs of static trials: a zero for each quantity. Effects of single channels: size of
     each such channel's response by load place and kind of trial, and a zero that moves in time.
     """
-    groups = {
-        "static loads": _by_load(problem, fit, TrialKind.STATIC),
-        "loads of flight": _by_load(problem, fit, TrialKind.FLIGHT),
-        "zeros of the static runs": _by_run(problem),
-    }
-    for term in fit.candidate.terms:
-        channel = _own_channel(problem, term)
-        if channel:
-            groups[f"channel {channel}"] = _by_channel(problem, fit, channel)
+    groups = directions(problem, fit)
     return score_tests(problem, fit, {name: group for name, group in groups.items() if group})
 
 
@@ -253,57 +238,49 @@ def _projected(
     )
 
 
-def _by_load(problem: Problem, fit: CandidateFit, kind: TrialKind) -> dict[str, Direction]:
-    """Return size, zero (static only) and slope over the span of the response, by load place."""
-    found: dict[str, dict[int, FloatArray]] = {}
-    for number, data in enumerate(problem.trials):
-        if data.trial.kind is not kind:
-            continue
-        response = _response(problem, fit, number)
-        where = "in flight" if kind is TrialKind.FLIGHT else f"under load at {_place(data)}"
-        found.setdefault(f"the size {where}", {})[number] = response
-        if kind is TrialKind.STATIC:
-            found.setdefault(f"the zero {where}", {})[number] = np.broadcast_to(
-                response[np.argmax(np.abs(data.trial.force))], response.shape
-            )
-        along = _along_span(problem, data)
-        if along is not None:
-            found.setdefault(f"the slope over the span {where}", {})[number] = response * along
-    return dict(found)
+def directions(problem: Problem, fit: CandidateFit) -> dict[str, dict[str, Direction]]:
+    """Return the directions of each test by name.
 
-
-def _by_run(problem: Problem) -> dict[str, Direction]:
-    """Return a zero that all channels of a quantity share in the static trials of a run."""
-    found: dict[str, dict[int, FloatArray]] = {}
-    for number, data in enumerate(problem.trials):
-        if data.trial.kind is not TrialKind.STATIC:
-            continue
-        quantities = [problem.campaign.channels[name].quantity for name in data.trial.channels]
-        for quantity in sorted(set(quantities)):
-            columns = np.array([item is quantity for item in quantities])
-            zero = np.broadcast_to(columns * _scale(problem, quantity), data.weight.shape)
-            where = f"in run {data.trial.run}" if data.trial.run else "in the runs without a label"
-            found.setdefault(f"the zero of {quantity.value} {where}", {})[number] = zero
-    return dict(found)
-
-
-def _by_channel(problem: Problem, fit: CandidateFit, channel: str) -> dict[str, Direction]:
-    """Return the size of a channel's response by kind of trial and load place, and its drift."""
-    found: dict[str, dict[int, FloatArray]] = {}
+    Loads at rest and in flight: size, zero (at rest only) and slope over the span of the response, by load
+    place. Runs: a zero that all channels of a quantity share. The channel of an effect: the size of its
+    response by kind of trial and load place, and its drift.
+    """
+    own = [channel for term in fit.candidate.terms if (channel := _own_channel(problem, term))]
+    names = ("static loads", "loads of flight", "zeros of the static runs", *(f"channel {c}" for c in own))
+    found: dict[str, dict[str, dict[int, FloatArray]]] = {name: {} for name in names}
     last = max(abs(data.trial.start) for data in problem.trials) or 1.0
-    scale = _scale(problem, problem.campaign.channels[channel].quantity)
     for number, data in enumerate(problem.trials):
-        if channel not in data.trial.channels:
-            continue
-        column = data.trial.channels.index(channel)
-        size, drift = np.zeros(data.weight.shape), np.zeros(data.weight.shape)
-        size[:, column] = _response(problem, fit, number)[:, column]
-        drift[:, column] = scale * data.trial.start / last
-        static = data.trial.kind is TrialKind.STATIC
-        where = f"under load at {_place(data)}" if static else f"in the trials {data.trial.kind.value}"
-        found.setdefault(f"the size {where}", {})[number] = size
-        found.setdefault("the zero over time", {})[number] = drift
-    return dict(found)
+        trial, kind = data.trial, data.trial.kind
+
+        def add(group: str, label: str, column: FloatArray, number: int = number) -> None:
+            found[group].setdefault(label, {})[number] = column
+
+        response = _response(problem, fit, number)
+        static = kind is TrialKind.STATIC
+        place = f"under load at {_place(data)}"
+        if static or kind is TrialKind.FLIGHT:
+            group, where = ("static loads", place) if static else ("loads of flight", "in flight")
+            add(group, f"the size {where}", response)
+            along = _along_span(problem, data)
+            if static:
+                zero = response[np.argmax(np.abs(trial.force))]
+                add(group, f"the zero {where}", np.broadcast_to(zero, response.shape))
+            if along is not None:
+                add(group, f"the slope over the span {where}", response * along)
+        quantities = [problem.campaign.channels[name].quantity for name in trial.channels]
+        for quantity in sorted(set(quantities)) if static else ():
+            columns = np.array([item is quantity for item in quantities]) * _scale(problem, quantity)
+            where = f"in run {trial.run}" if trial.run else "in the runs without a label"
+            label = f"the zero of {quantity.value} {where}"
+            add("zeros of the static runs", label, np.broadcast_to(columns, data.weight.shape))
+        for channel in own:
+            if channel in trial.channels:
+                column = np.array([name == channel for name in trial.channels])
+                drift = _scale(problem, problem.campaign.channels[channel].quantity) * trial.start / last
+                where = place if static else f"in the trials {kind.value}"
+                add(f"channel {channel}", f"the size {where}", response * column)
+                add(f"channel {channel}", "the zero over time", drift * np.ones(response.shape) * column)
+    return {name: dict(group) for name, group in found.items()}
 
 
 def _response(problem: Problem, fit: CandidateFit, number: int) -> FloatArray:

@@ -6,42 +6,40 @@ compared along the missing force where one can be seen, else by whole simulation
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Generic
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from discrepancy.catalogue.entry import NINETY
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import key_of
-from discrepancy.missing_force.shares import Share, orders
+from discrepancy.missing_force.shares import Share
 from discrepancy.search.honest_evidence import weigh_with_remainders
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import (
-    ExplainedShare,
-    Gate,
-    Hypothesis,
-    NamedEffect,
-    RemainderEstimate,
-    Verdict,
-    VerdictKind,
-)
+from discrepancy.sentences import said
+from discrepancy.verdict import ExplainedShare, RemainderEstimate, Verdict, VerdictKind
+from reporting.words import counted, listing
 
-from .comparison import ByForce, ByReadings, Comparison, H
-from .conclusion import Conclusion, effects_at, named_effects, parameters_at, plain_names
+from .comparison import ByForce, ByReadings
+from .conclusion import (
+    Conclusion,
+    Outcome,
+    below_limit,
+    certain,
+    effects_text,
+    hypothesis,
+    inclusion,
+    named_effects,
+    plain_names,
+)
 from .consistency_gate import consistency_gate
-from .court import Court, names, part, percent
+from .court import Court, H, names, part, percent
 from .practical_size import UNSTATED_GAIN, is_one_driven_channel, small_terms
 from .proof import held_out_gate
-
-FloatArray = NDArray[np.float64]
-Outcome = tuple[Verdict, Search, CandidateFit]
 
 LEAST_SHOWN = 0.1
 """Share of what is missing from which a hypothesis is shown as the best one where none is named."""
@@ -63,18 +61,18 @@ def judged_in_part(problem: Problem, found: Search, first: Verdict) -> Outcome:
 
     Returns
     -------
-    Verdict, Search, CandidateFit
-        As `naming.name` returns them; the fit is that of the best hypothesis for an unexplained gap too.
+    Outcome
+        As `naming.name` returns it; the fit is that of the best hypothesis for an unexplained gap too.
     """
     if found.force is not None:
-        return _Said(problem, found, first, ByForce(problem, found)).verdict()
+        return _verdict_of(ByForce(problem, found, found.force), first)
     weigh_with_remainders(found)
-    way = ByReadings(problem, found)
-    coloured = _beside_coloured_noise(problem, found, way)
+    court = ByReadings(problem, found)
+    coloured = _beside_coloured_noise(court)
     if coloured is not None:
         return coloured
-    way.add_families()
-    return _Said(problem, found, first, way).verdict()
+    court.add_families()
+    return _verdict_of(court, first)
 
 
 def without_sliver(problem: Problem, found: Search, first: Verdict, fit: CandidateFit) -> Outcome:
@@ -90,8 +88,7 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
     fit : CandidateFit
         Of the set that was named.
     """
-    way = ByReadings(problem, found)
-    court = Court(problem, way)
+    court = ByReadings(problem, found)
     small = small_terms(problem, fit, unstated=UNSTATED_GAIN)
     terms, one_channel = fit.candidate.terms, is_one_driven_channel(problem)
     kept = {
@@ -99,13 +96,9 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
         if size is None and (court.acts(term) or not one_channel)
     }  # fmt: skip
     whole_key, share = set(key_of(fit.candidate)), court.told(fit).value
-    less = [
-        item
-        for item in found.exact.values()
-        if item.candidate.terms and set(key_of(item.candidate)) < whole_key
-    ]
+    less = [item for key, item in found.exact.items() if key and set(key) < whole_key]
     if kept == whole_key and not any(court.told(item).value > share - SEARCH.sliver for item in less):
-        return first, found, fit
+        return Outcome(first, found, fit)
     weigh_with_remainders(found)
     whole = found.judged.get(key_of(fit.candidate), fit)
     for item in sorted(found.judged.values(), key=lambda one: len(one.candidate.terms)):
@@ -113,238 +106,161 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
         if not own or not own < whole_key or court.told(item).value < share - SEARCH.sliver:
             continue
         if own == kept or found.score(item) > found.score(whole) - SEARCH.sliver_gain:
-            said = _Said(problem, found, first, way)
-            probability = said.court.probability(item)
-            if said.court.against(item) or probability < SEARCH.sure:
-                return said.unexplained(item, probability)
-            return said.in_part(item, probability)
+            probability = court.probability(item)
+            if court.against(item) or probability < SEARCH.sure:
+                return _unexplained(court, first, item, probability)
+            return _in_part(court, item, probability)
     found.judge({})
-    return first, found, fit
+    return Outcome(first, found, fit)
 
 
-def _beside_coloured_noise(problem: Problem, found: Search, way: ByReadings) -> Outcome | None:
+def _beside_coloured_noise(court: ByReadings) -> Outcome | None:
     """Return the verdict where all that is left is the colour of the noise, as its records have it."""
+    problem, found = court.problem, court.found
     nothing, best = found.nothing, found.best()
     probabilities = found.set_probabilities()
-    told = Conclusion.of(problem, found, best, probabilities)
+    told = Conclusion.of(found, best, probabilities)
     gate, p_none = absolute_gate(problem, nothing), probabilities.get((), 0.0)
     if p_none > 1.0 - SEARCH.sure and gate.passed is not False and _is_coloured(nothing):
-        hints = sorted(name for name, p in told.inclusion.items() if p > 1.0 - SEARCH.sure)
         more: dict[str, Any] = {"gates": (gate,), "remainders": remainder_estimates(problem, nothing)}
         if p_none >= SEARCH.unsure:
-            sentence = (
-                "The model explains the data within their noise, which is coloured as its records admit."
-            )
-            return told.verdict(VerdictKind.NOTHING_MISSING, sentence, p_none, **more), found, nothing
-        sentence = (
-            "Something may be missing, but too small for these data to tell from noise that is coloured"
-        )
-        sentence += f"; the nearest are {', '.join(hints[:4])}." if hints else "."
+            sentence = said("verdict.coloured_noise")
+            return told.outcome(VerdictKind.NOTHING_MISSING, sentence, p_none, nothing, **more)
+        hints = sorted(name for name, p in told.inclusion.items() if p > 1.0 - SEARCH.sure)
         total = min(p_none + sum(told.inclusion[name] for name in hints), 1.0)
-        return (
-            told.verdict(VerdictKind.BELOW_LIMIT, sentence, total, group=tuple(hints), **more),
-            found,
-            nothing,
-        )
-    court = Court(problem, way)
+        sentence, more["group"] = below_limit(hints, " that is coloured"), tuple(hints)
+        return told.outcome(VerdictKind.BELOW_LIMIT, sentence, total, nothing, **more)
     if not best.candidate.terms or best.candidate.is_family or not _is_coloured(best):
         return None
     probability = court.probability(best)
-    gates: tuple[Gate, ...] = (
-        absolute_gate(problem, best), consistency_gate(problem, best),
-        held_out_gate(way.residuals(replace(best, remainder=None))),
-    )  # fmt: skip
+    held_out = held_out_gate(court.residuals(replace(best, remainder=None)))
+    gates = (absolute_gate(problem, best), consistency_gate(problem, best), held_out)
     if probability < SEARCH.sure or any(gate.passed is False for gate in gates):
         return None
     named = named_effects(problem, best)
-    sentence = f"The model lacks {_words(named)} (probability {_certain(probability)})."
+    sentence = said("verdict.named", what=effects_text(named), certain=certain(probability), limit="")
     more = {"effects": named, "gates": gates, "remainders": remainder_estimates(problem, best)}
-    return told.verdict(VerdictKind.NAMED, sentence, probability, **more), found, best
+    return told.outcome(VerdictKind.NAMED, sentence, probability, best, **more)
 
 
 def _is_coloured(item: CandidateFit) -> bool:
     return item.remainder is not None and item.remainder.is_noise
 
 
-@dataclass(frozen=True)
-class _Said(Generic[H]):
-    """What is said of hypotheses: the verdicts of each kind, with the fit that stands for each."""
+def _verdict_of(court: Court[H], first: Verdict) -> Outcome:
+    """Return the verdict of a court."""
+    if not court.contenders:
+        return _unexplained(court, first)
+    best = court.slimmed(court.contenders[0])
+    members = [best, *court.rivals(best)]
+    probability = sum(court.probability(item) for item in members)
+    if 1 < len(members) <= SEARCH.largest_group:
+        return _group(court, members, probability)
+    if len(members) > SEARCH.largest_group:
+        return _unexplained(court, first, best, court.probability(best), len(members) - 1)
+    if probability < SEARCH.sure or court.gain(best) < SEARCH.bayes_factor:
+        return _unexplained(court, first, best, probability)
+    return _in_part(court, best, probability)
 
-    problem: Problem
-    found: Search
-    first: Verdict
-    way: Comparison[H]
 
-    @cached_property
-    def court(self) -> Court[H]:
-        """Which of them may be named."""
-        return Court(self.problem, self.way)
+def _in_part(court: Court[H], best: H, probability: float) -> Outcome:
+    """Return the verdict that names a hypothesis in part."""
+    effects, share = named_effects(court.problem, best), court.told(best)
+    family = ", ".join(sorted({t.effect.family for t in best.candidate.terms if t.free_shape}))
+    named = effects_text(effect for effect in effects if not effect.shape)
+    what = listing(filter(None, (named, said("verdict.family_in_part", family=family) if family else "")))
+    inside = court.has_held_out and not share.held_out
+    sentence = said(
+        "verdict.in_part", what=_capital(what), certain=certain(probability), part=part(share),
+        where=_where(share), inside=said("verdict.hardly_any_force") if inside else "",
+        left=court.left(best, share), shape=_shape(court, best),
+    )  # fmt: skip
+    more = {"effects": effects, "family": family, "gates": (court.gate(best),)}
+    return _outcome(court, VerdictKind.NAMED_IN_PART, sentence, probability, best, [best], **more)
 
-    def verdict(self) -> Outcome:
-        """Return the verdict."""
-        court = self.court
-        if not court.contenders:
-            return self.unexplained()
-        best = court.slimmed(court.contenders[0])
-        members = [best, *court.rivals(best)]
-        probability = sum(court.probability(item) for item in members)
-        if 1 < len(members) <= SEARCH.largest_group:
-            return self.group(members, probability)
-        if len(members) > SEARCH.largest_group:
-            return self.unexplained(best, court.probability(best), len(members) - 1)
-        if probability < SEARCH.sure or self.way.gain(members[0]) < SEARCH.bayes_factor:
-            return self.unexplained(members[0], probability)
-        return self.in_part(members[0], probability)
 
-    def in_part(self, best: H, probability: float) -> Outcome:
-        """Return the verdict that names a hypothesis in part."""
-        effects, share = self.effects(best), self.court.told(best)
-        family = ", ".join(sorted({t.effect.family for t in best.candidate.terms if t.free_shape}))
-        named = _words([effect for effect in effects if not effect.shape])
-        free = f"an effect of the family {family}, with a shape of its own," if family else ""
-        what = " and ".join(text for text in (named, free) if text)
-        inside = self.way.has_held_out and not share.held_out
-        sentence = (
-            f"{_capital(what)} is missing (probability {_certain(probability)}): "
-            f"{part(share)} {_where(share)}"
-            f"{'; in the trials held out it has hardly any force' if inside else ''}; "
-            f"{self.way.left(best, share)}."
-            f"{self._shape(best)}"
-        )
-        return self._verdict(
-            VerdictKind.NAMED_IN_PART, sentence, probability, best, [best], effects=effects, family=family,
-            gates=(self.way.gate(best),),
-        )  # fmt: skip
+def _group(court: Court[H], members: Sequence[H], probability: float) -> Outcome:
+    """Return the verdict that one of several hypotheses is what is missing, what they share first."""
+    share, effects = court.told(members[0]), [named_effects(court.problem, item) for item in members]
+    rows = zip(members, effects, strict=True)
+    words = [f"{effects_text(own)} ({percent(court.told(item))})" for item, own in rows]
+    sentence = said("verdict.this_share", members=listing(words, "or"), share=share, where=_where(share))
+    common = set.intersection(*(names(item) for item in members))
+    both = [effect for effect in effects[0] if (effect.identifier, effect.place) in common]
+    if both:
+        sentence = f"{_capital(effects_text(both))} is missing. {sentence}"
+    more = {
+        "effects": tuple(effect for own in effects for effect in own),
+        "group": tuple(" + ".join(sorted(plain_names(item.candidate.identifiers))) for item in members),
+        "gates": (court.gate(members[0]),),
+    }
+    return _outcome(court, VerdictKind.GROUP, sentence, min(probability, 1.0), members[0], members, **more)
 
-    def group(self, members: Sequence[H], probability: float) -> Outcome:
-        """Return the verdict that one of several hypotheses is what is missing, what they share first."""
-        share = self.court.told(members[0])
-        words = [f"{_words(self.effects(item))} ({percent(self.court.told(item))})" for item in members]
-        sentence = (
-            f"Either {', '.join(words[:-1])} or {words[-1]} is this share of {share.of} "
-            f"{_where(share)}; these data cannot tell which."
-        )
-        common = set.intersection(*(names(item) for item in members))
-        both = [e for e in self.effects(members[0]) if (e.identifier, e.place) in common]
-        if both:
-            sentence = f"{_capital(_words(both))} is missing. {sentence}"
-        return self._verdict(
-            VerdictKind.GROUP, sentence, min(probability, 1.0), members[0], members,
-            effects=tuple(effect for item in members for effect in self.effects(item)),
-            group=tuple(" + ".join(sorted(plain_names(item.candidate.identifiers))) for item in members),
-            gates=(self.way.gate(members[0]),),
-        )  # fmt: skip
 
-    def unexplained(self, close: H | None = None, probability: float = 0.0, rivals: int = 0) -> Outcome:
-        """Return the verdict that a force is missing which has no name: how large, and what orders it.
+def _unexplained(
+    court: Court[H], first: Verdict, close: H | None = None, probability: float = 0.0, rivals: int = 0
+) -> Outcome:
+    """Return the verdict that a force is missing which has no name: how large, and what orders it.
 
-        `close`: what has a probability that is too small for a name, or more rivals than tell anything.
-        """
-        court = self.court
-        failed = next((gate.reason for gate in self.first.gates if gate.passed is False), "")
-        sentence = f"There is a gap that no effect of the catalogue fits. {failed}".strip()
-        sentence = f"{sentence} {self._of_the_force()}".strip()
-        effective = [item for item in court.ranked if item.candidate.terms]
-        shown = close or max(effective, key=lambda item: court.told(item).value, default=None)
-        if shown is not None and court.told(shown).value < LEAST_SHOWN:
-            shown = None
-        if shown is None:
-            sentence += " No hypothesis is a tenth of it."
-        else:
-            share, why = court.told(shown), court.against(shown)
-            if rivals:
-                why = f"{rivals} others are as much of it: that tells nothing"
-            elif close is not None and not why:
-                why = f"its probability is {probability:.2g}: a name needs {SEARCH.sure:g}"
-            sentence += (
-                f" The best hypothesis, {_words(self.effects(shown))}, is {part(share)} {_where(share)}"
-                f"{f'; it is no name, as {why}' if why else ''}."
-            )
-        resembles = () if shown is None else plain_names(shown.candidate.identifiers)
-        return self._verdict(
-            VerdictKind.UNEXPLAINED, sentence, self.first.probability, shown, [], resembles=resembles,
-            gates=self.first.gates,
-        )  # fmt: skip
+    `close`: what has a probability that is too small for a name, or more rivals than tell anything.
+    """
+    failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
+    gap = f"{said('verdict.no_effect_fits', reason=failed).strip()} {court.gap()}".strip()
+    effective = [item for item in court.ranked if item.candidate.terms]
+    shown = close or max(effective, key=lambda item: court.told(item).value, default=None)
+    if shown is None or court.told(shown).value < LEAST_SHOWN:
+        shown, sentence = None, said("verdict.no_tenth", gap=gap)
+    else:
+        share, why = court.told(shown), court.against(shown)
+        if rivals:
+            why = said("against.rivals", rivals=rivals)
+        elif close is not None and not why:
+            why = said("against.probability", probability=probability, sure=SEARCH.sure)
+        told = {"what": effects_text(named_effects(court.problem, shown)), "where": _where(share)}
+        why = f"; it is no name, as {why}" if why else ""
+        sentence = said("verdict.best_is", gap=gap, part=part(share), why=why, **told)
+    more = {
+        "resembles": () if shown is None else plain_names(shown.candidate.identifiers), "gates": first.gates,
+    }  # fmt: skip
+    return _outcome(court, VerdictKind.UNEXPLAINED, sentence, first.probability, shown, [], **more)
 
-    def _verdict(
-        self,
-        kind: VerdictKind,
-        sentence: str,
-        probability: float,
-        stands: H | None,
-        first: Sequence[H],
-        **more: Any,
-    ) -> Outcome:
-        court = self.court
-        ranked = [*court.ranked, *(item for item in first if not any(item is one for one in court.ranked))]
-        scores = np.array([self.way.score(item) for item in ranked])
-        weights = np.exp(scores - logsumexp(scores)).tolist()
-        rows = sorted(
-            zip(weights, ranked, strict=True),
-            key=lambda row: (not any(row[1] is item for item in first), -row[0]),
-        )
-        inclusion: dict[str, float] = {}
-        for weight, item in rows:
-            for name in dict.fromkeys(plain_names(item.candidate.identifiers)):
-                inclusion[name] = inclusion.get(name, 0.0) + weight
-        fit = self.found.none if stands is None else self.way.fitted(stands)
-        verdict = Verdict(
-            kind, sentence, probability, self.way.gain(stands or court.ranked[0]), inclusion=inclusion,
-            explained=None if stands is None else explained_share(court.told(stands)),
-            hypotheses=tuple(
-                Hypothesis(
-                    self.effects(item), evidence, weight, chi_square, freedom,
-                    parameters_at(self.problem, item.shared, self.way.covariance(item)),
-                )
-                for weight, item in rows[:MOST_TOLD]
-                for evidence, chi_square, freedom in (self.way.sizes(item),)
-            ),
-            remainders=remainder_estimates(self.problem, fit),
-            **more,
-        )  # fmt: skip
-        return verdict, self.found, fit
 
-    def effects(self, item: H) -> tuple[NamedEffect, ...]:
-        """Return the effects of a hypothesis with their intervals."""
-        ends = NINETY * np.sqrt(np.diag(self.way.covariance(item))[len(item.shared) :])
-        return effects_at(self.problem, item.candidate, item.effect, item.effect - ends, item.effect + ends)
+def _outcome(
+    court: Court[H], kind: VerdictKind, sentence: str, probability: float, stands: H | None,
+    first: Sequence[H], **more: Any,
+) -> Outcome:  # fmt: skip
+    """Return a verdict with all hypotheses, some of them `first`, and the one that stands for it."""
+    problem, ranked = court.problem, list(court.ranked)
+    ranked += [item for item in first if not any(item is one for one in ranked)]
+    scores = np.array([court.score(item) for item in ranked])
+    weights = np.exp(scores - logsumexp(scores)).tolist()
+    rows = sorted(
+        zip(ranked, weights, strict=True),
+        key=lambda row: (not any(row[0] is item for item in first), -row[1]),
+    )
+    identifiers = dict.fromkeys(name for item, _ in rows for name in plain_names(item.candidate.identifiers))
+    told = tuple(hypothesis(problem, item, p, *court.sizes(item)) for item, p in rows[:MOST_TOLD])
+    fit = court.found.none if stands is None else court.fitted(stands)
+    gain = court.gain(ranked[0] if stands is None else stands)
+    more["explained"] = None if stands is None else explained_share(court.told(stands))
+    more["remainders"] = remainder_estimates(problem, fit)
+    conclusion = Conclusion(court.found, gain, told, inclusion(rows, identifiers))
+    return conclusion.outcome(kind, sentence, probability, fit, **more)
 
-    def _of_the_force(self) -> str:
-        """Return size and port of the missing force, and the variable that orders it; empty: none is seen."""
-        if not isinstance(self.way, ByForce):
-            return ""
-        search = self.way.search
-        at = search.best()
-        (port,) = at.processes
-        rows = []
-        for trial, motion in zip(at.view.trials, at.motions, strict=True):
-            samples = slice(None, None, trial.parts)
-            moving = motion.positions[:, port], motion.speeds[:, port]
-            columns = (motion.forces[port], *moving, trial.fine_time)
-            rows.append(np.array([column[samples] for column in columns]))
-        force, position, speed, time = np.concatenate(rows, axis=1)
-        shares, names_of = orders(force, position, speed, time)
-        ordered = "ordered by none of displacement, velocity, amplitude and time"
-        if names_of:
-            most = 100.0 * max(shares.values())
-            ordered = f"ordered by {' and '.join(names_of)} ({most:.0f} % of its variance)"
-        size = float(np.sqrt(np.mean(force**2)))
-        unit = self.way.unit(at)
-        return f"A force of {size:.3g} {unit} (rms) is missing at {search.ports[port]!r}, {ordered}."
 
-    def _shape(self, best: H) -> str:
-        """Return the sentence on the free shape of one law, unless trials not fitted speak against it."""
-        (term, *others), told = best.candidate.terms, self.court.told
-        free = None if others else self.way.freed(best)
-        if free is None or told(free).value < told(best).value - SEARCH.slim:
-            return ""
-        spread = np.sqrt(np.diag(self.way.covariance(free)))[len(free.shared) + len(term.effect.parameters) :]
-        shown = [
-            f"{item.description.split(' (')[0]} {item.value:.2g} ({item.low:.2g} to {item.high:.2g})"
-            for item, deviation in zip(self.effects(free)[0].shape, spread, strict=True)
-            if deviation < SEARCH.told_by_data
-        ]
-        return f" With a shape of its own: {', '.join(shown)}." if shown else ""
+def _shape(court: Court[H], best: H) -> str:
+    """Return the sentence on the free shape of one law, unless trials not fitted speak against it."""
+    (term, *others) = best.candidate.terms
+    free = None if others else court.freed(best)
+    if free is None or court.told(free).value < court.told(best).value - SEARCH.slim:
+        return ""
+    spread = np.sqrt(np.diag(free.covariance))[len(free.shared) + len(term.effect.parameters) :]
+    shown = [
+        f"{item.description.split(' (')[0]} {item.value:.2g} ({item.low:.2g} to {item.high:.2g})"
+        for item, deviation in zip(named_effects(court.problem, free)[0].shape, spread, strict=True)
+        if deviation < SEARCH.told_by_data
+    ]
+    return said("verdict.with_a_shape", shape=", ".join(shown)) if shown else ""
 
 
 def explained_share(share: Share) -> ExplainedShare:
@@ -359,35 +275,20 @@ def explained_share(share: Share) -> ExplainedShare:
 
 
 def _where(share: Share) -> str:
-    kind = "not fitted" if share.held_out else "fitted"
+    trials = counted(share.trials, "trial") if share.trials > 1 else "one trial"
     return (
-        f"in {share.trials} trials that were {kind}" if share.trials > 1 else f"in one trial that was {kind}"
+        f"in {trials} that {'were' if share.trials > 1 else 'was'} {'not ' if share.held_out else ''}fitted"
     )
-
-
-def _words(effects: Sequence[NamedEffect]) -> str:
-    return " and ".join(f"{effect.name}{f' at {effect.place}' if effect.place else ''}" for effect in effects)
 
 
 def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _certain(probability: float) -> str:
-    return "> 0.999" if probability > 0.9995 else f"{probability:.3f}"
-
-
 def remainder_estimates(problem: Problem, found: CandidateFit) -> tuple[RemainderEstimate, ...]:
     """Return the remainders of a fit for the verdict."""
-    remainder = found.remainder
-    if remainder is None:
+    left = found.remainder
+    if left is None:
         return ()
-    rows = (
-        (name, remainder.size[channel], remainder.time[channel], remainder.frequency[channel])
-        for channel, name in enumerate(problem.channel_names)
-        if remainder.size[channel] > 0.0
-    )
-    return tuple(
-        RemainderEstimate(name, float(size), float(time), float(frequency))
-        for name, size, time, frequency in rows
-    )
+    rows = zip(problem.channel_names, left.size, left.time, left.frequency, strict=True)
+    return tuple(RemainderEstimate(name, *map(float, of)) for name, *of in rows if of[0] > 0.0)

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.search.starting_points import are_related
+from discrepancy.sentences import said
 from discrepancy.verdict import Verdict, VerdictKind
+from reporting.words import listing
 
 TOLD = 3
 """Effects that were not tested and are called by name in the sentence of a verdict."""
@@ -26,13 +28,10 @@ def with_untested(verdict: Verdict, setting: Setting, effects: Sequence[Effect])
     known = {effect.identifier: effect for effect in effects}
     members = [known[item.identifier] for item in verdict.effects if item.identifier in known]
     untested.sort(key=lambda effect: not any(are_related(effect, member) for member in members))
-    names = [effect.name for effect in untested[:TOLD]]
-    rest = len(untested) - len(names)
-    listed = f"{', '.join(names)} and {rest} more" if rest else " and ".join(names)
-    return replace(
-        verdict,
-        sentence=f"{verdict.sentence} These trials cannot test all effects that may act so: {listed}.",
-    )
+    rest = len(untested) - TOLD
+    names = [effect.name for effect in untested[:TOLD]] + ([f"{rest} more"] if rest > 0 else [])
+    sentence = said("remarks.untested", sentence=verdict.sentence, names=listing(names))
+    return replace(verdict, sentence=sentence)
 
 
 def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | None:
@@ -55,29 +54,18 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     effects = {effect.identifier: effect for effect in compared}
     named = {effect.identifier: effect.name for effect in verdict.effects}
     alike = {
-        other
-        for identifier, effect in effects.items()
-        for other in effect.confusable
-        if identifier in named and other not in named
+        identifier for identifier, effect in effects.items() if not set(effect.confusable).isdisjoint(named)
     }
-    alike |= {
-        identifier
-        for identifier, effect in effects.items()
-        if identifier not in named and not named.keys().isdisjoint(effect.confusable)
-    }
-    text = (
-        f"A cause that the catalogue lacks and that acts on these trials as {' and '.join(named.values())} "
-        f"{'does' if len(named) == 1 else 'do together'}, within the noise, would be given the same name."
-    )
+    alike |= {other for name in named.keys() & effects.keys() for other in effects[name].confusable}
+    alike -= named.keys()
+    does = "does" if len(named) == 1 else "do together"
+    text = said("remarks.look_alike", names=" and ".join(named.values()), does=does)
     tried, untried = sorted(alike & effects.keys()), sorted(alike - effects.keys())
+    missed = said("remarks.not_compared", names=", ".join(untried), was=_was(untried)) if untried else ""
     if tried:
-        text += (
-            f" Of what is known to look alike, {', '.join(tried)} {_was(tried)} compared, with less evidence"
-        )
-        text += f"; {', '.join(untried)} {_was(untried)} not compared." if untried else "."
-    elif untried:
-        text += f" Of what is known to look alike, {', '.join(untried)} {_was(untried)} not compared."
-    return text
+        words = said("remarks.compared", names=", ".join(tried), was=_was(tried))
+        return f"{text}{words}{f'; {missed}' if missed else '.'}"
+    return f"{text} Of what is known to look alike, {missed}" if missed else text
 
 
 def _was(items: list[str]) -> str:

@@ -6,6 +6,7 @@ nuisances; the information is the mutual information of hypothesis and data, by 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.models.wrapped import PatchedModel
+from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import Experiment
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass
 
@@ -29,6 +31,7 @@ SEED = 20210527
 LEAST_INFORMATION = 0.03
 """Experiments that tell less are not proposed [nat]."""
 PROPOSED = 4
+_BY_ROW = ("values", "used", "force", "load_factor", "temperature", "health", "health_deviation")
 
 
 @dataclass(frozen=True)
@@ -172,131 +175,56 @@ def proposals(campaign: Campaign, problem: Problem, *, swings: bool = True) -> I
     swings : bool
         Whether a release oscillates: a longer record of one that does not shows rest.
     """
-    ringdowns = [trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN]
-    statics = [trial for trial in campaign.trials if trial.kind is TrialKind.STATIC]
-    flights = [trial for trial in campaign.trials if trial.kind is TrialKind.FLIGHT]
-    scales = problem.setting.scales
-    if ringdowns:
-        yield from _ringdowns(campaign, ringdowns, problem, scales.modal_mass, swings=swings)
-    if statics:
-        yield from _statics(statics, problem)
-    if flights:
-        largest = max(flights, key=lambda trial: float(np.abs(trial.load_factor).max()))
-        for factor, words in ((0.5, "half"), (-0.5, "minus half"), (1.5, "one and a half times")):
-            yield Proposal(
-                replace(largest, name="next flight", load_factor=factor * largest.load_factor),
-                f"Fly turns at {words} the largest load factor "
-                f"({factor * float(np.abs(largest.load_factor).max()):.2g}).",
-                "Lift, inertia and stiffness depend differently on the load factor.",
-                5.0,
-            )
+    for row in SENTENCES["proposal"]:
+        done = [trial for trial in campaign.trials if trial.kind.value == row["kind"] and _size(trial) >= 0.0]
+        if not done or (row["change"] == "length" and not swings):
+            continue
+        largest = (min if row.get("of") == "smallest" else max)(done, key=_size)
+        found = _changed(problem, largest, row["change"], row["by"])
+        if found is not None:
+            top = _size(largest)
+            told = {"top": top, "most": abs(row["by"]) * top, "signed": row["by"] * top, "value": found.value}
+            trial = replace(found.trial, name=row["name"])
+            description = row["description"].format(**told)
+            yield Proposal(trial, description, row["reason"], row["cost"], found.added)
 
 
-def _ringdowns(
-    campaign: Campaign, ringdowns: list[Trial], problem: Problem, modal_mass: float, *, swings: bool
-) -> Iterator[Proposal]:
-    def release(trial: Trial) -> float:
-        return abs(trial.release.displacement) if trial.release is not None else 0.0
-
-    largest = max(ringdowns, key=release)
-    smallest = min(ringdowns, key=release)
-    if largest.release is None or smallest.release is None:
-        return
-
-    def at(trial: Trial, factor: float, name: str) -> Trial:
-        assert trial.release is not None  # checked above
-        changed = replace(trial.release, displacement=factor * trial.release.displacement)
-        return replace(trial, name=name, release=changed)
-
-    for trial, factor, words in (
-        (smallest, 0.5, "at half the smallest amplitude so far"),
-        (largest, 2.0, "at twice the largest amplitude so far"),
-        (largest, -1.0, "to the other side, at the largest amplitude so far"),
-    ):
-        yield Proposal(
-            at(trial, factor, f"release {words}"),
-            f"Release {words} ({abs(factor) * release(trial):.3g} at its point, SI).",
-            "Linear effects scale with the amplitude, friction, slip and stiffening do not.",
-            1.0,
-        )
-    if swings:
-        yield _longer(largest)
-    if problem.model.supports(PointMass):
-        stations = problem.model.stations()
-        mass = 0.1 * modal_mass
-        yield Proposal(
-            replace(largest, name="added mass"),
-            f"Repeat the release with a known mass of {1e3 * mass:.3g} g at the tip.",
-            "Mass, stiffness and the clock move the frequencies differently when a known mass is added.",
-            1.5,
-            ModelPatch((PointMass(mass, stations[1] if stations is not None else 0.0),)),
-        )
-    if problem.model.supports(ModulusTemperature) and campaign.reference_temperature is not None:
-        yield Proposal(
-            replace(largest, name="warmer release", temperature=largest.temperature + 15.0),
-            "Repeat the release 15 K warmer.",
-            "Only effects of temperature follow it.",
-            3.0,
-        )
+def _size(trial: Trial) -> float:
+    """Return what counts for the size of a trial; below zero where it says nothing of it."""
+    if trial.kind is TrialKind.RINGDOWN:
+        return -1.0 if trial.release is None else abs(trial.release.displacement)
+    return float(np.abs(trial.load_factor if trial.kind is TrialKind.FLIGHT else trial.force).max())
 
 
-def _longer(largest: Trial) -> Proposal:
-    """Return the same release, recorded three times as long."""
-    count = len(largest.time)
-    longer = replace(
-        largest,
-        name="longer record",
-        **{  # type: ignore[arg-type]
-            name: np.concatenate([getattr(largest, name)] * 3)
-            for name in (
-                "values",
-                "used",
-                "force",
-                "load_factor",
-                "temperature",
-                "health",
-                "health_deviation",
-            )
-        },
-        time=largest.time[0] + largest.interval * np.arange(3 * count),
-    )
-    return Proposal(
-        longer,
-        f"Record the same release three times as long ({3 * count * largest.interval:.3g} s).",
-        "What decays with the motion and what goes on with time part company.",
-        1.2,
-    )
+class _Changed(NamedTuple):
+    """A trial as it would be, the new value of what is neither load nor release, what is added."""
+
+    trial: Trial
+    value: float = 0.0
+    added: ModelPatch = ModelPatch()
 
 
-def _statics(statics: list[Trial], problem: Problem) -> Iterator[Proposal]:
-    largest = max(statics, key=lambda trial: float(np.abs(trial.force).max()))
-    top = float(np.abs(largest.force).max())
-    yield Proposal(
-        replace(largest, name="other sign", force=-largest.force),
-        f"Load to the other side, to {top:.3g} N.",
-        "Gaps, cracks and one-sided contacts show their sign.",
-        1.0,
-    )
-    yield Proposal(
-        replace(largest, name="larger load", force=2.0 * largest.force),
-        f"Load to {2.0 * top:.3g} N.",
-        "Offsets stay, gains grow with the load, stiffening faster.",
-        1.0,
-    )
-    stations = problem.model.stations()
-    if stations is not None:
-        for share in (0.5, 0.75):
-            place = (round(stations[0] + share * (stations[1] - stations[0]), 3), 0.35)
-            yield Proposal(
-                replace(largest, name="other place", load_place=place),
-                f"Load at y = {place[0]:.3g} m instead, to {top:.3g} N.",
-                "The root turns with the moment, the load cell with the force, the wing with both.",
-                1.0,
-            )
-    if problem.model.supports(ModulusTemperature) and problem.campaign.reference_temperature is not None:
-        yield Proposal(
-            replace(largest, name="warmer", temperature=largest.temperature + 15.0),
-            "Repeat the static loading 15 K warmer.",
-            "Only effects of temperature follow it.",
-            3.0,
-        )
+def _changed(problem: Problem, trial: Trial, what: str, by: float) -> _Changed | None:
+    """Return a trial with something changed by so much; None where that cannot be, or shows nothing."""
+    model, stations = problem.model, problem.model.stations()
+    if what == "release" and trial.release is not None:
+        release = replace(trial.release, displacement=by * trial.release.displacement)
+        return _Changed(replace(trial, release=release))
+    if what in ("force", "load_factor"):
+        return _Changed(replace(trial, **{what: by * getattr(trial, what)}))
+    if what == "length":
+        count = int(by) * len(trial.time)
+        longer = {name: np.concatenate([getattr(trial, name)] * int(by)) for name in _BY_ROW}
+        time = trial.time[0] + trial.interval * np.arange(count)
+        return _Changed(replace(trial, **longer, time=time), count * trial.interval)  # type: ignore[arg-type]
+    if what == "place" and stations is not None:
+        place = (round(stations[0] + by * (stations[1] - stations[0]), 3), 0.35)
+        return _Changed(replace(trial, load_place=place), place[0])
+    if what == "mass" and model.supports(PointMass):
+        mass = by * problem.setting.scales.modal_mass
+        at_tip = PointMass(mass, stations[1] if stations is not None else 0.0)
+        return _Changed(trial, 1e3 * mass, ModelPatch((at_tip,)))
+    known = problem.campaign.reference_temperature is not None
+    if what == "temperature" and known and model.supports(ModulusTemperature):
+        return _Changed(replace(trial, temperature=trial.temperature + by))
+    return None

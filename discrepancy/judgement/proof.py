@@ -13,9 +13,9 @@ from scipy import stats
 
 from discrepancy.campaign.noise_tests import SHORTEST_SERIES, ljung_box, variance_p_value
 from discrepancy.errors import FitError
-from discrepancy.location.locate import Location
 from discrepancy.location.omnibus_tests import mean_square
 from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.sentences import said
 from discrepancy.verdict import Gate, Proof, Scores
 
 FloatArray = NDArray[np.float64]
@@ -230,24 +230,22 @@ def held_out_gate(after: ResidualSet) -> Gate:
     """
     outside = after.held_out
     if outside is None:
-        return Gate("held-out trials", None, nan, HELD_OUT_DEVIATIONS, "No trial was held out.")
+        return _gate(None, nan, "no_trial")
     found = scores(outside)
     beyond = (found.chi_square_per_dof - 1.0) / found.chi_square_deviation
     if not np.isfinite(beyond):
-        return Gate("held-out trials", None, nan, HELD_OUT_DEVIATIONS, "No noise record to judge them by.")
+        return _gate(None, nan, "no_noise_record")
     if beyond > HELD_OUT_DEVIATIONS:
-        reason = (
-            f"On held-out trials χ²/dof is {found.chi_square_per_dof:.2f}, where 1 ± "
-            f"{found.chi_square_deviation:.2f} is expected."
-        )
-        return Gate("held-out trials", False, beyond, HELD_OUT_DEVIATIONS, reason)
+        return _gate(False, beyond, "misfit", found)
     if found.sample_count >= LEAST_COVERED and not COVERAGE[0] <= found.coverage_90 <= COVERAGE[1]:
-        reason = f"90 % intervals hold {100.0 * found.coverage_90:.0f} % of the samples of held-out trials."
-        return Gate("held-out trials", False, beyond, HELD_OUT_DEVIATIONS, reason)
-    return Gate(
-        "held-out trials", True, beyond, HELD_OUT_DEVIATIONS,
-        "Held-out trials are predicted within their noise.",
-    )  # fmt: skip
+        return _gate(False, beyond, "coverage", found)
+    return _gate(True, beyond, "within")
+
+
+def _gate(passed: bool | None, beyond: float, say: str, found: Scores | None = None) -> Gate:
+    percent = nan if found is None else 100.0 * found.coverage_90
+    reason = said(f"proof.{say}", found=found, percent=percent)
+    return Gate("held-out trials", passed, beyond, HELD_OUT_DEVIATIONS, reason)
 
 
 def gap_closed(before: Scores | None, after: Scores | None) -> tuple[float, str]:
@@ -256,29 +254,22 @@ def gap_closed(before: Scores | None, after: Scores | None) -> tuple[float, str]
     A χ²/dof below one after counts as one: fitting noise closes no gap.
     """
     if before is None or after is None:
-        return nan, "No trial was held out."
+        return nan, said("proof.no_trial")
     if not np.isfinite(before.chi_square_per_dof):
-        return nan, "No noise record: what a closed gap would be is not known."
+        return nan, said("proof.no_noise_record_before")
     gap = before.chi_square_per_dof - 1.0
     if gap < SMALLEST_GAP * before.chi_square_deviation:
-        return nan, (
-            f"Held-out trials show no gap before: χ²/dof {before.chi_square_per_dof:.2f}, where "
-            f"1 \N{PLUS-MINUS SIGN} {before.chi_square_deviation:.2f} is expected of noise."
-        )
+        return nan, said("proof.no_gap", found=before)
     return 1.0 - max(after.chi_square_per_dof - 1.0, 0.0) / gap, ""
 
 
-def prove(
-    before: ResidualSet, after: ResidualSet, *, location: Location | None = None, seed: int = 0
-) -> Proof:
+def prove(before: ResidualSet, after: ResidualSet, *, seed: int = 0) -> Proof:
     """Return the proof from the residuals without and with the effect.
 
     Parameters
     ----------
     before, after : ResidualSet
         The same trials and samples; noise deviations are alike.
-    location : Location, optional
-        Where the model with the effect still disagrees, for the sentence on what remains.
     seed : int
         As of `scores`.
 
@@ -299,56 +290,32 @@ def prove(
     if outside[0] is not None and outside[1] is not None:
         gain, error = score_gain(outside[0], outside[1])
     target = after.fitted if outside[1] is None else outside[1]
-    return Proof(
-        held_out_before=held_before,
-        held_out_after=held_after,
-        fitted_before=scores(before.fitted, seed=seed),
-        fitted_after=fitted_after,
-        gap_closed=closed,
-        log_score_gain=gain,
-        log_score_gain_error=error,
-        remaining=_remaining(target, fitted_after if held_after is None else held_after, location),
-        gap_reason=reason,
-    )
+    remaining = _remaining(target, fitted_after if held_after is None else held_after)
+    fitted_before = scores(before.fitted, seed=seed)
+    return Proof(held_before, held_after, fitted_before, fitted_after, closed, gain, error, remaining, reason)
 
 
 def _check_alike(before: ResidualSet, after: ResidualSet) -> None:
-    names = [[item.trial.name for item in one.trials] for one in (before, after)]
+    names = [", ".join(item.trial.name for item in one.trials) for one in (before, after)]
     if names[0] != names[1]:
-        raise FitError(
-            f"A proof needs the same trials before and after, but they are {', '.join(names[0])} and "
-            f"{', '.join(names[1])}."
-        )
+        raise FitError(said("proof.other_trials", before=names[0], after=names[1]))
     for first, second in zip(before.trials, after.trials, strict=True):
         if first.trial.held_out is not second.trial.held_out or not np.array_equal(first.used, second.used):
-            raise FitError(
-                f"The trial {first.trial.name!r} has other samples or another role before than after."
-            )
+            raise FitError(said("proof.other_samples", trial=first.trial.name))
         if not np.allclose(first.noise_deviation, second.noise_deviation, rtol=1e-9):
-            raise FitError(
-                f"The trial {first.trial.name!r} has other noise deviations before than after: both must be "
-                "those of the noise records."
-            )
+            raise FitError(said("proof.other_noise", trial=first.trial.name))
 
 
-def _remaining(residuals: ResidualSet, after: Scores, location: Location | None) -> str:
+def _remaining(residuals: ResidualSet, after: Scores) -> str:
     """Return a sentence on what is still not explained."""
-    where = "held-out" if residuals.trials[0].trial.held_out else "fitted"
-    size = f"χ²/dof {after.chi_square_per_dof:.2f} on {where} trials"
     if not np.isfinite(after.chi_square_per_dof):
-        return "Without a noise record it is not known what remains."
-    names = list(dict.fromkeys(n for item in residuals.trials for n in item.trial.channels))
+        return said("proof.not_known")
+    where = "held-out" if residuals.trials[0].trial.held_out else "fitted"
+    names = dict.fromkeys(n for item in residuals.trials for n in item.trial.channels)
     known = [name for name in names if residuals.degrees_of_freedom(name) > 0.0]
     square, freedom = mean_square(residuals, known)
-    noise = min(residuals.degrees_of_freedom(name) for name in known)
-    too_large = variance_p_value(square, freedom, noise) < _REMAINS
-    coloured = after.whiteness < _REMAINS
-    if location is not None and location.disagreements:
-        return f"Still unexplained ({size}): {location.disagreements[0].sentence}"
-    if too_large:
-        worst = max(known, key=lambda name: mean_square(residuals, (name,))[0])
-        share = mean_square(residuals, (worst,))[0]
-        return f"Still unexplained: {size}, most on {worst} ({share:.2f})."
-    if coloured:
-        return f"The size is that of noise ({size}), but residuals are not white (p = {after.whiteness:.1g})."
-    return f"Nothing that these data can show remains ({size})."
+    if variance_p_value(square, freedom, min(map(residuals.degrees_of_freedom, known))) < _REMAINS:
+        shares = {name: mean_square(residuals, (name,))[0] for name in known}
+        worst = max(shares, key=lambda name: shares[name])
+        return said("proof.remains", found=after, where=where, worst=worst, share=shares[worst])
+    return said("proof.coloured" if after.whiteness < _REMAINS else "proof.nothing", found=after, where=where)

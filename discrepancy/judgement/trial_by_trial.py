@@ -17,6 +17,7 @@ from discrepancy.fits.cholesky import Cholesky
 from discrepancy.fits.fitting import CandidateFit, trial_block
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import is_magnitude
+from discrepancy.sentences import said
 
 FloatArray = NDArray[np.float64]
 
@@ -76,10 +77,7 @@ class SizeByTrial:
         """Return what is said of an effect that follows the trial."""
         low, high = int(np.argmin(self.shares)), int(np.argmax(self.shares))
         ends = [f"{100.0 * (1.0 + self.shares[at]):.0f} % of it in {self.trials[at]!r}" for at in (low, high)]
-        return (
-            f"The size of {self.name} follows the trial: {ends[0]}, {ends[1]}, which their intervals do not "
-            f"hold together (Cochran's Q, p = {self.p_value:.1g}), so that it stands for something else."
-        )
+        return said("remarks.follows_trial", name=self.name, low=ends[0], high=ends[1], p=self.p_value)
 
 
 def sizes_by_trial(problem: Problem, found: CandidateFit) -> list[SizeByTrial]:

@@ -241,10 +241,7 @@ def at_amplitude(curves: Sequence[Backbone], amplitude: float, factor: float = 2
     if not values:
         return BackboneValue(amplitude, nan, nan, nan, nan, 0)
     table = np.array(values)
-    if len(table) == 1:
-        f, f_error, ratio, ratio_error = table[0].tolist()
-        return BackboneValue(amplitude, f, f_error, ratio, ratio_error, 1)
-    mean, scatter = table.mean(axis=0), table.std(axis=0, ddof=1) / sqrt(len(table))
-    return BackboneValue(
-        amplitude, float(mean[0]), float(scatter[0]), float(mean[2]), float(scatter[2]), len(table)
-    )
+    found = table.mean(axis=0)
+    if len(table) > 1:
+        found[1::2] = table[:, ::2].std(axis=0, ddof=1) / sqrt(len(table))
+    return BackboneValue(amplitude, *found.tolist(), len(table))

@@ -3,24 +3,20 @@
 Excess variance is the sum of squares in units of the noise less what noise alone would leave after the fit.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import block_diag
 
 from discrepancy.campaign.noise_tests import periodogram
-from discrepancy.location.map import features
+from discrepancy.location.columns import FloatArray, Part, explained, features, part_of
 from discrepancy.location.modal_motion import MotionByMode, modal_motion
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 
-FloatArray = NDArray[np.float64]
-
 _HATS = 9  # knots of a dependence on time or amplitude
-_FREE_SHARE = 0.02  # of a direction's square must survive the fit
 
 
 @dataclass(frozen=True)
@@ -32,9 +28,9 @@ class Explanation:
     trials : str
         Kind of the trials.
     subject : str
-        "mode 1", "channel g17", or "" for all channels alike.
+        "mode 1", or "" for all channels alike.
     dependence : str
-        "amplitude", "time", "load (proportional)", "x and v", "whole", ...
+        "amplitude", "time", "load (proportional)", "x and v", ...
     share : float
         Of the excess variance of these trials, after subtracting one for each coefficient.
     coefficients : int
@@ -65,9 +61,7 @@ def kinds(residuals: ResidualSet) -> dict[str, tuple[int, ...]]:
 
 def excess(items: Sequence[FittedTrial]) -> float:
     """Return the excess variance of trials, in units of the noise variance."""
-    return float(
-        sum(np.sum(i.standardised[i.used] ** 2) - np.sum(i.expected_variance[i.used]) for i in items)
-    )
+    return float(sum(np.nansum(i.standardised**2) - np.sum(i.expected_variance[i.used]) for i in items))
 
 
 def _hats(values: FloatArray, low: float, high: float, knots: int = _HATS) -> FloatArray:
@@ -96,40 +90,25 @@ def explanations(
         freedom = sum(float(np.sum(i.expected_variance[i.used])) for i in items)
         if freedom <= 0.0 or whole <= 2.0 * np.sqrt(2.0 * freedom):
             continue  # no excess to explain
-        blocks: dict[tuple[str, str], list[_Block]] = {}
+        parts: dict[tuple[str, str], list[Part]] = {}
         modes = _modes(items, frequencies)
         line = dominant_line(items) if items[0].trial.is_dynamic else None
         for column in range(len(items[0].trial.channels)):
             used = [item for item in items if item.used[:, column].any()]
-            if not used:
-                continue
-            residual = np.concatenate([i.standardised[i.used[:, column], column] for i in used])
-            sensitive = None
-            if all(i.sensitivity is not None for i in used):
-                sensitive = np.vstack([_rows(i, column) for i in used])
-            bases = _bases(used, column, modes)
-            if line is not None:
+            bases = _bases(used, column, modes) if used else {}
+            if used and line is not None:
                 bases["", line.name] = _line_basis(used, column, line)
             for key, basis in bases.items():
-                if (block := _block(basis, residual, sensitive)) is not None:
-                    blocks.setdefault(key, []).append(block)
-        sums = {key: _explained(parts) for key, parts in blocks.items()}
-        for (subject, dependence), (explained, count) in sums.items():
-            share = float(np.clip((explained - count) / whole, 0.0, 1.0))
-            p = float(stats.chi2.sf(explained, count)) if count else 1.0
+                part = part_of(basis, [(item, item.used[:, column]) for item in used], column)
+                if part is not None:
+                    parts.setdefault(key, []).append(part)
+        for (subject, dependence), own in parts.items():
+            statistic, count = explained(own)
+            share = float(np.clip((statistic - count) / whole, 0.0, 1.0))
+            p = float(stats.chi2.sf(statistic, count)) if count else 1.0
             if line is not None and dependence == line.name:
                 p = min(1.0, p * line.choices)
             found.append(Explanation(name, subject, dependence, share, count, p))
-        for column, channel in enumerate(items[0].trial.channels):
-            if len(items[0].trial.channels) > 1:
-                own = sum(
-                    float(np.sum(i.standardised[i.used[:, column], column] ** 2)
-                          - np.sum(i.expected_variance[i.used[:, column], column])) for i in items
-                )  # fmt: skip
-                count = sum(int(i.used[:, column].sum()) for i in items)
-                p = float(stats.chi2.sf(own + count, count)) if count else 1.0
-                share = float(np.clip(own / whole, 0.0, 1.0))
-                found.append(Explanation(name, f"channel {channel}", "whole", share, count, p))
     return tuple(sorted(found, key=lambda item: -item.share))
 
 
@@ -187,44 +166,6 @@ def _line_basis(items: Sequence[FittedTrial], column: int, line: SpectralLine) -
     return np.asarray(block_diag(*waves))
 
 
-class _Block(NamedTuple):
-    """One channel of a dependence: B'B, B'r and S'B for unit columns of B."""
-
-    gram: FloatArray
-    along: FloatArray
-    absorbed: FloatArray
-
-
-def _rows(item: FittedTrial, column: int) -> FloatArray:
-    assert item.sensitivity is not None
-    return np.asarray(item.sensitivity[item.used[:, column], column])
-
-
-def _block(basis: FloatArray, residual: FloatArray, sensitive: FloatArray | None) -> _Block | None:
-    size = np.linalg.norm(basis, axis=0)
-    basis = basis[:, size > 0.0] / size[size > 0.0]
-    if not 0 < basis.shape[1] < residual.size:
-        return None  # as many coefficients as samples explain anything
-    absorbed = np.zeros((0, basis.shape[1])) if sensitive is None else sensitive.T @ basis
-    return _Block(basis.T @ basis, basis.T @ residual, absorbed)
-
-
-def _explained(blocks: Sequence[_Block]) -> tuple[float, int]:
-    """Return the sum of squares that a dependence explains, and the number of its coefficients.
-
-    B'r has the covariance G = B'(I - S S')B under the null, so that (B'r)' G^-1 (B'r) is chi^2; with a gap it
-    is what B explains of it after the fit has absorbed its share. Directions that it absorbs are left out.
-    """
-    gram = block_diag(*(block.gram for block in blocks))
-    if all(block.absorbed.shape[0] for block in blocks):
-        absorbed = np.hstack([block.absorbed for block in blocks])
-        gram = gram - absorbed.T @ absorbed
-    along = np.concatenate([block.along for block in blocks])
-    values, vectors = np.linalg.eigh(gram)
-    kept = values > _FREE_SHARE
-    return float(np.sum((vectors[:, kept].T @ along) ** 2 / values[kept])), int(kept.sum())
-
-
 def _modes(
     items: Sequence[FittedTrial], frequencies: Sequence[float] | None
 ) -> dict[int, MotionByMode] | None:
@@ -245,8 +186,9 @@ def _bases(
     rows = [item.used[:, column] for item in items]
 
     def stack(*names: str) -> FloatArray:
+        width = max((table.shape[1] for f in named for name, table in f.items() if name in names), default=1)
         return np.vstack([
-            np.column_stack([f.get(name, np.zeros(int(use.sum()))) for name in names])
+            np.hstack([f.get(name, np.zeros((int(use.sum()), width))) for name in names])
             for f, use in zip(named, rows, strict=True)
         ])  # fmt: skip
 
@@ -264,7 +206,12 @@ def _bases(
     if not items[0].trial.is_dynamic:
         if np.ptp(within) > 0.0:
             bases["", "time"] = np.column_stack([np.ones_like(within), within - within.mean()])
-        return bases | _load_bases(items, joined, stack)
+        force = joined([item.trial.force for item in items])
+        load = force if np.any(force) else joined([item.trial.load_factor for item in items])
+        if np.ptp(load) > 0.0:
+            bases["", "load (proportional)"] = np.column_stack([stack("x")[:, 0], load])
+            bases["", "load (not proportional)"] = np.column_stack([load, np.abs(load) * load, load**2])
+        return bases
     drifts = []
     for item, use in zip(items, rows, strict=True):
         x = (item.trial.time[use] - item.trial.time[0]) / (item.trial.time[-1] - item.trial.time[0])
@@ -272,9 +219,7 @@ def _bases(
     bases["", "a drift of zero in each trial"] = np.asarray(block_diag(*drifts))
     if all(item.rates is not None for item in items):
         bases["", "x and v"] = stack("x", "v")
-        bases["", "higher harmonics"] = stack(
-            *(f"{n} {part}" for n in ("2nd harmonic", "3rd harmonic") for part in ("cos", "sin"))
-        )
+        bases["", "higher harmonics"] = stack("2nd harmonic", "3rd harmonic")
     if modes is None:
         return bases
     by_time = _hats(within, float(within.min()), float(within.max()))
@@ -292,21 +237,6 @@ def _bases(
         for dependence, shape in (("amplitude", by_amplitude), ("time", by_time)):
             table = np.hstack([shape * motion[:, [0]], shape * motion[:, [1]]])
             bases[f"mode {mode + 1}", dependence] = table
-    return bases
-
-
-def _load_bases(
-    items: Sequence[FittedTrial],
-    joined: Callable[[Sequence[FloatArray]], FloatArray],
-    stack: Callable[..., FloatArray],
-) -> dict[tuple[str, str], FloatArray]:
-    bases = {}
-    force = joined([item.trial.force for item in items])
-    load = force if np.any(force) else joined([item.trial.load_factor for item in items])
-    x = stack("x")[:, 0]
-    if np.ptp(load) > 0.0:
-        bases["", "load (proportional)"] = np.column_stack([x, load])
-        bases["", "load (not proportional)"] = np.column_stack([load, np.abs(load) * load, load**2])
     return bases
 
 

@@ -10,6 +10,7 @@ from discrepancy.campaign.noise_tests import holm, variance_p_value
 from discrepancy.errors import FitError
 from discrepancy.location.dependence import (
     Explanation,
+    excess,
     explanations,
     kinds,
     mode_shares,
@@ -26,6 +27,7 @@ from discrepancy.location.omnibus_tests import (
 )
 from discrepancy.location.patterns import SingularPattern, singular_patterns
 from discrepancy.location.residuals import FittedTrial, ResidualSet, at_own_scale
+from discrepancy.sentences import said
 
 FloatArray = NDArray[np.float64]
 
@@ -38,10 +40,6 @@ MAP_RATE = 0.05
 _TOO_SMALL = 1e-3  # p-value below which residuals are smaller than the noise record allows
 _FAR_OUT = 6.0  # noise deviations; 2e-9 of Gaussian samples lie beyond
 _MEDIAN = 0.6745  # of the magnitude of a standard normal variable
-_OWN_SCALE = (
-    "The model is so far off that nothing is left to judge beside the noise: the map judges each cell by the "
-    "size of what is left in its channel as a whole."
-)
 _WORTH_TELLING = 0.05  # share of the excess variance below which a dependence is not told
 _CLOSE = 0.02  # shares this close are not told apart
 
@@ -153,7 +151,7 @@ def locate(
     judged = any(cell.axis != "frequency" for cell in cells)
     if not judged and (scaled := at_own_scale(fitted)) is not None:
         cells = residual_map(scaled, scaled.white(generator), MAP_RATE)
-        own = (_OWN_SCALE,)
+        own = (said("location.own_scale"),)
     return Location(
         disagrees=disagrees,
         tests=tests,
@@ -167,28 +165,18 @@ def locate(
 
 def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     remarks = []
-    unknown = sorted({
-        name for item in residuals.trials for name in item.trial.channels
-        if residuals.degrees_of_freedom(name) <= 0.0
-    })  # fmt: skip
+    named = {name for item in residuals.trials for name in item.trial.channels}
+    unknown = sorted(name for name in named if residuals.degrees_of_freedom(name) <= 0.0)
     if unknown:
-        remarks.append(
-            f"No noise record for {', '.join(unknown)}: nothing absolute can be said about the size of "
-            "these residuals; give pre-trigger samples, repeats or a standard deviation with its degrees of "
-            "freedom."
-        )
+        remarks.append(said("location.no_noise_record", names=", ".join(unknown)))
     for names in noise_groups(residuals).values():
         square, freedom = mean_square(residuals, names)
-        noise_freedom = residuals.degrees_of_freedom(names[0])
         if freedom < 1.0:
             continue
-        p = variance_p_value(square, freedom, noise_freedom, small=True)
+        p = variance_p_value(square, freedom, residuals.degrees_of_freedom(names[0]), small=True)
         if p < _TOO_SMALL:
-            remarks.append(
-                f"Residuals of {', '.join(names[:4])}{' ..' if len(names) > 4 else ''} are smaller than "
-                f"their noise record allows (mean square {square:.2g} of its expectation, p = {p:.1g}): "
-                "the stated noise is too large, or not that of these channels."
-            )
+            few = f"{', '.join(names[:4])}{' ..' if len(names) > 4 else ''}"
+            remarks.append(said("location.too_small", names=few, square=square, p=p))
     return tuple(remarks)
 
 
@@ -214,10 +202,7 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     if not found:
         return ()
     listed = ", ".join(f"{name} ({count})" for name, count in found.items())
-    return (
-        f"Single samples lie beyond {_FAR_OUT:g} deviations of noise and rest while their neighbours do not: "
-        f"{listed}; if they are errors of the data, leave them out.",
-    )
+    return (said("location.outliers", far=_FAR_OUT, names=listed),)
 
 
 def _probability(p: float) -> str:
@@ -232,11 +217,11 @@ def _disagreements(
     frequencies: Sequence[float] | None,
 ) -> tuple[Disagreement, ...]:
     found: list[Disagreement] = []
-    excess: dict[str, float] = {}
+    gap: dict[str, float] = {}
     for name, members in kinds(residuals).items():
         items = [residuals.trials[number] for number in members]
-        excess[name] = sum(_excess(item) for item in items)
-        rows = [row for row in explained if row.trials == name and row.dependence != "whole"]
+        gap[name] = sum(max(excess([item]), 0.0) for item in items)
+        rows = [row for row in explained if row.trials == name]
         told = _smallest_sufficient(rows)
         if told is None:
             continue
@@ -245,31 +230,16 @@ def _disagreements(
         if line and subject.startswith("mode"):
             subject = "all channels"  # a line of its own frequency is no matter of a mode that the model has
         words = told.dependence if line else f"by {_dependence_words(told, rows)}"
-        found.append(
-            Disagreement(
-                name,
-                subject,
-                told.dependence,
-                told.share,
-                told.p_value,
-                f"{subject[0].upper()}{subject[1:]}, {words}, in {name} trials; explains "
-                f"{100.0 * told.share:.0f} % of the excess variance ({_probability(told.p_value)}).",
-            )
-        )
-    for pattern in patterns:
-        found.append(
-            Disagreement(
-                pattern.trials, pattern.meaning, "channels", pattern.share, pattern.p_value, pattern.sentence
-            )
-        )
+        whose = f"{subject[0].upper()}{subject[1:]}, {words},"
+        p = _probability(told.p_value)
+        sentence = said("location.explains", what=whose, trials=name, percent=100.0 * told.share, p=p)
+        found.append(Disagreement(name, subject, told.dependence, told.share, told.p_value, sentence))
+    found += [
+        Disagreement(item.trials, item.meaning, "channels", item.share, item.p_value, item.sentence)
+        for item in patterns
+    ]
     # Shares are of one kind of trial; what explains most of the whole gap is told first.
-    return tuple(sorted(found, key=lambda item: -item.share * excess[item.trials]))
-
-
-def _excess(item: FittedTrial) -> float:
-    """Return the sum of squares of a trial's residuals beyond what noise would leave."""
-    square = float(np.nansum(item.standardised**2) - item.expected_variance[item.used].sum())
-    return max(square, 0.0)
+    return tuple(sorted(found, key=lambda item: -item.share * gap[item.trials]))
 
 
 def _subject(

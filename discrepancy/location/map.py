@@ -1,27 +1,22 @@
 """The map of residuals: cells of sensor, trial and bin, with the statistics of each.
 
-Whole records are correlated with what they could depend on; bins of time, amplitude, frequency and load are
-tested for their mean and size. Every p-value allows for what the fit has absorbed: a feature f has
-z = f . r / sqrt(f . f - |S^T f|^2), and a feature that the fit absorbs is not tested.
+Whole records are correlated with what they could depend on (`columns`); bins of time, amplitude, frequency
+and load are tested for their mean and size.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import ndtr, stdtr
 
 from discrepancy.campaign.noise_tests import benjamini_yekutieli, periodogram, variance_p_value
 from discrepancy.campaign.records import Trial
+from discrepancy.location.columns import BoolArray, FloatArray, envelope, explained, features, part_of
 from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
-
-FloatArray = NDArray[np.float64]
 
 BINS = 6
 """Bins of time, amplitude and frequency of a dynamic record."""
 
-_FREE_SHARE = 0.02  # of a feature's square must survive the fit, else it says nothing
 _FEWEST = 4  # samples of a cell whose size is tested
 
 
@@ -85,31 +80,6 @@ def residual_map(
     return tuple(replace(cell, significant=bool(flag)) for cell, flag in zip(cells, found, strict=True))
 
 
-def envelope(item: FittedTrial, column: int) -> FloatArray:
-    """Return the amplitude of a channel's predicted motion, (N,): sqrt(x^2 + (v / w)^2) over one period.
-
-    w is the ratio of the root mean squares of rate and value; the mean is taken out first.
-    """
-    if item.rates is None:
-        raise ValueError(f"The trial {item.trial.name!r} has no rates.")
-    x = item.prediction[:, column] - _resting(item, column)
-    v = item.rates[:, column]
-    size, speed = float(np.sqrt(np.mean(x**2))), float(np.sqrt(np.mean(v**2)))
-    if size == 0.0 or speed == 0.0:
-        return np.abs(x)
-    amplitude = np.hypot(x, v * size / speed)
-    width = max(1, round(2.0 * np.pi * size / (speed * item.trial.interval)))
-    width = min(width, len(x))
-    kernel = np.ones(width)
-    return np.asarray(np.convolve(amplitude, kernel, "same") / np.convolve(np.ones_like(x), kernel, "same"))
-
-
-def _resting(item: FittedTrial, column: int) -> float:
-    """Return the value about which a dynamic prediction oscillates: that of its last quarter."""
-    values = item.prediction[:, column]
-    return float(np.mean(values[-max(len(values) // 4, 1) :]))
-
-
 def state_of(trial: Trial) -> str:
     """Return kind, run and health of a trial in a few words."""
     words = [trial.kind.value]
@@ -121,53 +91,6 @@ def state_of(trial: Trial) -> str:
         )
         words.append(losses + ("" if np.ptp(trial.health, axis=0).max() == 0 else " .."))
     return ", ".join(words)
-
-
-def features(item: FittedTrial, column: int) -> dict[str, FloatArray]:
-    """Return what residuals of a channel may go with, (n,) each at the used samples.
-
-    Shapes beyond the linear ones (x^3, |v|v and so on) are made orthogonal to mean, x and v, so that an
-    error of amplitude or phase does not show in all of them.
-    """
-    used, trial = item.used[:, column], item.trial
-    count = int(used.sum())
-    ones = np.ones(count)
-    x = item.prediction[used, column] - (_resting(item, column) if trial.is_dynamic else 0.0)
-    found: dict[str, FloatArray] = {"mean": ones, "x": x}
-    linear = [ones, x]
-    candidates: dict[str, FloatArray] = {"x^3": x**3, "|x|": np.abs(x), "sgn x": np.sign(x)}
-    if trial.is_dynamic:
-        candidates["time"] = trial.time[used]
-        if item.rates is not None:
-            v = item.rates[used, column]
-            found["v"] = v
-            linear.append(v)
-            candidates |= {"sgn v": np.sign(v), "|v|v": np.abs(v) * v}
-            amplitude = envelope(item, column)[used]
-            phase = np.arctan2(-v / _scale(v), x / _scale(x))
-            for order, name in ((2, "2nd harmonic"), (3, "3rd harmonic")):
-                candidates[f"{name} cos"] = amplitude * np.cos(order * phase)
-                candidates[f"{name} sin"] = amplitude * np.sin(order * phase)
-    else:
-        candidates["time"] = trial.time[used]
-        candidates["load"] = trial.force[used]
-        candidates["load factor"] = trial.load_factor[used]
-    candidates["temperature"] = trial.temperature[used]
-    base = np.linalg.qr(np.column_stack([column_ / _scale(column_) for column_ in linear]))[0]
-    for name, values in candidates.items():
-        size = float(np.linalg.norm(values))
-        if size == 0.0:
-            continue
-        # Loads and temperature are themselves what a reader looks for: only their mean goes out.
-        against = base[:, :1] if name in ("load", "load factor", "temperature", "time") else base
-        rest = values - against @ (against.T @ values)
-        if np.linalg.norm(rest) > 1e-6 * size:
-            found[name] = rest
-    return {name: values for name, values in found.items() if np.any(values)}
-
-
-def _scale(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2))) or 1.0
 
 
 def _cells(residuals: ResidualSet, item: FittedTrial, white: FloatArray) -> Iterator[Cell]:
@@ -186,54 +109,30 @@ def _cells(residuals: ResidualSet, item: FittedTrial, white: FloatArray) -> Iter
 
 
 def _whole(item: FittedTrial, column: int, base: Cell, freedom: float) -> Iterator[Cell]:
-    named = features(item, column)
-    table = np.column_stack(list(named.values()))
-    table = table / np.linalg.norm(table, axis=0)
-    z, free = _projected(item, column, table)
-    residual = item.standardised[item.used[:, column], column]
-    size = float(np.linalg.norm(residual)) or 1.0
-    pairs: dict[str, list[int]] = {}
-    for number, name in enumerate(named):
-        pairs.setdefault(name.removesuffix(" cos").removesuffix(" sin"), []).append(number)
-    for name, numbers in pairs.items():
-        if not all(free[number] for number in numbers):
-            continue
-        if name == "mean":
-            value = float(np.mean(residual))
-        else:
-            along = table[:, numbers].T @ residual
-            value = float(along[0] if len(numbers) == 1 else np.linalg.norm(along)) / size
-        if len(numbers) == 1:
-            p = 2.0 * float(_tail(abs(z[numbers[0]]), freedom))
-        else:
-            # Cosine and sine of one harmonic are all but orthogonal: chi^2 or F with two degrees of freedom.
-            p = variance_p_value(float(np.mean(z[numbers] ** 2)), len(numbers), freedom or np.inf)
-        yield replace(base, statistic=name, value=value, p_value=min(p, 1.0))
-    yield from _size(item, column, item.used[:, column], base, freedom)
-
-
-def _projected(item: FittedTrial, column: int, table: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return z of each feature (unit columns) and whether the fit leaves enough of it."""
     used = item.used[:, column]
-    residual = item.standardised[used, column]
-    if item.sensitivity is None:
-        variance = np.asarray((table**2).T @ item.expected_variance[used, column])
-    else:
-        variance = 1.0 - np.sum((item.sensitivity[used, column].T @ table) ** 2, axis=0)
-    free = variance > _FREE_SHARE
-    z = np.where(free, table.T @ residual / np.sqrt(np.where(free, variance, 1.0)), 0.0)
-    return z, free
+    for name, table in features(item, column).items():
+        yield from _along(item, column, used, table, replace(base, statistic=name), freedom)
+    yield from _size(item, column, used, base, freedom)
 
 
-def _tail(z: float, freedom: float) -> float:
-    if freedom <= 0.0 or np.isinf(freedom):
-        return float(ndtr(-z))
-    return float(stdtr(freedom, -z))
-
-
-def _size(
-    item: FittedTrial, column: int, where: NDArray[np.bool_], base: Cell, freedom: float
+def _along(
+    item: FittedTrial, column: int, where: BoolArray, table: FloatArray, cell: Cell, freedom: float
 ) -> Iterator[Cell]:
+    """Yield a cell on whether residuals go with columns (n, k) at some samples, if the fit leaves these."""
+    part = part_of(table, ((item, where),), column)
+    statistic, count = (0.0, 0) if part is None else explained((part,))
+    if part is None or count < table.shape[1]:
+        return
+    residual = item.standardised[where, column]
+    value = float(np.mean(residual))
+    if cell.statistic != "mean":
+        along = part.along / (float(np.linalg.norm(residual)) or 1.0)
+        value = float(along[0] if count == 1 else np.linalg.norm(along))
+    p = variance_p_value(statistic / count, count, freedom or np.inf)
+    yield replace(cell, count=int(where.sum()), value=value, p_value=p)
+
+
+def _size(item: FittedTrial, column: int, where: BoolArray, base: Cell, freedom: float) -> Iterator[Cell]:
     count = int(where.sum())
     if freedom <= 0.0 or count < (1 if base.axis == "whole" else _FEWEST):
         return
@@ -274,12 +173,8 @@ def _bins(item: FittedTrial, column: int, base: Cell, freedom: float) -> Iterato
             if not where.any():
                 continue
             cell = replace(base, axis=axis, low=float(edges[number]), high=float(edges[number + 1]))
-            table = where[used].astype(float)[:, np.newaxis] / np.sqrt(where.sum())
-            z, free = _projected(item, column, table)
-            if free[0]:
-                value = float(np.mean(item.standardised[where, column]))
-                p = min(1.0, 2.0 * _tail(abs(float(z[0])), freedom))
-                yield replace(cell, count=int(where.sum()), statistic="mean", value=value, p_value=p)
+            ones = np.ones((int(where.sum()), 1))
+            yield from _along(item, column, where, ones, replace(cell, statistic="mean"), freedom)
             yield from _size(item, column, where, cell, freedom)
 
 

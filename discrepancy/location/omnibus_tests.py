@@ -18,6 +18,7 @@ from discrepancy.campaign.noise_tests import (
     variance_p_value,
 )
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
+from discrepancy.sentences import said
 
 FloatArray = NDArray[np.float64]
 
@@ -186,13 +187,7 @@ def coloured_noise(residuals: ResidualSet) -> dict[str, str]:
         if line < NOISE_RECORD_LEVEL:
             interval = channel.noise.interval
             at = f" at {place / (series.size * interval):.4g} Hz" if interval else ""
-            remarks[name] = (
-                f"The noise record of {name} holds a line{at} ({100.0 * share:.0f} % of its variance): "
-                "the line is in the acquisition, and whiteness is not tested on this channel."
-            )
+            remarks[name] = said("location.line_in_noise", name=name, at=at, percent=100.0 * share)
         elif min(ljung_box(series)[1], cumulative_periodogram(series)[1]) < NOISE_RECORD_LEVEL:
-            remarks[name] = (
-                f"The noise record of {name} is not white: whiteness is not tested on this channel, and its "
-                "degrees of freedom are fewer than its samples."
-            )
+            remarks[name] = said("location.coloured_noise", name=name)
     return remarks

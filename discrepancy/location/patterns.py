@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from discrepancy.location.dependence import kinds
 from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.sentences import said
 
 FloatArray = NDArray[np.float64]
 
@@ -93,10 +94,8 @@ def singular_patterns(
                 break
             share = float(np.clip((value - expected) / surplus, 0.0, 1.0))
             meaning, words = _meaning(residuals, items, channels, weights, shapes)
-            sentence = (
-                f"{words} in {name} trials; explains {100.0 * share:.0f} % of the excess variance "
-                f"(p {'<=' if p <= 1.0 / _SIMULATIONS else '='} {p:.1g})."
-            )
+            told = f"p {'<=' if p <= 1.0 / _SIMULATIONS else '='} {p:.1g}"
+            sentence = said("location.explains", what=words, trials=name, percent=100.0 * share, p=told)
             found.append(SingularPattern(name, channels, weights, share, p, meaning, sentence))
             if number >= 2:
                 break
@@ -124,31 +123,17 @@ def _meaning(
 ) -> tuple[str, str]:
     """Return the meaning of a pattern over the channels, and it in words."""
     largest = int(np.argmax(np.abs(weights)))
-    noise = items[0].noise_deviation
-    candidates: list[tuple[float, str, str]] = [
-        (float(weights[largest] ** 2), "sensor", f"One channel, {channels[largest]} (a sensor),")
-    ]
-    quantities = {residuals.channels[name].quantity for name in channels}
-    if len(quantities) == 1:
-        cosine = _squared_cosine(weights, 1.0 / noise)
-        candidates.append(
-            (cosine, "common", "All channels alike, whatever they measure (hum, temperature or zero),")
-        )
+    noise, alone = items[0].noise_deviation, np.eye(len(weights))[largest]
+    compared = [(alone, "sensor", said("location.sensor", name=channels[largest]))]
+    if len({residuals.channels[name].quantity for name in channels}) == 1:
+        compared.append((1.0 / noise, "common", said("location.common")))
     prediction = np.vstack([(i.prediction - i.prediction.mean(axis=0)) / noise for i in items])
-    if np.any(prediction):
-        own = np.linalg.svd(prediction, full_matrices=False)[2][0]
-        words = "The pattern of the predicted response itself (dynamics, load, or clock)"
-        candidates.append((_squared_cosine(weights, own), "dynamics or load", words))
+    own = np.linalg.svd(prediction, full_matrices=False)[2][0]
+    compared.append((own if np.any(prediction) else 0.0 * own, "dynamics or load", said("location.response")))
     for name, shape in shapes.items():
         values = np.array([shape.get(channel, 0.0) for channel in channels]) / noise
-        if np.any(values):
-            candidates.append(
-                (
-                    _squared_cosine(weights, values),
-                    "dynamics or load",
-                    f"The shape of {name} (dynamics or load)",
-                )
-            )
+        compared.append((values, "dynamics or load", said("location.shape", name=name)))
+    candidates = [(_squared_cosine(weights, v), kind, words) for v, kind, words in compared if np.any(v)]
     best = max(candidates, key=lambda row: row[0])
     if best[0] < ALIKE:
         listed = np.argsort(-np.abs(weights))[:3]

@@ -86,29 +86,23 @@ class FittedTrial:
     sensitivity: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        shape = self.trial.values.shape
+        shape, used, of_all = self.trial.values.shape, self.trial.used, self.sensitivity
         where = f"The fit of the trial {self.trial.name!r}"
         for name in ("prediction", "residual", "predictive_deviation", "leverage", "rates"):
             array = getattr(self, name)
-            if array is None:
-                continue
-            if array.shape != shape:
+            if array is not None and array.shape != shape:
                 raise FitError(f"{where} has {name} of the shape {array.shape}, but the data have {shape}.")
-            if not np.all(np.isfinite(array[self.trial.used])):
+            if array is not None and not np.all(np.isfinite(array[used])):
                 raise FitError(f"{where} has a value of {name} that is not finite at a used sample.")
         if self.noise_deviation.shape != shape[1:] or not np.all(self.noise_deviation > 0.0):
             raise FitError(f"{where} needs one positive noise deviation for each of {shape[1]} channels.")
-        if not np.all(self.predictive_deviation[self.trial.used] > 0.0):
+        if not np.all(self.predictive_deviation[used] > 0.0):
             raise FitError(f"{where} has a predictive deviation that is not positive.")
-        if self.sensitivity is not None and (
-            self.sensitivity.ndim != 3 or self.sensitivity.shape[:2] != shape
-        ):
+        if of_all is not None and (of_all.ndim != 3 or of_all.shape[:2] != shape):
             raise FitError(
-                f"{where} has a sensitivity of the shape {self.sensitivity.shape}; ({shape[0]}, {shape[1]}, "
-                "P) is expected."
+                f"{where} has a sensitivity of the shape {of_all.shape}; {(*shape, 'P')} is expected."
             )
-        expected = self.expected_variance[self.trial.used]
-        if not np.all(expected > -1e-9):
+        if not np.all(self.expected_variance[used] > -1e-9):
             raise FitError(f"{where} has a leverage above one, so that the expected variance is negative.")
 
     @property

@@ -174,16 +174,8 @@ class Filtered:
         moves, slot, gains, sizes, _, filtered = self._passed
         lengths, which = self.trial.steps
         rows = self.system[2]
-        means, later = _smoothed(
-            moves,
-            which,
-            rows,
-            self.trial.used,
-            slot,
-            gains,
-            sizes,
-            np.ascontiguousarray(readings * self.white),
-        )
+        seen = np.ascontiguousarray(readings * self.white)
+        means, later = _smoothed(moves, which, rows, self.trial.used, slot, gains, sizes, seen)
         parts = self.trial.parts
         fine = self._steps(lengths / parts)
         found = _between(parts, *fine, which, slot, filtered, means, later)

@@ -6,8 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.models.interface import Model
+from discrepancy.models.port_units import port_unit
+from discrepancy.verdict import ForceAtPort, ForceMoment
+
 from .hypotheses import scaled
 from .naming import Explained, ForceSearch
+from .shares import orders
 
 FloatArray = NDArray[np.float64]
 
@@ -55,8 +60,6 @@ class MissingForce:
     ----------
     port : str
         Its name.
-    of_state : bool
-        Whether it is a flow at a store.
     evidence : mapping of str to float
         By port: over no missing force [nat].
     correlation_time : float
@@ -68,7 +71,6 @@ class MissingForce:
     """
 
     port: str
-    of_state: bool
     evidence: Mapping[str, float]
     correlation_time: float
     courses: Sequence[ForceCourse]
@@ -100,10 +102,26 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
         law = force - left if named else None
         motion_at = (position[samples], speed[samples])
         courses.append(ForceCourse(trial.name, trial.time, *motion_at, force, one.deviation(at), law))
-    scale = search.problem.setting.scales.ports.get(port)
-    of_state = bool(scale and scale.of_state)
     time = found.processes[at].time
-    return MissingForce(port, of_state, evidence, time, courses, named)
+    return MissingForce(port, evidence, time, courses, named)
+
+
+def told_force(missing: MissingForce, model: Model) -> ForceAtPort:
+    """Return what is told of a missing force: size, motion, what orders it; not of the shares of a law."""
+    force, position, speed, at = (
+        np.concatenate([getattr(item, name) for item in missing.courses])
+        for name in ("force", "position", "speed", "time")
+    )
+    by_variable, ordered_by = orders(force, position, speed, at)
+    rms, displacement, velocity = (float(np.sqrt(np.mean(item**2))) for item in (force, position, speed))
+    course = max(missing.courses, key=lambda one: float(np.abs(one.force).max()))
+    k = int(np.abs(course.force).argmax())
+    most = (float(item[k]) for item in (course.time, course.force, course.position, course.speed))
+    return ForceAtPort(
+        missing.port, port_unit(missing.port, model), rms, displacement, velocity,
+        ForceMoment(course.trial, *most), missing.evidence, missing.correlation_time, by_variable,
+        ordered_by, missing.law,
+    )  # fmt: skip
 
 
 def of_nothing(found: Explained) -> float:

@@ -94,8 +94,8 @@ class Explained:
     motions: Sequence[Motion]
 
     @property
-    def covariance(self) -> FloatArray:
-        """Of the effects' unknowns (E, E)."""
+    def effect_covariance(self) -> FloatArray:
+        """Of the effects' unknowns (E, E), beside the missing force as it is."""
         at = len(self.view.shared_precision)
         return self.solution.covariance[at:, at:]
 
@@ -110,7 +110,7 @@ class Explained:
         return np.asarray(mean[:at] + covariance[:at, at:] @ step)
 
     @cached_property
-    def told_covariance(self) -> FloatArray:
+    def covariance(self) -> FloatArray:
         """Of all unknowns, shared ones first, wide enough for what is left to lie along the laws in part.
 
         The process is a force in time that has nothing to do with the motion. What is left of another law
@@ -178,11 +178,10 @@ class ForceSearch:
             for port, name in enumerate(self.ports):
                 view = View(trials, problem.shared.precision)
                 if turn:
-                    motions = view.smoothed(self.at[name].processes)[2]
-                    view = replace(view, motions=motions, own=self._own(view, motions))
+                    view = self._along(view, view.smoothed(self.at[name].processes)[2])
                 begins = [scaled(self.about((port,)), 1.0, time) for time in BEGIN_TIMES]
                 begins += [self.at[name].processes] if turn else []
-                found = [self._seen(view, Candidate(), np.zeros(0), one, SHARES[:1]) for one in begins]
+                found = [seen(view, self.about(one), one, SHARES[:1]) for one in begins]
                 self.at[name] = max(found, key=lambda item: item.evidence)
             if not turn and about is None:
                 self.point = self._point(self.best())
@@ -200,8 +199,8 @@ class ForceSearch:
             begin |= scaled(item.processes, BESIDE, 1.0)
         view = best.view
         for _ in range(2):
-            found = self._seen(view, Candidate(), np.zeros(0), begin, SHARES[:1])
-            view = replace(view, motions=found.motions, own=self._own(view, found.motions))
+            found = seen(view, self.about(begin), begin, SHARES[:1])
+            view = self._along(view, found.motions)
             begin = dict(found.processes)
         return found
 
@@ -218,18 +217,10 @@ class ForceSearch:
             found[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / pace)
         return found
 
-    def _own(self, view: View, motions: Sequence[Motion]) -> Column | None:
-        return self.columns.of_patch(view, motions, self.laws) if len(self.laws) else None
-
-    def _seen(
-        self,
-        view: View,
-        candidate: Candidate,
-        effect: FloatArray,
-        begin: Processes,
-        shares: Sequence[float] = SHARES,
-    ) -> Explained:
-        return seen(view, self.about(begin), begin, shares, candidate, effect)
+    def _along(self, view: View, motions: Sequence[Motion]) -> View:
+        """Return a view along motions, the laws that the model has itself included."""
+        own = self.columns.of_patch(view, motions, self.laws) if len(self.laws) else None
+        return replace(view, motions=motions, own=own)
 
     def rough(self, port: str) -> Explained:
         """Return the missing force at a port as one that may jump, linear about the motion that it gives."""
@@ -240,15 +231,10 @@ class ForceSearch:
             self.columns = Columns(self.problem, self.numbers, self.point)
             view = View(trials, self.problem.shared.precision)
             for _ in range(2):
-                motions = view.smoothed(found.processes)[2]
-                view = replace(view, motions=motions, own=self._own(view, motions))
+                view = self._along(view, view.smoothed(found.processes)[2])
             begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
-            found = self._seen(view, Candidate(), np.zeros(0), begin)
+            found = seen(view, self.about(begin), begin)
         return found
-
-    def _at(self, view: View, candidate: Candidate, effect: FloatArray, processes: Processes) -> Explained:
-        evidence = view.evidence(self.about(processes), processes)
-        return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))
 
     def whole_point(self, found: Explained) -> Point:
         """Return the point of a hypothesis, from which a fit may begin."""
@@ -376,18 +362,21 @@ class ForceSearch:
         best: Explained | None = None
         before = np.zeros(len(effect))
         for turn in range(ROUNDS):
-            view = self.linear(self.columns, base.view, motions, candidate, effect)
+            view = self.linear(base.view, motions, candidate, effect)
             if view is None:
                 break
             if turn == 0 or settled or turn == ROUNDS - 1:
-                found = self._seen(view, candidate, effect, processes, SHARES[: 1 if turn else None])
+                some = SHARES[: 1 if turn else None]
+                found = seen(view, self.about(processes), processes, some, candidate, effect)
                 processes = dict(found.processes)
             else:
-                found = self._at(view, candidate, effect, processes)
+                evidence = view.evidence(self.about(processes), processes)
+                smoothed = view.smoothed(processes)
+                found = Explained(candidate, effect, processes, evidence, view, *smoothed)
             step = found.solution.mean[len(view.shared_precision) :] - effect
             far = np.where(np.abs(step) > SETTLED, step, 0.0)
             if far.any():  # a value that it cannot reach is not its own
-                loss = 0.5 * float(far @ np.linalg.lstsq(found.covariance, far, rcond=None)[0])
+                loss = 0.5 * float(far @ np.linalg.lstsq(found.effect_covariance, far, rcond=None)[0])
                 found = replace(found, evidence=found.evidence - loss)
             # along the motion of its base, which follows the readings, a hypothesis looks better than it is
             if best is None or turn == 1 or found.evidence > best.evidence:
@@ -402,14 +391,10 @@ class ForceSearch:
         return best
 
     def linear(
-        self,
-        columns: Columns,
-        view: View,
-        motions: Sequence[Motion],
-        candidate: Candidate,
-        effect: FloatArray,
+        self, view: View, motions: Sequence[Motion], candidate: Candidate, effect: FloatArray
     ) -> View | None:
         """Return the view of a hypothesis, linear about values of its unknowns and along motions."""
+        columns = self.columns
         at = columns.of(view, motions, candidate, effect) if candidate.terms else ()
         if at is None:
             return None
@@ -422,9 +407,8 @@ class ForceSearch:
                 return None
             slopes.append(combined((ends[0], ends[1]), (0.5 / SLOPE, -0.5 / SLOPE)))
         return replace(
-            view, motions=motions, effects=tuple(slopes), precision=(1.0,) * len(effect),
+            self._along(view, motions), effects=tuple(slopes), precision=(1.0,) * len(effect),
             known=combined((at, *slopes), (1.0, *-effect)) if at else None,
-            own=columns.of_patch(view, motions, self.laws) if len(self.laws) else None,
         )  # fmt: skip
 
 

@@ -124,10 +124,8 @@ class ForceShares:
         """
         view, motions = self.motions(found, held_out=held_out)
         without = self._without(held_out)[1]
-        laws = {
-            self.search.ports.index(t.place) for t in found.candidate.terms if t.place in self.search.ports
-        }
-        port_of = laws or set(self.search.best().processes)
+        places, ports = [term.place for term in found.candidate.terms], self.search.ports
+        laws = {ports.index(place) for place in places if place in ports}
         system = view.trials[0].system
         weight = {
             port: float(np.hypot(np.linalg.norm(system.actions[port]), np.linalg.norm(system.through[port])))
@@ -137,40 +135,22 @@ class ForceShares:
         filters = view.filtered({**found.processes, **self.search.whole.processes})
         for trial, motion, bare, one in zip(view.trials, motions, without, filters, strict=True):
             shown = dict(zip(one.processes, one.smoothed(_noise(trial))[1], strict=True))
+            kinds = (bare.forces, motion.left, shown)
             count = len(trial.time)
             edges = np.linspace(0, count, min(WINDOWS, max(1, count // SHORTEST)) + 1).astype(int)
             for begin, end in pairwise(edges.tolist()):
                 samples = slice(begin * trial.parts, end * trial.parts, trial.parts)
-                kinds = (bare.forces, motion.left, shown)
-                of_force.append(
-                    [
-                        sum(float(np.sum((weight[p] * force[samples]) ** 2)) for p, force in forces.items())
-                        for forces in kinds
-                    ]
-                )
-                of_readings.append([float(np.sum(trial.ahead(forces, begin, end) ** 2)) for forces in kinds])
-        left, whole, own = (
-            max(_size([forces[p] for forces in kind if p in forces]) for p in port_of)
-            for kind in (
-                [motion.left for motion in motions],
-                [bare.forces for bare in without],
-                [motion.laws for motion in motions],
-            )
-        )
-        shares = [
-            Share(
-                table[0],
-                table[1],
-                table[2],
-                held_out,
-                len(motions),
-                left,
-                whole,
-                of,
-                not laws or own**2 > TESTED * whole**2,
-            )
-            for table, of in ((np.array(of_force).T, OF_FORCE), (np.array(of_readings).T, OF_PREDICTIONS))
-        ]
+                squares = [[np.sum((weight[p] * f[samples]) ** 2) for p, f in of.items()] for of in kinds]
+                of_force.append([float(sum(row)) for row in squares])
+                of_readings.append([float(np.sum(trial.ahead(of, begin, end) ** 2)) for of in kinds])
+        seen = ([m.left for m in motions], [m.forces for m in without], [m.laws for m in motions])
+        port_of = laws or set(self.search.best().processes)
+        left, whole, own = (max(_size([f[p] for f in kind if p in f]) for p in port_of) for kind in seen)
+        tested, shares = not laws or own**2 > TESTED * whole**2, []
+        for rows, of in ((of_force, OF_FORCE), (of_readings, OF_PREDICTIONS)):
+            before, after, noise = np.array(rows).T
+            sizes = (len(motions), left, whole)
+            shares.append(Share(before, after, noise, held_out, *sizes, of, tested))
         return max(shares, key=lambda share: share.interval[0])
 
     def _without(self, held_out: bool) -> tuple[View, list[Motion]]:

@@ -11,10 +11,10 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
-from discrepancy.report.kit import heat_map, panels
+from discrepancy.report.kit import heat_map, panels, plain_powers
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.verdict import Scores
-from reporting.figures import OBSERVED, PAST, PREDICTION, new_figure, publication_style
+from reporting.figures import OBSERVED, PAST, PREDICTION, publication_style
 
 _LARGEST_DISTANCE = 1e4
 
@@ -22,7 +22,7 @@ _LARGEST_DISTANCE = 1e4
 def pit_figure(scores: Mapping[str, Scores]) -> Figure:
     """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
     with publication_style():
-        figure, (row,) = panels(1, 2, 1.9, 0.87, 0.22, left=0.09, wspace=0.18)
+        figure, (row,) = panels(1, 2, 1.9)
         for spare in row[len(scores) :]:
             spare.remove()
         top = max(max(item.pit) for item in scores.values())
@@ -47,12 +47,10 @@ def _map_of_names(
     texts: NDArray[np.str_] | None = None,
 ) -> tuple[Figure, Axes, AxesImage]:  # fmt: skip
     """Return a figure with a map of square cells between names of effects."""
-    height = 0.175 * len(rows) + 1.6
-    figure = new_figure(height)
-    width = min(0.0243 * len(columns) + 0.02, 0.6)
-    axes = figure.add_axes((0.27, 1.35 / height, width, 1.0 - 1.45 / height))
+    figure, ((axes,),) = panels(1, 1, 0.175 * len(rows) + 1.6)
     words = ([name.replace("_", " ") for name in names] for names in (rows, columns))
     image = heat_map(axes, values, (next(words), next(words)), norm, 55, texts)
+    axes.set_aspect("equal", anchor="W")
     axes.tick_params(labelsize=6.5)
     return figure, axes, image
 
@@ -74,10 +72,10 @@ def separability_figure(found: Separability) -> Figure | None:
         for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
             if row != column:
                 axes.plot(column, row, "x", color=PREDICTION, ms=4.0, mew=1.1)
-        box = axes.get_position()
-        side = figure.add_axes((box.x1 + 0.03, box.y0, 0.018, min(box.height, 2.2 / figure.get_figheight())))
-        bar = figure.colorbar(image, cax=side)
-        bar.set_label("d², squared distance in noise deviations")
+        cell = 1.0 / len(names)
+        bar = figure.colorbar(image, cax=axes.inset_axes((1.0 + 0.4 * cell, 0.0, 0.4 * cell, 1.0)))
+        bar.set_label("squared distance d²")
+        plain_powers(bar.ax.yaxis, (1.0,))
         bar.outline.set_linewidth(0.5)
         bar.ax.axhline(CONFUSED, color=PREDICTION, lw=1.2)
         bar.ax.axhline(DETECTED, color="white", lw=1.2)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from math import isfinite, isnan
 
-from discrepancy.judgement.conclusion import named_effects
+from discrepancy.judgement.conclusion import effects_text, named_effects
 from discrepancy.judgement.when import when_sentence
 from discrepancy.report import text as words
 from discrepancy.report.figures import ReportInput
@@ -34,16 +34,14 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] = 
     catalogue = words.catalogue_of(investigation)
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
         names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
-        page.add_paragraph(
-            f"The nearest in the catalogue is {listing(names)}; this is a resemblance, no name."
-        )
+        page.add_paragraph(words.told("nearest", names=listing(names)))
     for effect in {item.identifier: item for item in verdict.effects}.values():
         entry = catalogue.get(effect.identifier)
         if entry is not None:
-            page.add_paragraph(
-                f"{effect.name[0].upper()}{effect.name[1:]}: {words.formula(entry.equation)}. Its signature: "
-                f"{words.formula(entry.signature).rstrip('.')}. Source: {entry.reference.rstrip('.')}."
-            )
+            text = {"equation": words.formula(entry.equation), "reference": entry.reference.rstrip(".")}
+            signature = words.formula(entry.signature).rstrip(".")
+            name = f"{effect.name[0].upper()}{effect.name[1:]}"
+            page.add_paragraph(words.told("entry", name=name, signature=signature, **text))
     told = {"whose": words.WORDS["sizes"].get(verdict.kind, words.WORDS["sizes"]["other"]), "patch": ""}
     if content.intervals:
         of = "" if verdict.kind in words.NAMING else f" of {words.added_label(investigation)}"
@@ -114,7 +112,7 @@ def _what(verdict: Verdict) -> str:
     }  # fmt: skip
     named = verdict.effects if verdict.kind in words.NAMING else ()
     kept = [item for item in named if not (item.shape and verdict.family)]
-    found = [words.effects_text(kept), f"an effect of the family {verdict.family}" if verdict.family else ""]
+    found = [effects_text(kept), f"an effect of the family {verdict.family}" if verdict.family else ""]
     return without.get(verdict.kind) or listing(filter(None, found)) or "no name"
 
 
@@ -142,9 +140,8 @@ def closing_sentence(investigation: Investigation) -> str:
     added = "It" if verdict.kind in words.NAMING else "The best hypothesis, which is no name,"
     share = None if words.rests_on_force(verdict) else verdict.explained
     if share is not None:
-        interval = f"{100.0 * share.low:.0f} to {100.0 * share.high:.0f} %"
-        closed = f"{100.0 * share.value:.0f} % of the gap on {share.trials} trials ({interval})"
-        return f"{added} closes {closed} and leaves {words.number(share.left, 2)} noises."
+        ends = {"low": 100.0 * share.low, "high": 100.0 * share.high, "left": words.number(share.left, 2)}
+        return words.told("closes", added=added, percent=100.0 * share.value, found=share, **ends)
     if proof is None or not words.added_label(investigation):
         return ""
     before, after, where = words.scored(proof)
@@ -152,10 +149,9 @@ def closing_sentence(investigation: Investigation) -> str:
     if not all(map(isfinite, sizes)):
         return ""
     course = f"{words.number(sizes[0])} before and {words.number(sizes[1])} after it"
-    if proof.gap_closed > 0.0:
-        closed = f"{words.percent(proof.gap_closed)} % of the gap on {where} trials"
-        return f"{added} closes {closed}: χ²/dof is {course}, 1 for noise alone."
-    return f"On {where} trials χ²/dof is {course}, 1 for noise alone."
+    percent = words.percent(proof.gap_closed)
+    how = "closed" if proof.gap_closed > 0.0 else "scored"
+    return words.told(how, added=added, percent=percent, where=where, course=course)
 
 
 def add_next(page: Page, investigation: Investigation) -> None:

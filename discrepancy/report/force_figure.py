@@ -23,10 +23,7 @@ def missing_force_figure(missing: MissingForce, told: ForceAtPort) -> Figure:
     integral, state = ("displacement", "speed") if place else ("integral of the state", "state")
     along = (("position", ", ".join(filter(None, (integral, place)))), ("speed", f"{state}, {rate}"))
     with publication_style():
-        figure, rows = panels(
-            len(parts), 3, 2.4 * len(parts) + 0.5, 1.0 - 0.17 / len(parts), 0.2 / len(parts), left=0.085,
-            wspace=0.3, hspace=0.5,
-        )  # fmt: skip
+        figure, rows = panels(len(parts), 3, 2.4 * len(parts) + 0.5)
         for number, (row, (title, name)) in enumerate(zip(rows, parts, strict=True)):
             for axes, (motion, label) in zip(row[:2], along, strict=True):
                 _draw_over(axes, missing, motion, name)
@@ -40,7 +37,7 @@ def missing_force_figure(missing: MissingForce, told: ForceAtPort) -> Figure:
                     axes.sharey(rows[0][0])
                 panel_label(axes, "abcdef"[3 * number + column], title)
         drawn = rows[0][0].get_legend_handles_labels()
-        figure.legend(*drawn, loc="upper right", ncols=2, markerscale=3.0)
+        figure.legend(*drawn, loc="outside upper right", ncols=2, markerscale=3.0)
     return figure
 
 

@@ -47,13 +47,11 @@ def titles(shown: Sequence[Shown]) -> list[str]:
     return [f"{'ab'[n]}  {item.label}" for n, item in enumerate(shown)] if shown[1:] else ["model as it is"]
 
 
-def panels(
-    rows: int, columns: int, height: float, top: float, bottom: float, **grid: Any
-) -> tuple[Figure, list[list[Axes]]]:
-    """Return a figure of a height [in] and its panels; the rest is in shares of the figure, as in a grid."""
+def panels(rows: int, columns: int, height: float, **grid: Any) -> tuple[Figure, list[list[Axes]]]:
+    """Return a figure of a height [in] and its panels; `grid` as of `matplotlib.figure.Figure.subplots`."""
     figure = new_figure(height)
-    cells = figure.add_gridspec(rows, columns, top=top, bottom=bottom, **{"right": 0.985, **grid})
-    return figure, [[figure.add_subplot(cells[row, n]) for n in range(columns)] for row in range(rows)]
+    figure.set_layout_engine("constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **grid).tolist()
 
 
 def draw_noise(axes: Axes, deviation: float, opacity: float) -> None:
@@ -77,11 +75,9 @@ def scale_of(values: Sequence[float] | NDArray[np.float64]) -> Normalize:
     return LogNorm(0.7, max(largest, 3.0))
 
 
-def size_bar(figure: Figure, norm: Normalize, place: tuple[float, float, float, float] | Axes) -> None:
-    """Draw the colour scale of sizes of residuals at a place of the figure, or beside a panel."""
-    aside: dict[str, Any] = {"ax": place, "fraction": 0.045, "pad": 0.02, "aspect": 14}
-    where = aside if isinstance(place, Axes) else {"cax": figure.add_axes(place)}
-    bar = figure.colorbar(ScalarMappable(norm, LEVELS), **where)
+def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
+    """Draw the colour scale of sizes of residuals beside panels."""
+    bar = figure.colorbar(ScalarMappable(norm, LEVELS), ax=beside, fraction=0.045, pad=0.02, aspect=14)
     bar.set_label("rms residual / noise")
     plain_powers(bar.ax.yaxis, (1.0, 2.0, 5.0) if float(norm.vmax or 1.0) < 50.0 else (1.0,))
     bar.outline.set_linewidth(0.5)

@@ -1,7 +1,7 @@
 """Motion before and after: histories, spectra, and frequency and damping over the amplitude."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,7 +17,7 @@ from discrepancy.location.dependence import predicted_frequencies
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.report.kit import draw_noise, models, panels, plain_powers
 from discrepancy.report.residual_figures import size
-from reporting.figures import OBSERVED, REFERENCE, TRUTH, new_figure, publication_style
+from reporting.figures import OBSERVED, REFERENCE, TRUTH, publication_style
 
 FloatArray = NDArray[np.float64]
 
@@ -58,10 +58,8 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     shown = models(before, after)
     with publication_style():
         count = 1 + len(shown)
-        figure, cells = panels(
-            count, 1, 1.45 * count + 0.35, 1.0 - 0.2 / (1.45 * count), 0.38 / (1.45 * count), left=0.095,
-            hspace=0.34, height_ratios=[1.25, *([1.0] * len(shown))],
-        )  # fmt: skip
+        ratios = [1.25, *([1.0] * len(shown))]
+        figure, cells = panels(count, 1, 1.45 * count + 0.35, height_ratios=ratios)
         (axes,), *below = cells
         values = factor * item.trial.values[used, column]
         axes.plot(time[used], values, ".", ms=1.8, color=OBSERVED, label="measured")
@@ -98,8 +96,7 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
         return None
     noise = before.channels[worst.channel].noise
     with publication_style():
-        figure = new_figure(2.7)
-        axes = figure.add_axes((0.095, 0.16, 0.885, 0.70))
+        figure, ((axes,),) = panels(1, 1, 2.7)
         if noise is not None and noise.samples is not None and noise.interval and len(noise.samples) >= 32:
             count = min(len(noise.samples), 128)
             at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
@@ -177,10 +174,7 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
         return None
     factor, unit = UNITS[before.channels[channel].quantity].drawn
     with publication_style():
-        figure, cells = panels(
-            len(modes), 2, 2.3 * len(modes) + 0.3, 1.0 - 0.22 / (2.3 * len(modes)), 0.19 / len(modes) + 0.02,
-            left=0.09, hspace=0.4, wspace=0.26,
-        )  # fmt: skip
+        figure, cells = panels(len(modes), 2, 2.3 * len(modes) + 0.3)
         for row, mode in enumerate(modes):
             for place, (name, label, scale) in enumerate(
                 (("frequency", "frequency, Hz", 1.0), ("damping_ratio", "damping ratio, %", 100.0))
@@ -236,11 +230,8 @@ def _clear(curve: Backbone) -> Backbone | None:
     keep = curve.damping_ratio_error < limit
     if not keep.any():
         return None
-    fields = (
-        "time", "amplitude", "amplitude_error", "frequency", "frequency_error", "damping_ratio",
-        "damping_ratio_error",
-    )  # fmt: skip
-    return Backbone(curve.mode, *(getattr(curve, name)[keep] for name in fields))
+    names = [item.name for item in fields(Backbone)[1:]]
+    return Backbone(curve.mode, *(getattr(curve, name)[keep] for name in names))
 
 
 def _draw_points(axes: Axes, curves: Sequence[Backbone], name: str, factor: float, scale: float) -> None:

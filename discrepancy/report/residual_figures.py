@@ -17,7 +17,7 @@ from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.report.kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar, titles
 from discrepancy.verdict import GapWindow, Moment
 from fe.wing.design import WingDesign
-from reporting.figures import LEVELS, OBSERVED, REFERENCE, new_figure, publication_style
+from reporting.figures import LEVELS, OBSERVED, REFERENCE, publication_style
 
 FloatArray = NDArray[np.float64]
 
@@ -95,10 +95,7 @@ def planform_figure(before: ResidualSet, after: ResidualSet | None, design: Wing
         return None
     norm = scale_of([value for row in sizes for value in row.values()])
     with publication_style():
-        figure, rows = panels(
-            len(sizes), 1, 1.62 * len(sizes) + 0.35, 0.94 if after is not None else 0.88,
-            0.20 / len(sizes) + 0.04, left=0.07, right=0.86, hspace=0.30,
-        )  # fmt: skip
+        figure, rows = panels(len(sizes), 1, 1.62 * len(sizes) + 0.35)
         for (axes,), row, title in zip(rows, sizes, titles(models(before, after)), strict=True):
             _draw_planform(axes, design)
             _draw_gauges(axes, before.channels, places, row, norm, design)
@@ -106,7 +103,7 @@ def planform_figure(before: ResidualSet, after: ResidualSet | None, design: Wing
             axes.set_ylabel("chord, m")
             axes.tick_params(labelbottom=axes is rows[-1][0])
         rows[-1][0].set_xlabel("distance from the root, m")
-        size_bar(figure, norm, (0.885, 0.2, 0.016, 0.66))
+        size_bar(figure, norm, [axes for (axes,) in rows])
     return figure
 
 
@@ -167,17 +164,13 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
     below = min(0.22 + 0.042 * max(len(name) for name in trials), 1.5)
     height = max(0.22 * len(channels), 0.9) + below + 0.35
     with publication_style():
-        figure, (row,) = panels(
-            1, len(tables), height, 1.0 - 0.28 / height, below / height, left=0.11,
-            right=0.60 if after is None else 0.885, wspace=0.06,
-        )  # fmt: skip
+        figure, (row,) = panels(1, len(tables), height)
         few = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
         for number, (axes, (_, _, table), title) in enumerate(zip(row, tables, titles(shown), strict=True)):
             names = ([""] * len(channels) if number else channels, trials)
             heat_map(axes, table, names, norm, 40, _cells(table) if few else None)
             axes.set_title(title, loc="left")
-        right = 0.62 if after is None else 0.905
-        size_bar(figure, norm, (right, below / height, 0.016, 1.0 - (below + 0.28) / height))
+        size_bar(figure, norm, row)
     return figure
 
 
@@ -202,10 +195,7 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
     columns = min(len(found), 2)
     rows = (len(found) + columns - 1) // columns
     with publication_style():
-        figure, cells = panels(
-            rows, columns, 2.25 * rows + 0.3, 1.0 - 0.24 / (2.25 * rows), 0.2 / rows + 0.02, left=0.085,
-            hspace=0.42, wspace=0.24,
-        )  # fmt: skip
+        figure, cells = panels(rows, columns, 2.25 * rows + 0.3)
         for spare in cells[-1][len(found) - columns * (rows - 1) :]:
             spare.remove()
         for number, (kind, label, quantity, names) in enumerate(found):
@@ -217,7 +207,7 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
             axes.set_xlabel(label)
             axes.set_ylabel(f"residual, {unit}")
             axes.set_title(f"{'abcd'[number]}  {kind.value}, {quantity.value}", loc="left")
-        figure.legend(*cells[0][0].get_legend_handles_labels(), loc="upper right", ncols=3)
+        figure.legend(*cells[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure
 
 
@@ -257,11 +247,8 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     trials = [name for name in sizes if name in largest]
     norm = scale_of([window.size for window in windows])
     both = any(window.with_effect for window in windows)
-    height = 0.34 * len(trials) + 0.9
     with publication_style():
-        figure = new_figure(height)
-        figure.set_layout_engine("constrained")
-        axes = figure.add_subplot()
+        figure, ((axes,),) = panels(1, 1, 0.34 * len(trials) + 0.9)
         for row, name in enumerate(trials):
             own = [window for window in windows if window.trial == name]
             _draw_record(axes, row, own, norm, both=both)
@@ -270,7 +257,7 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
         axes.tick_params(axis="y", length=0)
         axes.spines["left"].set_visible(False)
         axes.set_xlabel("time since the start of the trial, s")
-        size_bar(figure, norm, axes)
+        size_bar(figure, norm, [axes])
     return figure
 
 

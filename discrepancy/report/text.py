@@ -2,12 +2,13 @@
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from math import floor, isfinite, isnan, log10
 from pathlib import Path
 from typing import Any
 
 from discrepancy.catalogue.entry import Effect
+from discrepancy.judgement.conclusion import effects_text
 from discrepancy.verdict import (
     Estimate,
     ExplainedShare,
@@ -31,6 +32,9 @@ BEYOND_DOUBT = 1e6
 SAID: dict[str, str] = WORDS["said"]
 """Paragraphs and remarks."""
 
+TOLD: dict[str, str] = WORDS["told"]
+"""Of the missing force, of shares, of what is left."""
+
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
 """Verdicts that say what is missing, if not all of it."""
 
@@ -43,6 +47,11 @@ MOTIONS = {
     "N or N m": ("force", "m or rad", "m/s or rad/s"),
 }  # fmt: skip
 """What is missing at a port, and units of its displacement and speed, by the unit of the force."""
+
+
+def told(name: str, /, **values: object) -> str:
+    """Return a sentence of `TOLD` with its values."""
+    return TOLD[name].format(**values)
 
 
 def estimate_text(estimate: Estimate) -> tuple[str, str]:
@@ -124,12 +133,6 @@ def headline(verdict: Verdict) -> str:
     return f"{text} ({about} {probability_text(verdict.probability)})."
 
 
-def effects_text(effects: Iterable[NamedEffect], joint: str = "and") -> str:
-    """Return effects with their places."""
-    found = (f"{item.name} at {item.place}" if item.place else item.name for item in effects)
-    return listing(dict.fromkeys(found), joint)
-
-
 def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
     """Return the members of a group by name, each with its effects; empty for any other verdict."""
     found = {}
@@ -150,35 +153,29 @@ def force_sentence(force: ForceAtPort) -> str:
     """Return where a force is missing, how large, what orders it, and what share of it its law is."""
     what, place, rate = motion_of(force)
     most = force.largest
-    at = f"{number(most.displacement)} {place} and " if place else ""
     order = ""
     if not force.law:
-        share = max(force.orders.values())
-        by = f"ordered by {listing(force.ordered_by)} ({100.0 * share:.0f} % of its variance)"
-        order = f", {by if force.ordered_by else 'ordered by none of displacement, velocity and time'}"
+        names, share = listing(force.ordered_by), 100.0 * max(force.orders.values())
+        order = told("ordered", names=names, share=share) if names else told("not_ordered")
     others = {name: value for name, value in force.evidence.items() if name != force.port}
     own, beside = force.evidence[force.port], ""
     if others:
         nearest = max(others, key=lambda name: others[name])
         ahead = own - others[nearest]
-        beside = f", {nats(abs(ahead))} {'more' if ahead >= 0.0 else 'less'} than at {nearest}"
-    sentence = (
-        f"A {what} of {number(force.rms)} {force.unit} (rms) is missing at {force.port}, at most "
-        f"{number(abs(most.force))} at {at}{number(most.speed)} {rate}{order} (evidence {nats(own)} nat over "
-        f"none{beside})."
-    )
+        more = "more" if ahead >= 0.0 else "less"
+        beside = told("beside", evidence=nats(abs(ahead)), more=more, port=nearest)
+    at = f"{f'{number(most.displacement)} {place} and ' if place else ''}{number(most.speed)} {rate}"
+    sizes = {"rms": number(force.rms), "most": number(abs(most.force)), "own": nats(own)}
+    sentence = told("force", what=what, force=force, at=at, order=order, beside=beside, **sizes)
     tested = [share for share in (force.fitted, force.held_out) if share is not None and share.tested]
     if tested:
-        shares = [
-            f"{share_text(share)} of {'what it does to predictions' if share.ahead else 'it'} in "
-            f"{counted(share.trials, 'fitted trial' if share is force.fitted else 'held-out trial')}"
-            for share in tested
-        ]
-        left, whole = number(tested[-1].left), number(tested[-1].whole)
-        sentence += (
-            f" {force.law[:1].upper()}{force.law[1:]} is {listing(shares)}, where {left} of {whole} "
-            f"{force.unit} (rms) are left."
-        )
+        shares = []
+        for item in tested:
+            of = "what it does to predictions" if item.ahead else "it"
+            trials = counted(item.trials, "fitted trial" if item is force.fitted else "held-out trial")
+            shares.append(told("share", share=share_text(item), of=of, trials=trials))
+        left = {"left": number(tested[-1].left), "whole": number(tested[-1].whole), "unit": force.unit}
+        sentence += told("law", law=force.law[:1].upper() + force.law[1:], shares=listing(shares), **left)
     return sentence
 
 
@@ -204,11 +201,9 @@ def shares_sentence(verdict: Verdict) -> str:
     found = verdict.explained
     if found is None or rests_on_force(verdict):
         return ""
-    whose = "The best hypothesis takes" if verdict.kind is VerdictKind.UNEXPLAINED else "The effect takes"
-    return (
-        f"{whose} {percent(found.effect)} % of the mean square on {found.trials} trials, in units of the "
-        f"noise; {percent(found.remainder)} % is left without a name and {percent(found.noise)} % is noise."
-    )
+    whose = "The best hypothesis" if verdict.kind is VerdictKind.UNEXPLAINED else "The effect"
+    parts = {name: percent(getattr(found, name)) for name in ("effect", "remainder", "noise")}
+    return told("mean_square", whose=whose, found=found, **parts)
 
 
 def residual_sizes(found: ExplainedShare) -> tuple[str, str]:
@@ -223,14 +218,14 @@ def remainders_sentence(verdict: Verdict) -> str:
     for item in verdict.remainders:
         swing = f", swinging at {number(item.frequency)} Hz" if item.frequency > 0.0 else ""
         parts.append(f"{item.channel} {number(item.size, 2)} noises over {number(item.time, 2)} s{swing}")
-    return f"What is left beside the noise: {'; '.join(parts)}." if parts else ""
+    return told("left", parts="; ".join(parts)) if parts else ""
 
 
 def meaning(verdict: Verdict) -> str:
     """Return what the verdict means, in a sentence."""
     judged = all(gate.passed is not None for gate in verdict.gates if gate.name == "absolute fit")
-    told: str = WORDS["meaning"][verdict.kind]
-    return told if judged else WORDS["unjudged"].get(verdict.kind, told)
+    meant: str = WORDS["meaning"][verdict.kind]
+    return meant if judged else WORDS["unjudged"].get(verdict.kind, meant)
 
 
 def hypothesis_name(hypothesis: Hypothesis) -> str:

@@ -74,6 +74,11 @@ class Hypotheses:
         """Return the most probable candidate."""
         return max((self.judged or self.exact).values(), key=self.score)
 
+    def best_of(self, identifiers: tuple[str, ...]) -> CandidateFit:
+        """Return the most probable fit of a set of effects."""
+        options = [item for item in self.all().values() if item.candidate.identifiers == identifiers]
+        return max(options, key=self.score)
+
     def fitted(self) -> frozenset[str]:
         """Return the identifiers of all effects that were fitted, alone or with others."""
         kept = (*self.rough.values(), *self.exact.values(), *self.judged.values())

@@ -17,10 +17,9 @@ from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.consistency_gate import (
     CONSISTENCY_LEVEL,
-    _by_channel,
-    _by_run,
     consistency_gate,
     consistency_tests,
+    directions,
     score_tests,
 )
 from discrepancy.judgement.naming import name
@@ -176,10 +175,10 @@ def test_a_zero_that_moves_is_as_large_in_a_noisy_trial(kit) -> None:  # type: i
     """The second ring-down has 1.5 times the noise; two static trials of one run have other channels."""
     problem = changed(kit.closed_problem(seed=4, effect=0.5))
     assert {data.trial.noise_factor for data in problem.trials} == {1.0, 1.5}
-    directions = _by_channel(problem, fitted(problem, kit.offset_effect(), "y1"), "y1")
+    along = directions(problem, fitted(problem, kit.offset_effect(), "y1"))["channel y1"]
     starts = {n: data.trial.start for n, data in enumerate(problem.trials)}
     assert len(set(starts.values())) == 4
-    drift = {n: column.max() for n, column in directions["the zero over time"].items()}
+    drift = {n: column.max() for n, column in along["the zero over time"].items()}
     assert drift == pytest.approx({n: drift[3] * start / starts[3] for n, start in starts.items()})
 
     channels = dict(problem.campaign.channels)
@@ -188,7 +187,9 @@ def test_a_zero_that_moves_is_as_large_in_a_noisy_trial(kit) -> None:  # type: i
     kept = {"channels": second.channels[1:], "values": second.values[:, 1:], "used": second.used[:, 1:]}
     assert "y3" not in kept["channels"]
     campaign = replace(problem.campaign, channels=channels, trials=(first, replace(second, **kept), *others))
-    (zeros,) = _by_run(Problem(campaign, problem.model, problem.setting)).values()
+    other = Problem(campaign, problem.model, problem.setting)
+    along = directions(other, fitted(other, kit.offset_effect(), "y1"))
+    (zeros,) = along["zeros of the static runs"].values()
     assert {float(value) for column in zeros.values() for value in column.ravel()} == {0.02}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +12,11 @@ from scipy.signal import lfilter
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import SHAPE_GAIN
-from discrepancy.judgement.naming import _open, _shared, name
+from discrepancy.judgement.naming import name
+from discrepancy.judgement.rules import SURE, UNSURE, Case
 from discrepancy.missing_force.hypotheses import key_of
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.verdict import VerdictKind
 from fe.runtime.patch import ModelPatch, PowerDamping
 
 NO_NAME = (
@@ -282,7 +283,7 @@ def test_members_that_do_not_fit_are_no_part_of_a_group(searched, few) -> None: 
     found.keep(wrong, exact=True)
     right = ("coulomb_friction",)
     shares = {wrong.candidate.identifiers: 0.6, right: 0.38, (): 0.02}
-    verdict, _, nearest = _open(problem, found, shares, partial(Verdict, log_bayes_factor=0.0), wrong)
+    verdict, _, nearest = Case(problem, found, shares).open()
     assert verdict.kind is VerdictKind.GROUP
     assert verdict.group == right
     assert "cannot tell which" not in verdict.sentence
@@ -302,13 +303,19 @@ def test_what_all_probable_sets_hold_is_named_where_it_fits_alone(searched, few)
     for terms in ((cell,), (friction, gain), (cell, gain)):
         found.keep(fit(problem, Candidate(terms), problem.start(Candidate(terms))), exact=True)
     right, more = ("coulomb_friction",), Candidate((friction, gain)).identifiers
-    outcome = _shared(problem, found, {more: 0.7, right: 0.3})
+    outcome = Case(problem, found, {more: 0.7, right: 0.3}).shared()
     assert outcome is not None
     assert outcome[0].kind is VerdictKind.NAMED
     assert [item.identifier for item in outcome[0].effects] == list(right)
     assert outcome[0].probability == pytest.approx(1.0)
-    assert _shared(problem, found, {Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}) is None
-    assert _shared(problem, found, {right: 0.8, (): 0.2}) is None
+    for shares in ({Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}, {right: 0.8, (): 0.2}):
+        assert Case(problem, found, shares).shared() is None
+
+
+def test_the_rules_stand_in_the_page_in_their_order() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "discrepancy.md").read_text(encoding="utf-8")
+    table = "".join(f"| {rule.kind} | {rule.when} |\n" for rule in (*UNSURE, *SURE))
+    assert f"| verdict | where |\n| --- | --- |\n{table}\n" in page
 
 
 # ---------------------------------------------------------------- families

@@ -19,7 +19,6 @@ from discrepancy.errors import VerdictFileError
 from discrepancy.files.document import Origin, json_schema, shipped_schema
 from discrepancy.files.patch import (
     PATCH_SCHEMA,
-    PatchDocument,
     StoredPatch,
     patch_effects,
     primitive_intervals,
@@ -27,7 +26,7 @@ from discrepancy.files.patch import (
     write_patch,
 )
 from discrepancy.files.residuals import read_residuals, write_residuals
-from discrepancy.files.verdict import VERDICT_SCHEMA, VerdictDocument, read_verdict, write_verdict
+from discrepancy.files.verdict import VERDICT_SCHEMA, StoredVerdict, read_verdict, write_verdict
 from discrepancy.judgement.proof import prove
 from discrepancy.verdict import (
     CalibratedParameter,
@@ -179,7 +178,7 @@ def test_every_real_parameter_of_every_primitive_has_a_unit() -> None:
 
 @pytest.mark.parametrize(
     ("name", "document", "schema"),
-    [("verdict", VerdictDocument, VERDICT_SCHEMA), ("patch", PatchDocument, PATCH_SCHEMA)],
+    [("verdict", StoredVerdict, VERDICT_SCHEMA), ("patch", StoredPatch, PATCH_SCHEMA)],
 )
 def test_the_shipped_schema_is_that_of_the_records(name: str, document: type, schema: str) -> None:
     assert shipped_schema(name) == json.loads(json_schema(document, schema))
