@@ -11,7 +11,6 @@ from discrepancy.missing_force.force import ForceCourse, MissingForce, missing_f
 from discrepancy.missing_force.hypotheses import key_of, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.missing_force.shares import OF_PREDICTIONS, ForceShares, Share, orders
-from discrepancy.models.port_units import port_unit
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
 
@@ -41,7 +40,7 @@ def told_force(problem: Problem, search: Search, fit: CandidateFit, missing: Mis
     laws = [(term.effect.name, term.place) for term in fit.candidate.terms if term.place in ports]
     several = missing.law and len({place for _, place in laws}) > 1
     return ForceAtPort(
-        missing.port, port_unit(missing.port, problem.model.inner), rms, displacement, velocity,
+        missing.port, problem.model.port_unit(missing.port), rms, displacement, velocity,
         _largest(missing.courses), missing.evidence, missing.correlation_time, by_variable, ordered_by,
         " and ".join(f"{name} at {place}" for name, place in laws) if several else missing.law, *shares,
     )  # fmt: skip

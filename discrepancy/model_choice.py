@@ -16,7 +16,6 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.reduced_structure import StructureModel
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
-from discrepancy.models.wrapped import PatchedModel
 from discrepancy.sources.from_run import (
     CALIBRATION_FILE,
     DESIGN_FILE,
@@ -234,7 +233,7 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
     calibrated = {item.name: (item.mean, item.deviation) for item in stored.parameters}
     return replace(
         base,
-        model=PatchedModel(base.model, stored.patch, calibrated),
+        model=base.model.patched(stored.patch, calibrated),
         label=path.name,
         source_hash=hash_record({"model": base.source_hash, "patch": hash_file(path)}),
         built_in=stored.upon(base.built_in),

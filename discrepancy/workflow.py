@@ -38,7 +38,6 @@ from discrepancy.missing_force.force import MissingForce
 from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.wrapped import innermost
 from discrepancy.search.strategy import Search
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from fe.runtime.patch import ModelPatch
@@ -366,7 +365,7 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
     if not names:
         return []
     what = "a [[port]] in the model's file"
-    model = innermost(setting.model)
+    model = setting.model
     if isinstance(model, LumpedModel) and model.description.input:
         first = model.description.input[0]
         vector = ", ".join(f"{value:g}" for value in first.vector)

@@ -19,7 +19,6 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.models.interface import Model
 from discrepancy.models.sensing import observe
-from discrepancy.models.wrapped import MemoModel
 from fe.runtime.patch import ModelPatch
 
 from .candidate import Candidate
@@ -78,7 +77,7 @@ class Problem:
         like: "Problem | None" = None,
     ) -> None:
         self.campaign, self.setting = campaign, setting
-        self.model = model if isinstance(model, MemoModel) else MemoModel(model)
+        self.model = model.remembering()
         chosen = campaign.fitted if trials is None else trials
         if not chosen:
             raise CampaignDataError(

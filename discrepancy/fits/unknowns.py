@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.wrapped import initial_sizes
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -232,7 +231,7 @@ def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray, mode
         scale = release.deviation if release.at_rest else FREE_MOTION
         time_zero = release.time_zero_deviation
     elif trial.begins is Start.UNKNOWN:
-        sizes = initial_sizes(model, campaign, trial)
+        sizes = model.initial_sizes(campaign, trial)
         shape, scale = (-(-len(sizes) // 2), 2), FREE_MOTION
         sizes = np.pad(sizes, (0, len(sizes) % 2))
     uncertain = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation

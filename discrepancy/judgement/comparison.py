@@ -27,7 +27,6 @@ from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.naming import Explained
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share
-from discrepancy.models.port_units import port_unit
 from discrepancy.search.starting_points import acts_within, are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
@@ -188,7 +187,7 @@ class ByForce:
         """Return the unit of the force at the port of a hypothesis."""
         ports = self.search.ports
         places = [t.place for t in item.candidate.terms if t.place in ports]
-        return port_unit(places[0] if places else ports[next(iter(item.processes))], self.problem.model.inner)
+        return self.problem.model.port_unit(places[0] if places else ports[next(iter(item.processes))])
 
 
 @dataclass

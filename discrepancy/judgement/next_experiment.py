@@ -17,7 +17,6 @@ from discrepancy.fits.cholesky import finite
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.models.wrapped import PatchedModel
 from discrepancy.verdict import Experiment
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass
 
@@ -103,7 +102,7 @@ def mutual_information(
     weights : (H,) ndarray
         Their probabilities, of sum one.
     """
-    model = PatchedModel(problem.model, proposal.added) if len(proposal.added) else problem.model
+    model = problem.model.patched(proposal.added) if len(proposal.added) else problem.model
     there = Problem(problem.campaign, model, problem.setting, (proposal.trial,), like=problem)
     data = there.trials[0]
     # without a record, what the most probable hypothesis left stands for the noise

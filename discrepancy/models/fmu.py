@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from discrepancy.models.fmu_ports import SAFE_TURN
 from discrepancy.models.fmu_runs import FmuRuns, Run, State
 from discrepancy.models.fmu_trials import FmuPatch, FmuTrials, sampled
 from discrepancy.models.interface import (
-    NO_PATCH,
     Conditions,
     Outputs,
     PortedSystem,
@@ -22,14 +22,17 @@ from discrepancy.models.interface import (
     Response,
     Scales,
     campaign_sizes,
+)
+from discrepancy.models.model_file import DescribedModel
+from discrepancy.models.port_system import PortSystem
+from discrepancy.models.questions import (
     check_outputs,
     check_parameters,
     check_plain,
+    laws_at,
     prior_mean,
+    sorted_patch,
 )
-from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.patch_parts import laws_at, sorted_patch
-from discrepancy.models.port_system import PortSystem
 from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import (
     INTERNAL_FORCES,
@@ -121,6 +124,8 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ what it is
 
+    shows_ports: ClassVar[bool] = True
+
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
         description, forces = self.description, bool(self.description.inputs.forces)
@@ -139,7 +144,7 @@ class FmuModel(DescribedModel):
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
-        given, conditions = self.description.scales, Conditions(prior_mean(campaign, self.parameters))
+        given, conditions = self.description.scales, Conditions(prior_mean(campaign, self.declared))
         largest = np.zeros(len(self.ports()))
         for trial in campaign.trials:
             if trial.is_dynamic:
@@ -188,8 +193,8 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ response
 
-    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial, see `Model.respond`; `transverse` and `shear` are never known.
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
+        """Return the response of a trial; `transverse` and `shear` are never known.
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
@@ -228,9 +233,7 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ ports
 
-    def ported(
-        self, trial: Trial, outputs: Outputs, parameters: FloatArray, patch: ModelPatch = NO_PATCH
-    ) -> PortedSystem:
+    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the state of that of the prior means.
 
         Raises
@@ -238,8 +241,8 @@ class FmuModel(DescribedModel):
         ModelError
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
-        means = np.array([item.mean for item in self.parameters])
-        settings = self._parts(patch).settings
+        means = np.array([item.mean for item in self.declared])
+        settings = self._parts(self.patch).settings
         base, found = (self._port_system(trial, values, settings) for values in (means, parameters))
         if base is None or found is None or len(base.transition) != len(found.transition):
             raise ModelError(
@@ -264,11 +267,9 @@ class FmuModel(DescribedModel):
                 return found
         return None
 
-    def port_motion(
-        self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
-    ) -> tuple[FloatArray, FloatArray]:
+    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        parts = self._parts(patch)._replace(laws=NO_LAWS)
+        parts = self._parts(self.patch)._replace(laws=NO_LAWS)
         values, step = self._moving(trial, conditions, parts)
         rate, zero = conditions.clock
         moved = values[:, self.motion.ports.x]

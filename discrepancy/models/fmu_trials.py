@@ -13,8 +13,8 @@ from discrepancy.models.acting import Course, acting_force
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Run, State
-from discrepancy.models.interface import Conditions, Response, place_among, release_of
-from discrepancy.models.patch_parts import LoadChange
+from discrepancy.models.interface import Conditions, Response
+from discrepancy.models.questions import LoadChange, place_among, release_of
 from fe.runtime.motion import NO_LAWS, Laws
 
 SLOPES = (

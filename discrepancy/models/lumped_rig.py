@@ -20,11 +20,11 @@ from discrepancy.models.acting import (
     acting_force,
     order_of,
 )
-from discrepancy.models.interface import Conditions, Place, place_among, release_of
+from discrepancy.models.interface import Conditions, Place
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
 from discrepancy.models.lumped_sections import InputSection
-from discrepancy.models.patch_parts import LoadChange
+from discrepancy.models.questions import LoadChange, place_among, release_of
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import PointMass, PortLoad, Primitive, RootCompliance, course_of

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Protocol, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from discrepancy.campaign.records import Quantity
-from discrepancy.models.interface import ModelParameter
+from discrepancy.models.interface import Model, ModelParameter
 
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0, strict=True)]
@@ -59,7 +59,7 @@ class Named(Protocol):
         """Its name."""
 
 
-class DescribedModel:
+class DescribedModel(Model):
     """What models of a file know of themselves.
 
     Parameters
@@ -79,9 +79,8 @@ class DescribedModel:
         ports: Sequence[Named],
         quantities: Mapping[str, Quantity],
     ) -> None:
-        self.name, self.quantities = name, quantities
-        self.parameters = tuple(item.calibrated for item in parameters)
-        self._port_names = tuple(item.name for item in ports)
+        super().__init__(name, tuple(item.calibrated for item in parameters))
+        self.quantities, self._port_names = quantities, tuple(item.name for item in ports)
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""

@@ -8,7 +8,6 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
 from discrepancy.models.interface import Conditions, Model, Response
-from discrepancy.models.wrapped import built_in_sensors
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive
 from fe.runtime.sensors import (
@@ -60,7 +59,7 @@ def observe(
     outputs = tuple(
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
-    patch = (_by_channels(built_in_sensors(model), campaign) + patch).in_trial(trial.name)
+    patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
     if refinement != 1:
         conditions = replace(conditions, refinement=refinement)
     if not uses_sensors(patch):

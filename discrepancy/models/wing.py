@@ -13,8 +13,9 @@ from calibration.result.file import load_calibration
 from calibration.result.record import STATE
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale, check_outputs
+from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale
 from discrepancy.models.memory import Memory
+from discrepancy.models.questions import check_outputs
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.structural import Moving, State, StructuralModel
 from fe.reduction.model_cache import patch_arrays
@@ -53,6 +54,9 @@ SHIPPED_PRIOR = {
 }
 """Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e of the
 paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
+
+
+ROTATING_PORT = "root"
 
 
 class Stiffness:
@@ -181,6 +185,10 @@ class WingModel(StructuralModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
         return primitive in PRIMITIVES.values() and primitive is not PortLoad
+
+    def turns(self, port: str) -> bool | None:
+        """Return whether a port turns; the others move up and down."""
+        return port == ROTATING_PORT
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at ports of `port_rows`."""
