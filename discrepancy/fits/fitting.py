@@ -5,7 +5,8 @@ change little with an effect; away from the end they may be those of the fit wit
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,16 @@ class TrialBlock:
     def index(self) -> IntArray:
         """Which shared unknowns (K,) the trial knows."""
         return self.derivatives.index
+
+    @cached_property
+    def factor(self) -> Cholesky:
+        """Of the trial's own unknowns."""
+        return Cholesky.of(self.local)
+
+    @cached_property
+    def followed(self) -> FloatArray:
+        """What the trial's own unknowns (L, K) do less of where the shared ones do more."""
+        return self.factor.solve(self.cross)
 
 
 @dataclass(frozen=True)
@@ -126,22 +137,32 @@ class CandidateFit:
         return float(self.sums.sum())
 
 
+class Fitted(Protocol):
+    """Where a candidate stands: a fit, or a state on the way to it."""
+
+    @property
+    def point(self) -> Point:
+        """Values of all unknowns."""
+
+    @property
+    def residuals(self) -> tuple[FloatArray, ...]:
+        """Of each trial, standardised."""
+
+    @property
+    def linearisations(self) -> tuple[Linearisation, ...]:
+        """Of each trial."""
+
+
 def trial_block(
-    problem: Problem,
-    number: int,
-    point: Point,
-    parts: Linearisation,
-    candidate: Candidate,
-    residual: FloatArray,
-    precision: FloatArray,
+    problem: Problem, number: int, found: Fitted, candidate: Candidate, precision: FloatArray
 ) -> TrialBlock:
-    """Return the normal equations of a trial."""
-    data = problem.trials[number]
-    derivatives = problem.derivatives(number, point, parts, candidate)
+    """Return the normal equations of a trial, by precisions of all channels."""
+    data, point = problem.trials[number], found.point
+    derivatives = problem.derivatives(number, point, found.linearisations[number], candidate)
     products = derivatives.products()
     weights = precision[data.groups]
     normal = derivatives.normal(products, weights)
-    gradient = derivatives.onto(residual.T * weights[:, np.newaxis])
+    gradient = derivatives.onto(found.residuals[number].T * weights[:, np.newaxis])
     u, prior, count = point.local[number], data.unknowns.precision, derivatives.local_size
     return TrialBlock(
         local=normal[:count, :count] + np.diag(prior + 1e-12),
@@ -153,6 +174,45 @@ def trial_block(
         products=products,
         precision=weights,
     )
+
+
+class Eliminated(NamedTuple):
+    """Normal equations of shared unknowns and effect parameters, the trials' own unknowns eliminated.
+
+    Attributes
+    ----------
+    blocks : tuple of TrialBlock
+        Of each trial.
+    matrix, gradient : (Q + E, Q + E), (Q + E,) ndarray
+        With prior.
+    diagonal : (Q + E,) ndarray
+        Of the matrix before anything is eliminated.
+    """
+
+    blocks: tuple[TrialBlock, ...]
+    matrix: FloatArray
+    gradient: FloatArray
+    diagonal: FloatArray
+
+
+def eliminated(
+    problem: Problem, found: Fitted, candidate: Candidate, precision: FloatArray, damping: float = 0.0
+) -> Eliminated:
+    """Return the normal equations of a problem, what the trials know of their own damped."""
+    size = problem.shared.size + candidate.size
+    prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
+    matrix, diagonal = np.diag(prior + 1e-12), prior.copy()
+    gradient = -prior * np.concatenate((found.point.shared, found.point.effect))[:size]
+    blocks = []
+    for number in range(len(problem.trials)):
+        block = trial_block(problem, number, found, candidate, precision)
+        if damping:
+            block = replace(block, local=block.local + damping * np.diag(np.diag(block.local)))
+        blocks.append(block)
+        matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ block.followed
+        np.add.at(gradient, block.index, block.shared_gradient - block.followed.T @ block.local_gradient)
+        np.add.at(diagonal, block.index, np.diag(block.shared))
+    return Eliminated(tuple(blocks), matrix, gradient, diagonal)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a step too long, which is taken back
@@ -267,7 +327,7 @@ class _State:
     residuals: tuple[FloatArray, ...]
     responses: tuple[FloatArray, ...]
     sums: FloatArray
-    parts: tuple[Linearisation, ...]
+    linearisations: tuple[Linearisation, ...]
 
 
 @dataclass
@@ -326,22 +386,14 @@ class _Descent:
                 proposal = self.state(ahead, derivatives=False)
                 bent = not proposal.objective < state.objective and np.isfinite(proposal.objective)
                 if bent and share == 1.0:
-                    correction, _ = self.step(self.state(ahead, known=state.parts), damping)
+                    correction, _ = self.step(self.state(ahead, known=state.linearisations), damping)
                     ahead = _ahead(self.candidate, ahead, correction)
                     proposal = self.state(ahead, derivatives=False)
                 if proposal.objective < state.objective:
-                    return self.state(ahead, known=state.parts)
+                    return self.state(ahead, known=state.linearisations)
             except DiscrepancyError:  # outside what the structure can carry: a shorter step
                 continue
         return None
-
-
-def _blocks(problem: Problem, candidate: Candidate, state: _State) -> list[TrialBlock]:
-    precision = problem.precisions(state.sums)
-    return [
-        trial_block(problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision)
-        for n in range(len(problem.trials))
-    ]
 
 
 def _step(
@@ -350,31 +402,18 @@ def _step(
     """Return the step, the decrease it promises [nat], and the deviations (E,) of the effect parameters."""
     shared_size = problem.shared.size
     size = shared_size + candidate.size
-    prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
-    position = np.concatenate((state.point.shared, state.point.effect))
-    matrix = np.diag(prior + 1e-12)
-    gradient = -prior * position
-    blocks = _blocks(problem, candidate, state)
-    damped_diagonal = np.zeros(size)
-    eliminated = []
-    for block in blocks:
-        local = block.local + damping * np.diag(np.diag(block.local))
-        solved = np.linalg.solve(finite(local), np.column_stack((block.cross, block.local_gradient)))
-        inner, inner_gradient = solved[:, :-1], solved[:, -1]
-        matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
-        np.add.at(damped_diagonal, block.index, np.diag(block.shared))
-        gradient_part = block.shared_gradient - block.cross.T @ inner_gradient
-        np.add.at(gradient, block.index, gradient_part)
-        eliminated.append((inner, inner_gradient))
+    blocks, matrix, gradient, diagonal = eliminated(
+        problem, state, candidate, problem.precisions(state.sums), damping
+    )
     variance = np.diag(Cholesky.of(matrix).solve(np.eye(size)[:, shared_size:])[shared_size:])
-    damped = matrix + damping * np.diag(damped_diagonal + prior)
+    damped = matrix + damping * np.diag(diagonal)
     step = np.zeros(size) if local_only else Cholesky.of(damped).solve(finite(gradient))
     promised = 0.5 * float(gradient @ step)
     local_steps = []
-    for block, (inner, inner_gradient) in zip(blocks, eliminated, strict=True):
-        local_step = inner_gradient - inner @ step[block.index]
-        promised += 0.5 * float(block.local_gradient @ inner_gradient)
-        local_steps.append(np.asarray(local_step, dtype=np.float64))
+    for block in blocks:
+        own = block.factor.solve(block.local_gradient)
+        promised += 0.5 * float(block.local_gradient @ own)
+        local_steps.append(np.asarray(own - block.followed @ step[block.index], dtype=np.float64))
     return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised, np.sqrt(variance)
 
 
@@ -385,48 +424,25 @@ def _finished(
     covariance, log_evidence = np.zeros((size, size)), -state.objective
     spent = np.zeros(len(problem.channel_names))
     if evidence:
-        precision = problem.precisions(state.sums)
-        prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
-        matrix = np.diag(prior + 1e-12)
-        pieces = []
-        log_determinant = 0.0
-        for n in range(len(problem.trials)):
-            block = trial_block(
-                problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision
-            )
-            factor = Cholesky.of(block.local)
-            inner = factor.solve(block.cross)
-            matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
-            log_determinant += factor.log_determinant
-            pieces.append((block, factor, inner))
+        blocks, matrix, *_ = eliminated(problem, state, candidate, problem.precisions(state.sums))
         factor = Cholesky.of(matrix)
-        log_determinant += factor.log_determinant
         covariance = factor.solve(np.eye(size))
-        log_evidence -= 0.5 * log_determinant
-        for n, (block, local_factor, inner) in enumerate(pieces):
+        log_evidence -= 0.5 * sum(item.log_determinant for item in (factor, *(b.factor for b in blocks)))
+        for data, block in zip(problem.trials, blocks, strict=True):
             # leverage of each channel: trace of J Cov J^T; local unknowns follow the shared ones
             count = len(block.local)
             known = covariance[np.ix_(block.index, block.index)]
             joint = np.empty((count + len(known), count + len(known)))
-            followed = inner @ known
-            joint[:count, :count] = local_factor.solve(np.eye(count)) + followed @ inner.T
+            followed = block.followed @ known
+            joint[:count, :count] = block.factor.solve(np.eye(count)) + followed @ block.followed.T
             joint[:count, count:], joint[count:, :count] = -followed, -followed.T
             joint[count:, count:] = known
             leverage = block.derivatives.spread(block.products, block.precision, joint)
-            np.add.at(spent, problem.trials[n].groups, leverage)
+            np.add.at(spent, data.groups, leverage)
     return CandidateFit(
-        candidate,
-        state.point,
-        state.objective,
-        log_evidence,
-        covariance,
-        state.residuals,
-        state.responses,
-        state.sums,
-        spent,
-        state.parts,
-        converged,
-    )
+        candidate, state.point, state.objective, log_evidence, covariance, state.residuals, state.responses,
+        state.sums, spent, state.linearisations, converged,
+    )  # fmt: skip
 
 
 def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:

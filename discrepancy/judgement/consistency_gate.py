@@ -220,9 +220,7 @@ def _projected(
     weights = problem.precisions(fit.sums)
     for number, data in enumerate(problem.trials):
         residual = fit.residuals[number]
-        block = trial_block(
-            problem, number, fit.point, fit.linearisations[number], fit.candidate, residual, weights
-        )
+        block = trial_block(problem, number, fit, fit.candidate, weights)
         acting = np.array([k for k, item in enumerate(directions) if number in item], dtype=np.int64)
         extra = [problem.trials[number].standardised(directions[k][number]) for k in acting]
         weighted = [column * weights[data.groups] for column in extra]
@@ -236,7 +234,7 @@ def _projected(
         shared = np.block([[block.shared, between], [between.T, products]])
         along = np.array([np.vdot(residual, column) for column in weighted])
         index = np.concatenate((block.index, size + acting))
-        inner = Cholesky.of(block.local).solve(cross)
+        inner = block.factor.solve(cross)
         matrix[np.ix_(index, index)] += shared - cross.T @ inner
         np.add.at(
             gradient, index,

@@ -113,8 +113,9 @@ def mutual_information(
     for item in fits:
         point = Point(item.point.shared, (np.zeros(data.unknowns.size),), item.point.effect)
         parts = there.linearise(0, point, item.candidate)
-        local, shared, index = there.jacobian(0, point, parts, item.candidate)
-        local, shared = local * noise_units, shared * noise_units
+        derivatives = there.derivatives(0, point, parts, item.candidate)
+        index = derivatives.index
+        local, shared = (part * noise_units for part in derivatives.dense())
         means.append(data.standardised(there.prediction(0, point, parts.response)).ravel() * noise_units)
         root = np.linalg.cholesky(item.covariance[np.ix_(index, index)] + 1e-12 * np.eye(len(index)))
         precision = np.maximum(data.unknowns.precision, 1e-4)  # a free zero is known to a hundred s0

@@ -73,7 +73,7 @@ class FmuModel(DescribedModel):
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description
         self.runs = FmuRuns(description, Path(folder))
-        super().__init__(description.name, description.parameter, description.port, self.runs.quantities)
+        super().__init__(description, self.runs.quantities)
         self._trials = FmuTrials(description, self.runs)
         self._check_settings()
         means = Conditions(np.array([item.mean for item in self.parameters]))

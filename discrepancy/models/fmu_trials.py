@@ -116,7 +116,8 @@ class FmuTrials:
     def _forced(
         self, trial: Trial, patch: FmuPatch, step: float, steps: int
     ) -> list[tuple[Excitation, float]]:
-        begins, ends = Course.of_force(trial).ends(np.linspace(0.0, steps * step, steps + 1))
+        course = Course.of(trial.time, trial.force, trial.hold)
+        begins, ends = course.ends(np.linspace(0.0, steps * step, steps + 1))
         held, first = 0.5 * (begins + ends), float(trial.force[0])
         on = ((begins != 0.0) | (ends != 0.0)).astype(float)
         loads = []

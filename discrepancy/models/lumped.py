@@ -69,8 +69,7 @@ class LumpedModel(DescribedModel):
 
     def __init__(self, description: LumpedDescription) -> None:
         self.description = description
-        quantities = {item.name: item.quantity for item in description.output}
-        super().__init__(description.name, description.parameter, description.port, quantities)
+        super().__init__(description, {item.name: item.quantity for item in description.output})
         self._ports = {item.name: np.array(item.vector) for item in description.port}
         self._stations = sorted(place.station for place in description.place)
         self._rigs = Memory(KEPT_RIGS)
@@ -131,8 +130,8 @@ class LumpedModel(DescribedModel):
                 )
             return self._static(trial, outputs, structure, laws, change, conditions)
         rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
-        motion, drives = rig.moved(trial, conditions, laws, change, loads)
-        return motion.seen(rig.shown(outputs, drives, motion.acting.references))
+        motion = rig.moved(trial, conditions, laws, change, loads)
+        return motion.seen(rig.shown(outputs, motion.acting))
 
     def _static(
         self,
@@ -182,15 +181,15 @@ class LumpedModel(DescribedModel):
         """Return the system by which outputs see missing forces, in the modes of the prior means."""
         warm, structure = float(trial.temperature[0]), self._parts(self.patch).structure
         rig = self.rig(parameters, structure, warm)
-        drives = rig.acting(trial, Conditions(parameters))[1]
-        base = self.rig(self._mean, structure, warm).system(drives)
-        return rig.system(drives).seen_by(rig.shown(outputs, drives), base.shapes)
+        acting = rig.acting(trial, Conditions(parameters))
+        base = self.rig(self._mean, structure, warm).system(tuple(acting.drives))
+        return rig.system(tuple(acting.drives)).seen_by(rig.shown(outputs, acting), base.shapes)
 
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         structure, _, change, loads = self._parts(self.patch.in_trial(trial.name))
         rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
-        motion, _ = rig.moved(trial, conditions, NO_LAWS, change, loads)
+        motion = rig.moved(trial, conditions, NO_LAWS, change, loads)
         rows = np.array(list(motion.system.ports.values())).reshape(-1, rig.width)
         shapes = rows @ motion.system.all_shapes
         return motion.q @ shapes.T, motion.velocity @ shapes.T

@@ -42,7 +42,7 @@ from fe.runtime.patched_wing import (
 )
 from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import wing_names
-from fe.wing.design import load_design
+from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress
 
 SHIPPED_PRIOR = {
@@ -88,6 +88,8 @@ class WingModel(StructuralModel):
     prior : mapping of str to (float, float)
         Mean and standard deviation of the calibrated parameters, by the names of
         `calibration.result.record.STATE`.
+    design : WingDesign, optional
+        What the arrays were made of.
 
     Notes
     -----
@@ -99,8 +101,13 @@ class WingModel(StructuralModel):
     reference = LOAD_PLACE
 
     def __init__(
-        self, arrays: PatchArrays, name: str = "wing", prior: dict[str, tuple[float, float]] | None = None
+        self,
+        arrays: PatchArrays,
+        name: str = "wing",
+        prior: dict[str, tuple[float, float]] | None = None,
+        design: WingDesign | None = None,
     ) -> None:
+        self.design = design
         self.wing = wing = PatchedWing(arrays)
         prior = prior or SHIPPED_PRIOR
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
@@ -129,7 +136,7 @@ class WingModel(StructuralModel):
         """
         try:
             design = load_design(path)
-            return cls(patch_arrays(design, progress), design.name)
+            return cls(patch_arrays(design, progress), design.name, design=design)
         except FiniteElementError as cause:
             raise ModelError(str(cause)) from cause
 
@@ -145,7 +152,8 @@ class WingModel(StructuralModel):
         try:
             result = load_calibration(path)
             prior = {name: (result.mean(name), float(np.std(result.draws_of(name)))) for name in STATE}
-            return cls(patch_arrays(result.wing_design, progress), result.asset, prior)
+            design = result.wing_design
+            return cls(patch_arrays(design, progress), result.asset, prior, design)
         except (FiniteElementError, CalibrationError, OSError) as cause:
             raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
 
