@@ -6,7 +6,8 @@ import numpy as np
 
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 
-from .fitting import CandidateFit, fit, trial_block
+from .elimination import trial_block
+from .fitting import CandidateFit, fit
 from .problem import Problem
 
 

@@ -148,14 +148,12 @@ class Problem:
         Time steps are `refinement` times `finer` smaller than the model's own.
         """
         data = self.trials[number]
-        refinement = self.refinement * finer
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
-        key = (number, refinement, patch.primitives, conditions.key)
+        conditions = replace(conditions, refinement=self.refinement * finer)
+        key = (number, patch.primitives, conditions.key)
         kept = self._responses.get(key)
         if kept is None:
-            observed = observe(
-                self.model, self.campaign, data.trial, patch, conditions, refinement=refinement
-            )
+            observed = observe(self.model, self.campaign, data.trial, patch, conditions)
             kept = (observed.values, observed.rates)
             if len(self._responses) > 2000:
                 self._responses.clear()

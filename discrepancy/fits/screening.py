@@ -28,7 +28,8 @@ from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 from .candidate import Candidate, Term
 from .cholesky import Cholesky, finite
 from .derivatives import TrialDerivatives
-from .fitting import LARGEST_EFFECT, CandidateFit, eliminated
+from .elimination import eliminated
+from .fitting import LARGEST_EFFECT, CandidateFit
 from .problem import Problem
 
 FloatArray = NDArray[np.float64]

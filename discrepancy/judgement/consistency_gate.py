@@ -17,7 +17,8 @@ from scipy.stats import chi2, f
 from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.cholesky import Cholesky
-from discrepancy.fits.fitting import CandidateFit, trial_block
+from discrepancy.fits.elimination import trial_block
+from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.trial_data import TrialData
 from discrepancy.verdict import Gate

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from discrepancy.fits.fitting import CandidateFit, trial_block
+from discrepancy.fits.elimination import trial_block
+from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import is_magnitude
 

@@ -208,28 +208,28 @@ class FmuModel(DescribedModel):
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
             return Response(self._at_rest_values(trial, conditions, parts)[:, columns])
-        values, step = self._moving(trial, conditions, parts, columns)
-        rate, zero = conditions.clock
-        quantities = self.runs.quantities
-        derivatives = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
-        return sampled(values[:, columns], step, (1.0 + rate) * trial.time + zero, derivatives)
+        return self._moving(trial, conditions, parts, columns, self._orders(outputs))
 
     def _moving(
         self,
         trial: Trial,
         conditions: Conditions,
         patch: FmuPatch,
-        columns: Sequence[int] = (),
-    ) -> tuple[FloatArray, float]:
-        """Return all outputs (K, C) on the grid of the communication step [s], and the step."""
+        columns: Sequence[int],
+        orders: Sequence[int],
+    ) -> Response:
+        """Return columns of the FMU's outputs at the samples of a dynamic trial, derived so many times."""
 
         def excite(refined: int) -> Run:
             return self._trials.run(trial, conditions, patch, self.motion, refined)
 
         if len(patch.laws):
-            return self.motion.with_laws(patch.laws, excite, trial, conditions.refinement, columns)
-        run = excite(conditions.refinement)
-        return self.motion.free(run), run.step
+            values, step = self.motion.with_laws(patch.laws, excite, trial, conditions.refinement, columns)
+        else:
+            run = excite(conditions.refinement)
+            values, step = self.motion.free(run), run.step
+        rate, zero = conditions.clock
+        return sampled(values[:, columns], step, (1.0 + rate) * trial.time + zero, orders)
 
     # ------------------------------------------------------------ ports
 
@@ -249,9 +249,7 @@ class FmuModel(DescribedModel):
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
                 "move; it is not linear, or they are too few or too rough."
             )
-        quantities = self.runs.quantities
-        orders = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
-        shown = list(zip(self._columns(outputs), orders, strict=True))
+        shown = list(zip(self._columns(outputs), self._orders(outputs), strict=True))
         return found.in_state_of(base).ported(self.ports(), self.motion.ports.x, self.motion.ports.v, shown)
 
     def _port_system(
@@ -270,10 +268,7 @@ class FmuModel(DescribedModel):
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         parts = self._parts(self.patch)._replace(laws=NO_LAWS)
-        values, step = self._moving(trial, conditions, parts)
-        rate, zero = conditions.clock
-        moved = values[:, self.motion.ports.x]
-        found = sampled(moved, step, (1.0 + rate) * trial.time + zero, [0] * len(self.ports()))
+        found = self._moving(trial, conditions, parts, self.motion.ports.x, [0] * len(self.ports()))
         assert found.rates is not None  # of a motion there are
         return found.values, found.rates
 
@@ -320,6 +315,10 @@ class FmuModel(DescribedModel):
     def _columns(self, outputs: Outputs) -> list[int]:
         check_outputs(f"The FMU model {self.name!r}", self, outputs, self.quantities)
         return [self.runs.columns[output] for output, _ in outputs]
+
+    def _orders(self, outputs: Outputs) -> list[int]:
+        """Return how often each output is derived."""
+        return [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
 
 
 def _any_trial(kind: TrialKind, interval: float) -> Trial:

@@ -28,7 +28,6 @@ def observe(
     trial: Trial,
     patch: ModelPatch,
     conditions: Conditions,
-    refinement: int = 1,
 ) -> Response:
     """Return what the channels of a trial would show; gains and zeros that are nuisances are not in it.
 
@@ -46,8 +45,6 @@ def observe(
         (`fe.runtime.sensors`).
     conditions : Conditions
         Parameters, initial state, clock and health.
-    refinement : int
-        As of `Conditions`.
 
     Raises
     ------
@@ -60,8 +57,6 @@ def observe(
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
     patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
-    if refinement != 1:
-        conditions = replace(conditions, refinement=refinement)
     if not uses_sensors(patch):
         return model.respond(trial, outputs, patch, conditions)
     rate, zero = clock_of(patch)

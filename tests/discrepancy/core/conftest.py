@@ -343,8 +343,8 @@ class Bench:
             initial = np.zeros((rows, 2))
             if trial.release is not None:
                 initial[:, 0] = trial.release.deviation * generator.standard_normal(rows)
-            conditions = Conditions(theta, initial, (0.0, 0.0), trial.health)
-            values = observe(self.model, self.campaign, trial, patch, conditions, refinement=2).values.copy()
+            conditions = Conditions(theta, initial, (0.0, 0.0), trial.health, refinement=2)
+            values = observe(self.model, self.campaign, trial, patch, conditions).values.copy()
             drawn = (noise or (lambda g, shape: g.standard_normal(shape)))(generator, values.shape)
             for column, name in enumerate(trial.channels):
                 channel = self.campaign.channels[name]
