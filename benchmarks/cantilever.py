@@ -22,7 +22,8 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.models.acting import Acting, Course
-from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales, release_of
+from discrepancy.models.interface import Conditions, Model, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.questions import release_of
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.sensing import observe
 from fe.runtime.motion import laws_of
@@ -136,7 +137,7 @@ def _system(modulus: float, structural: ModelPatch) -> SecondOrderSystem:
     return SecondOrderSystem(mass, damping, stiffness, PORTS, 5)
 
 
-class Cantilever:
+class Cantilever(Model):
     """The cantilever; outputs "tip_displacement" and "strain[0]" to "strain[2]", ports root, tip and span."""
 
     name = "cantilever"
@@ -192,7 +193,7 @@ class Cantilever:
             ports=ports,
         )
 
-    def respond(
+    def _respond(
         self,
         trial: Trial,
         outputs: tuple[tuple[str, Quantity], ...],

@@ -36,7 +36,7 @@ def seen_force(
         return None, None
     if missing is None:
         return None, None
-    told = told_force(missing, problem.model.inner)
+    told = told_force(missing, problem.model)
     laws = [(term.effect.name, term.place) for term in terms if term.place in ports]
     if missing.law and len({place for _, place in laws}) > 1:
         told = replace(told, law=" and ".join(f"{name} at {place}" for name, place in laws))

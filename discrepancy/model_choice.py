@@ -4,8 +4,6 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
-from calibration.errors import CalibrationError
-from calibration.result.file import load_calibration
 from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.document import Origin
 from discrepancy.files.patch import StoredPatch, read_patch
@@ -16,7 +14,6 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.reduced_structure import StructureModel
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
-from discrepancy.models.wrapped import PatchedModel
 from discrepancy.sources.from_run import (
     CALIBRATION_FILE,
     DESIGN_FILE,
@@ -27,7 +24,7 @@ from discrepancy.sources.from_run import (
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure
-from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
+from fe.wing.design import SHIPPED_DESIGN, WingDesign
 from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
@@ -234,7 +231,7 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
     calibrated = {item.name: (item.mean, item.deviation) for item in stored.parameters}
     return replace(
         base,
-        model=PatchedModel(base.model, stored.patch, calibrated),
+        model=base.model.patched(stored.patch, calibrated),
         label=path.name,
         source_hash=hash_record({"model": base.source_hash, "patch": hash_file(path)}),
         built_in=stored.upon(base.built_in),
@@ -266,20 +263,15 @@ def _fmu(path: Path) -> ModelChoice:
 
 def _wing(path: Path | None, progress: Progress | None) -> ModelChoice:
     model = WingModel.of_design(path, progress)
-    file = SHIPPED_DESIGN if path is None else path
-    source = hash_record({"design": hash_file(file), "prior": {k: list(v) for k, v in SHIPPED_PRIOR.items()}})
-    try:
-        design = load_design(path)
-    except FiniteElementError as cause:
-        raise ModelError(str(cause)) from cause
-    label = "" if path is None else path.name
-    return ModelChoice(model, ModelKind.WING, label, source, design, path, design.hash)
+    prior = {name: list(values) for name, values in SHIPPED_PRIOR.items()}
+    source = hash_record({"design": hash_file(path or SHIPPED_DESIGN), "prior": prior})
+    return _of_wing(model, ModelKind.WING, path, source)
 
 
 def _calibrated(path: Path, progress: Progress | None) -> ModelChoice:
-    model = WingModel.of_calibration(path, progress)
-    try:
-        design = load_calibration(path).wing_design
-    except (CalibrationError, OSError) as cause:
-        raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
-    return ModelChoice(model, ModelKind.CALIBRATION, path.name, hash_file(path), design, path, design.hash)
+    return _of_wing(WingModel.of_calibration(path, progress), ModelKind.CALIBRATION, path, hash_file(path))
+
+
+def _of_wing(model: WingModel, kind: ModelKind, path: Path | None, source: str) -> ModelChoice:
+    label, made_of = "" if path is None else path.name, "" if model.design is None else model.design.hash
+    return ModelChoice(model, kind, label, source, model.design, path, made_of)

@@ -37,7 +37,6 @@ from discrepancy.missing_force.force import MissingForce
 from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.wrapped import innermost
 from discrepancy.search.hypotheses import Tell
 from discrepancy.search.strategy import Search
 from discrepancy.sentences import said
@@ -320,7 +319,7 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
     names = [effect.name for effect in effects if NO_PORT in (effect.unavailable(setting) or "")]
     if not names:
         return []
-    model, such_as = innermost(setting.model), ""
+    model, such_as = setting.model, ""
     if isinstance(model, LumpedModel) and model.description.input:
         first = model.description.input[0]
         vector = ", ".join(f"{value:g}" for value in first.vector)

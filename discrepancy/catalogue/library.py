@@ -12,7 +12,6 @@ from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 from discrepancy.catalogue.places import DYNAMIC
 from discrepancy.errors import CatalogueError
-from discrepancy.models.wrapped import follows_windows
 from fe.runtime.patch import SENSORS, ModelPatch, Window
 
 THEMES = (
@@ -104,7 +103,7 @@ def _switches(effect: Effect, setting: Setting) -> bool:
     patch = effect.patch(setting, sizes, places[0])
     if not len(patch) or patch.has_windows or not all(item.in_windows for item in patch):
         return False
-    return follows_windows(setting.model) or all(isinstance(item, SENSORS) for item in patch)
+    return setting.model.follows_windows or all(isinstance(item, SENSORS) for item in patch)
 
 
 def _during(effect: Effect, event: str, setting: Setting) -> Effect:

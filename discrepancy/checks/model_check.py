@@ -18,7 +18,6 @@ from discrepancy.checks.rest import rest_faults
 from discrepancy.checks.unit_slips import unit_slips
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
-from discrepancy.models.wrapped import oscillates
 from fe.runtime.patch import ModelPatch
 
 FloatArray = NDArray[np.float64]
@@ -50,7 +49,7 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     if missing:
         return missing
     faults = list(_lengths(campaign, model))
-    if oscillates(model):
+    if model.oscillates:
         faults += rest_faults(campaign, model.scales(campaign).angular_frequency / (2.0 * pi))
     predictions = {
         trial.name: observe(model, campaign, trial, ModelPatch(), prior_mean(campaign, model, trial)).values
@@ -124,7 +123,7 @@ def _missing_outputs(campaign: Campaign, model: Model) -> Iterator[DataFault]:
 def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
     # A driven trial is long enough if the parameters can be observed in it, see `unobservable`.
     dynamic = [trial for trial in campaign.trials if trial.is_dynamic and trial.kind is not TrialKind.DRIVEN]
-    if not dynamic or not oscillates(model):
+    if not dynamic or not model.oscillates:
         return
     frequency = model.scales(campaign).angular_frequency / (2.0 * pi)
     for trial in dynamic:

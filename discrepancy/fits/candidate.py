@@ -88,14 +88,8 @@ class Candidate:
 
     def acting(self, index: int) -> frozenset[TrialKind]:
         """Kinds of trials that change with the fitted parameter of this index."""
-        return self.terms[self._owner(index)].effect.acts_on
-
-    def _owner(self, index: int) -> int:
-        for number, term in enumerate(self.terms):
-            if index < len(term.parameters):
-                return number
-            index -= len(term.parameters)
-        raise IndexError(index)
+        owners = [term for term in self.terms for _ in term.parameters]
+        return owners[index].effect.acts_on
 
     def parts(self, normal: FloatArray) -> tuple[FloatArray, ...]:
         """Return the standard normal variables of each term."""

@@ -68,10 +68,11 @@ class TrialDerivatives:
         chosen = padded[self.owners[:, :, np.newaxis], self.owners[:, np.newaxis, :]]
         return np.asarray(weights * np.einsum("cij,cij->c", chosen, products))
 
-    def dense(self) -> FloatArray:
-        """Return J (L + K, N C), readings in the order of (N, C)."""
+    def dense(self) -> tuple[FloatArray, FloatArray]:
+        """Return J by the trial's own unknowns (L, N C) and by the others (K, N C), as (N, C) is ordered."""
         channels, _, samples = self.rows.shape
         found = np.zeros((self.size + 1, samples, channels))
         for channel in range(channels):
             found[self.owners[channel], :, channel] = self.rows[channel]
-        return found[:-1].reshape(self.size, samples * channels)
+        whole = found[:-1].reshape(self.size, samples * channels)
+        return whole[: self.local_size], whole[self.local_size :]

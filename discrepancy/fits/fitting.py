@@ -1,6 +1,6 @@
 """Fit of a candidate: maximum of the posterior by Levenberg-Marquardt, and its Laplace evidence.
 
-Local unknowns are eliminated trial by trial (Schur complement). The derivatives by what all hypotheses share
+The derivatives by what all hypotheses share
 change little with an effect; away from the end they may be those of the fit without effect (chord steps).
 """
 
@@ -14,13 +14,12 @@ from discrepancy.errors import DiscrepancyError, FitError
 
 from .candidate import Candidate
 from .cholesky import Cholesky, finite
-from .derivatives import TrialDerivatives
+from .elimination import eliminated
 from .linearisation import Base, Linearisation, Point
 from .problem import Problem
 from .remainder import Remainder
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
@@ -35,25 +34,6 @@ STEP_SHARES = (1.0, 0.3)
 CREEPING, NEAR_END = 0.2, 30.0
 """Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what
 the one before it promised: close to the end, promises should fall fast."""
-
-
-@dataclass(frozen=True)
-class TrialBlock:
-    """Normal equations of one trial."""
-
-    local: FloatArray  # (L, L) with prior
-    cross: FloatArray  # (L, K)
-    shared: FloatArray  # (K, K)
-    local_gradient: FloatArray  # (L,)
-    shared_gradient: FloatArray  # (K,)
-    derivatives: TrialDerivatives
-    products: FloatArray  # (C, M, M) of the derivatives of each channel
-    precision: FloatArray  # (C,) of each channel
-
-    @property
-    def index(self) -> IntArray:
-        """Which shared unknowns (K,) the trial knows."""
-        return self.derivatives.index
 
 
 @dataclass(frozen=True)
@@ -124,35 +104,6 @@ class CandidateFit:
     def chi_square(self) -> float:
         """Sum of squared standardised residuals."""
         return float(self.sums.sum())
-
-
-def trial_block(
-    problem: Problem,
-    number: int,
-    point: Point,
-    parts: Linearisation,
-    candidate: Candidate,
-    residual: FloatArray,
-    precision: FloatArray,
-) -> TrialBlock:
-    """Return the normal equations of a trial."""
-    data = problem.trials[number]
-    derivatives = problem.derivatives(number, point, parts, candidate)
-    products = derivatives.products()
-    weights = precision[data.groups]
-    normal = derivatives.normal(products, weights)
-    gradient = derivatives.onto(residual.T * weights[:, np.newaxis])
-    u, prior, count = point.local[number], data.unknowns.precision, derivatives.local_size
-    return TrialBlock(
-        local=normal[:count, :count] + np.diag(prior + 1e-12),
-        cross=normal[:count, count:],
-        shared=normal[count:, count:],
-        local_gradient=gradient[:count] - prior * u,
-        shared_gradient=gradient[count:],
-        derivatives=derivatives,
-        products=products,
-        precision=weights,
-    )
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a step too long, which is taken back
@@ -267,7 +218,7 @@ class _State:
     residuals: tuple[FloatArray, ...]
     responses: tuple[FloatArray, ...]
     sums: FloatArray
-    parts: tuple[Linearisation, ...]
+    linearisations: tuple[Linearisation, ...]
 
 
 @dataclass
@@ -326,22 +277,14 @@ class _Descent:
                 proposal = self.state(ahead, derivatives=False)
                 bent = not proposal.objective < state.objective and np.isfinite(proposal.objective)
                 if bent and share == 1.0:
-                    correction, _ = self.step(self.state(ahead, known=state.parts), damping)
+                    correction, _ = self.step(self.state(ahead, known=state.linearisations), damping)
                     ahead = _ahead(self.candidate, ahead, correction)
                     proposal = self.state(ahead, derivatives=False)
                 if proposal.objective < state.objective:
-                    return self.state(ahead, known=state.parts)
+                    return self.state(ahead, known=state.linearisations)
             except DiscrepancyError:  # outside what the structure can carry: a shorter step
                 continue
         return None
-
-
-def _blocks(problem: Problem, candidate: Candidate, state: _State) -> list[TrialBlock]:
-    precision = problem.precisions(state.sums)
-    return [
-        trial_block(problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision)
-        for n in range(len(problem.trials))
-    ]
 
 
 def _step(
@@ -350,31 +293,18 @@ def _step(
     """Return the step, the decrease it promises [nat], and the deviations (E,) of the effect parameters."""
     shared_size = problem.shared.size
     size = shared_size + candidate.size
-    prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
-    position = np.concatenate((state.point.shared, state.point.effect))
-    matrix = np.diag(prior + 1e-12)
-    gradient = -prior * position
-    blocks = _blocks(problem, candidate, state)
-    damped_diagonal = np.zeros(size)
-    eliminated = []
-    for block in blocks:
-        local = block.local + damping * np.diag(np.diag(block.local))
-        solved = np.linalg.solve(finite(local), np.column_stack((block.cross, block.local_gradient)))
-        inner, inner_gradient = solved[:, :-1], solved[:, -1]
-        matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
-        np.add.at(damped_diagonal, block.index, np.diag(block.shared))
-        gradient_part = block.shared_gradient - block.cross.T @ inner_gradient
-        np.add.at(gradient, block.index, gradient_part)
-        eliminated.append((inner, inner_gradient))
+    blocks, matrix, gradient, diagonal = eliminated(
+        problem, state, candidate, problem.precisions(state.sums), damping
+    )
     variance = np.diag(Cholesky.of(matrix).solve(np.eye(size)[:, shared_size:])[shared_size:])
-    damped = matrix + damping * np.diag(damped_diagonal + prior)
+    damped = matrix + damping * np.diag(diagonal)
     step = np.zeros(size) if local_only else Cholesky.of(damped).solve(finite(gradient))
     promised = 0.5 * float(gradient @ step)
     local_steps = []
-    for block, (inner, inner_gradient) in zip(blocks, eliminated, strict=True):
-        local_step = inner_gradient - inner @ step[block.index]
-        promised += 0.5 * float(block.local_gradient @ inner_gradient)
-        local_steps.append(np.asarray(local_step, dtype=np.float64))
+    for block in blocks:
+        own = block.factor.solve(block.local_gradient)
+        promised += 0.5 * float(block.local_gradient @ own)
+        local_steps.append(np.asarray(own - block.followed @ step[block.index], dtype=np.float64))
     return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised, np.sqrt(variance)
 
 
@@ -385,48 +315,25 @@ def _finished(
     covariance, log_evidence = np.zeros((size, size)), -state.objective
     spent = np.zeros(len(problem.channel_names))
     if evidence:
-        precision = problem.precisions(state.sums)
-        prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
-        matrix = np.diag(prior + 1e-12)
-        pieces = []
-        log_determinant = 0.0
-        for n in range(len(problem.trials)):
-            block = trial_block(
-                problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision
-            )
-            factor = Cholesky.of(block.local)
-            inner = factor.solve(block.cross)
-            matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
-            log_determinant += factor.log_determinant
-            pieces.append((block, factor, inner))
+        blocks, matrix, *_ = eliminated(problem, state, candidate, problem.precisions(state.sums))
         factor = Cholesky.of(matrix)
-        log_determinant += factor.log_determinant
         covariance = factor.solve(np.eye(size))
-        log_evidence -= 0.5 * log_determinant
-        for n, (block, local_factor, inner) in enumerate(pieces):
+        log_evidence -= 0.5 * sum(item.log_determinant for item in (factor, *(b.factor for b in blocks)))
+        for data, block in zip(problem.trials, blocks, strict=True):
             # leverage of each channel: trace of J Cov J^T; local unknowns follow the shared ones
             count = len(block.local)
             known = covariance[np.ix_(block.index, block.index)]
             joint = np.empty((count + len(known), count + len(known)))
-            followed = inner @ known
-            joint[:count, :count] = local_factor.solve(np.eye(count)) + followed @ inner.T
+            followed = block.followed @ known
+            joint[:count, :count] = block.factor.solve(np.eye(count)) + followed @ block.followed.T
             joint[:count, count:], joint[count:, :count] = -followed, -followed.T
             joint[count:, count:] = known
             leverage = block.derivatives.spread(block.products, block.precision, joint)
-            np.add.at(spent, problem.trials[n].groups, leverage)
+            np.add.at(spent, data.groups, leverage)
     return CandidateFit(
-        candidate,
-        state.point,
-        state.objective,
-        log_evidence,
-        covariance,
-        state.residuals,
-        state.responses,
-        state.sums,
-        spent,
-        state.parts,
-        converged,
-    )
+        candidate, state.point, state.objective, log_evidence, covariance, state.residuals, state.responses,
+        state.sums, spent, state.linearisations, converged,
+    )  # fmt: skip
 
 
 def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:

@@ -141,15 +141,10 @@ def shape_gate(named: CandidateFit, family: CandidateFit | None) -> Gate:
     if family is None:
         return Gate("shape", True, 0.0, SHAPE_GAIN, "The effect has no shape that could be free.")
     gain = family.log_evidence - named.log_evidence
-    if gain > SHAPE_GAIN:
-        return Gate(
-            "shape",
-            False,
-            gain,
-            SHAPE_GAIN,
-            f"Its family with a free shape gains {gain:.1f} nats over the name.",
-        )
-    return Gate("shape", True, gain, SHAPE_GAIN, "A free shape explains no more than the named one.")
+    passed, reason = gain <= SHAPE_GAIN, "A free shape explains no more than the named one."
+    if not passed:
+        reason = f"Its family with a free shape gains {gain:.1f} nats over the name."
+    return Gate("shape", passed, gain, SHAPE_GAIN, reason)
 
 
 def solver_share(problem: Problem, fit: CandidateFit) -> float:

@@ -1,10 +1,12 @@
 """Beside an optimum: other optima of the same candidate, and its law with a free shape."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from discrepancy.catalogue.entry import EffectParameter
+from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
 from discrepancy.search_settings import SEARCH
 
 from .candidate import Candidate, Term
@@ -12,6 +14,8 @@ from .fitting import CandidateFit, attempt
 from .linearisation import Point
 from .problem import Problem
 from .screening import is_magnitude
+
+FloatArray = NDArray[np.float64]
 
 
 def is_box(candidate: Candidate) -> bool:
@@ -28,8 +32,7 @@ def around(problem: Problem, found: CandidateFit) -> CandidateFit:
     Hysteresis of several elements has many local optima along the direction that the data tell least of, and
     a place has them at each sensor that it passes.
     """
-    parameters = [item for term in found.candidate.terms for item in term.parameters]
-    free = [number for number, item in enumerate(parameters) if not is_magnitude(item)]
+    free = [number for number, item in enumerate(_parameters(found)) if not is_magnitude(item)]
     for _ in range(SEARCH.rounds):
         moves = [step * axis for axis in np.eye(found.candidate.size)[free] for step in SEARCH.place_steps]
         if found.candidate.size > 1:
@@ -37,16 +40,8 @@ def around(problem: Problem, found: CandidateFit) -> CandidateFit:
             moves += [step * directions[:, -1] for step in SEARCH.ridge_steps]
         better = found
         for move in moves:
-            start = Point(found.point.shared, found.point.local, found.point.effect + move)
-            item = attempt(
-                problem,
-                found.candidate,
-                start,
-                iterations=SEARCH.neighbour_iterations,
-                give_up=better.objective,
-            )
-            if item is not None and item.log_evidence > better.log_evidence + SEARCH.neighbour_gain:
-                better = item
+            effect = found.point.effect + move
+            better = _better(problem, found, effect, better, iterations=SEARCH.neighbour_iterations)
         if better is found:
             break
         found = better
@@ -59,22 +54,28 @@ def elsewhere(problem: Problem, found: CandidateFit) -> CandidateFit:
     A mass on either side of an antinode changes a frequency alike, and a fit that began on one side may stay
     there though the other explains the data far better.
     """
-    parameters = [item for term in found.candidate.terms for item in term.parameters]
-    for number, item in enumerate(parameters):
+    for number, item in enumerate(_parameters(found)):
         if not isinstance(item, EffectParameter) or item.magnitude or not item.levels:
             continue
         for value in SEARCH.places:
             effect = found.point.effect.copy()
             effect[number] = value
-            again = attempt(
-                problem,
-                found.candidate,
-                Point(found.point.shared, found.point.local, effect),
-                give_up=found.objective,
-            )
-            if again is not None and again.log_evidence > found.log_evidence + SEARCH.neighbour_gain:
-                found = again
+            found = _better(problem, found, effect, found)
     return found
+
+
+def _parameters(found: CandidateFit) -> list[EffectParameter | ShapeParameter]:
+    return [item for term in found.candidate.terms for item in term.parameters]
+
+
+def _better(
+    problem: Problem, found: CandidateFit, effect: FloatArray, best: CandidateFit, **options: Any
+) -> CandidateFit:
+    """Return the best fit so far, or one begun beside a fit at other effect parameters where it gains."""
+    start = Point(found.point.shared, found.point.local, effect)
+    again = attempt(problem, found.candidate, start, give_up=best.objective, **options)
+    gains = again is not None and again.log_evidence > best.log_evidence + SEARCH.neighbour_gain
+    return again if again is not None and gains else best
 
 
 def free_shape(

@@ -3,16 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Trial
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 
-from .cholesky import Cholesky
-from .fitting import CandidateFit, TrialBlock, fit, trial_block
+from .elimination import trial_block
+from .fitting import CandidateFit, fit
 from .problem import Problem
-
-FloatArray = NDArray[np.float64]
 
 
 def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool = True) -> ResidualSet:
@@ -32,109 +28,69 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
     With a remainder the leverage is that of the trials' own unknowns: what is shared takes a few samples of
     all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show.
     """
-    fitted = _fitted(problem, found, sensitivities=sensitivities)
+    fitted = _predicted(problem, found, found, sensitivities=sensitivities)
     held_out = problem.campaign.held_out
-    trials = {item.trial.name: item for item in fitted}
     if held_out:
-        trials.update({item.trial.name: item for item in _held_out(problem, found, held_out)})
+        # what is shared stays as fitted, their own nuisances adapt to them
+        there = problem.with_trials(held_out)
+        nothing = tuple(np.zeros(data.unknowns.size) for data in there.trials)
+        start = replace(found.point, local=nothing)
+        adapted = fit(there, found.candidate, start, local_only=True)
+        fitted += _predicted(there, found, adapted, held_out=True)
+    trials = {item.trial.name: item for item in fitted}
     return ResidualSet(
         problem.campaign.channels,
         tuple(trials[trial.name] for trial in problem.campaign.trials if trial.name in trials),
     )
 
 
-def _fitted(problem: Problem, found: CandidateFit, *, sensitivities: bool) -> list[FittedTrial]:
-    shared_root = np.linalg.cholesky(found.covariance + 1e-14 * np.eye(len(found.covariance)))
-    shared_size = len(shared_root)
-    total = shared_size + sum(data.unknowns.size for data in problem.trials)
-    at, items = shared_size, []
-    ones = np.ones(len(problem.channel_names))
+def _predicted(
+    problem: Problem,
+    found: CandidateFit,
+    adapted: CandidateFit,
+    *,
+    sensitivities: bool = False,
+    held_out: bool = False,
+) -> list[FittedTrial]:
+    """Return trials beside their predictions, by what was found and its nuisances as adapted to them."""
+    root = np.linalg.cholesky(found.covariance + 1e-14 * np.eye(len(found.covariance)))
+    at, items = len(root), []
+    total = at + sum(data.unknowns.size for data in problem.trials)
+    ones, counted = np.ones(len(problem.channel_names)), float(found.remainder is None)
     for number, data in enumerate(problem.trials):
-        block = trial_block(
-            problem, number, found.point, found.linearisations[number], found.candidate,
-            found.residuals[number], ones,
-        )  # fmt: skip
-        local, shared = _halves(block)
-        factor = Cholesky.of(block.local)
-        own = factor.half(local)
+        block = trial_block(problem, number, adapted, adapted.candidate, ones)
+        local, shared = block.derivatives.dense()
+        own = block.factor.half(local)
         # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
-        follow = (shared - factor.solve(block.cross).T @ local).T @ shared_root[block.index]
-        leverage = np.einsum("kn,kn->n", own, own)
-        if found.remainder is None:
-            leverage = leverage + np.einsum("nk,nk->n", follow, follow)
-        shape = found.residuals[number].shape
+        follow = (shared - block.followed.T @ local).T @ root[block.index]
+        taken, carried = np.einsum("kn,kn->n", own, own), np.einsum("nk,nk->n", follow, follow)
+        shape = adapted.residuals[number].shape
+        if held_out:
+            leverage = np.maximum(counted * carried - taken, -1.0 + 1e-9)
+            variance = 1.0 + np.maximum(carried - taken, -1.0 + 1e-9).reshape(shape)
+        else:
+            leverage = np.minimum(taken + counted * carried, 1.0)
+            variance = 1.0 + np.maximum(leverage, 0.0).reshape(shape)
+        if found.remainder is not None and data.trial.is_dynamic:
+            variance = variance + found.remainder.size[data.groups] ** 2
         sensitive = None
         if sensitivities:
             sensitive = np.zeros((*shape, total))
-            sensitive[..., :shared_size] = follow.reshape(*shape, shared_size)
+            sensitive[..., : len(root)] = follow.reshape(*shape, len(root))
             sensitive[..., at : at + len(own)] = own.T.reshape(*shape, len(own))
+            at += len(own)
+        prediction = problem.prediction(number, adapted.point, adapted.responses[number])
+        residual = problem.residual(number, adapted.point, adapted.responses[number])
         items.append(
-            _item(problem, number, found, np.minimum(leverage, 1.0).reshape(shape), sensitive, held_out=False)
+            FittedTrial(
+                trial=data.trial,
+                prediction=prediction,
+                residual=residual * data.deviation,  # what a remainder takes up is what is left
+                noise_deviation=data.deviation,
+                predictive_deviation=data.deviation * np.sqrt(np.maximum(variance, 1e-9)),
+                leverage=leverage.reshape(shape),
+                rates=np.gradient(prediction, data.trial.interval, axis=0) if data.trial.is_dynamic else None,
+                sensitivity=sensitive,
+            )
         )
-        at += data.unknowns.size
     return items
-
-
-def _halves(block: TrialBlock) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives (L, N C) and (K, N C) by the trial's own and by the shared unknowns."""
-    dense = block.derivatives.dense()
-    return dense[: len(block.local)], dense[len(block.local) :]
-
-
-def _held_out(problem: Problem, found: CandidateFit, trials: tuple[Trial, ...]) -> list[FittedTrial]:
-    """Predict held-out trials: what is shared stays as fitted, their own nuisances adapt to them."""
-    there = problem.with_trials(trials)
-    nothing = tuple(np.zeros(data.unknowns.size) for data in there.trials)
-    start = replace(found.point, local=nothing)
-    adapted = replace(fit(there, found.candidate, start, local_only=True), remainder=found.remainder)
-    items = []
-    ones = np.ones(len(there.channel_names))
-    for number in range(len(there.trials)):
-        block = trial_block(
-            there, number, adapted.point, adapted.linearisations[number], adapted.candidate,
-            adapted.residuals[number], ones,
-        )  # fmt: skip
-        local, shared = _halves(block)
-        factor = Cholesky.of(block.local)
-        follow = shared - factor.solve(block.cross).T @ local
-        own = np.einsum("kn,kn->n", local, factor.solve(local))
-        covariance = found.covariance[np.ix_(block.index, block.index)]
-        carried = np.einsum("kn,kn->n", follow, covariance @ follow)
-        shape = adapted.residuals[number].shape
-        leverage = np.maximum(carried - own, -1.0 + 1e-9).reshape(shape)
-        item = _item(there, number, adapted, leverage, None, held_out=True)
-        if found.remainder is not None:
-            item = replace(item, leverage=np.maximum(-own, -1.0 + 1e-9).reshape(shape))
-        items.append(item)
-    return items
-
-
-def _item(
-    problem: Problem,
-    number: int,
-    found: CandidateFit,
-    leverage: FloatArray,
-    sensitive: FloatArray | None,
-    *,
-    held_out: bool,
-) -> FittedTrial:
-    data = problem.trials[number]
-    trial = data.trial
-    prediction = problem.prediction(number, found.point, found.responses[number])
-    residual = problem.residual(number, found.point, found.responses[number])
-    variance = 1.0 + leverage if held_out else 1.0 + np.maximum(leverage, 0.0)
-    if found.remainder is not None and trial.is_dynamic:
-        variance = variance + found.remainder.size[data.groups] ** 2
-    rates = None
-    if trial.is_dynamic:
-        rates = np.gradient(prediction, trial.interval, axis=0)
-    return FittedTrial(
-        trial=trial,
-        prediction=prediction,
-        residual=residual * data.deviation,  # what a remainder takes up is what is left
-        noise_deviation=data.deviation,
-        predictive_deviation=data.deviation * np.sqrt(np.maximum(variance, 1e-9)),
-        leverage=leverage,
-        rates=rates,
-        sensitivity=sensitive,
-    )

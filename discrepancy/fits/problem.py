@@ -19,7 +19,6 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.models.interface import Model
 from discrepancy.models.sensing import observe
-from discrepancy.models.wrapped import MemoModel
 from fe.runtime.patch import ModelPatch
 
 from .candidate import Candidate
@@ -78,7 +77,7 @@ class Problem:
         like: "Problem | None" = None,
     ) -> None:
         self.campaign, self.setting = campaign, setting
-        self.model = model if isinstance(model, MemoModel) else MemoModel(model)
+        self.model = model.remembering()
         chosen = campaign.fitted if trials is None else trials
         if not chosen:
             raise CampaignDataError(
@@ -94,7 +93,6 @@ class Problem:
         self.counts = counts
         self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
         self._responses: dict[object, tuple[FloatArray, FloatArray | None]] = {}
-        self._gains: dict[tuple[str, ...], tuple[IntArray, IntArray]] = {}
         self.refusals: dict[str, str] = {} if like is None else like.refusals
         self.shared: GlobalUnknowns
         if like is not None:
@@ -150,14 +148,12 @@ class Problem:
         Time steps are `refinement` times `finer` smaller than the model's own.
         """
         data = self.trials[number]
-        refinement = self.refinement * finer
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
-        key = (number, refinement, patch.primitives, conditions.key)
+        conditions = replace(conditions, refinement=self.refinement * finer)
+        key = (number, patch.primitives, conditions.key)
         kept = self._responses.get(key)
         if kept is None:
-            observed = observe(
-                self.model, self.campaign, data.trial, patch, conditions, refinement=refinement
-            )
+            observed = observe(self.model, self.campaign, data.trial, patch, conditions)
             kept = (observed.values, observed.rates)
             if len(self._responses) > 2000:
                 self._responses.clear()
@@ -310,24 +306,6 @@ class Problem:
             columns.extend(by_entry)
         return np.stack(columns) if columns else np.zeros((0, *response.shape))
 
-    def jacobian(
-        self, number: int, point: Point, parts: Linearisation, candidate: Candidate
-    ) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Return standardised derivatives of the prediction of a trial.
-
-        Returns
-        -------
-        local : (L, N C) ndarray
-            By the local unknowns.
-        shared : (K, N C) ndarray
-            By those shared unknowns and effect parameters that touch the trial.
-        index : (K,) ndarray of int
-            Which these are: global unknowns first, then effect parameters.
-        """
-        found = self.derivatives(number, point, parts, candidate)
-        dense = found.dense()
-        return dense[: found.local_size], dense[found.local_size :], found.index
-
     def derivatives(
         self, number: int, point: Point, parts: Linearisation, candidate: Candidate
     ) -> TrialDerivatives:
@@ -335,7 +313,9 @@ class Problem:
         data = self.trials[number]
         channels, zeros = data.trial.channels, data.unknowns.zeros
         gains = 1.0 + self.shared.gains(point.shared, channels)
-        position, column = self._gain_entries(channels)
+        known = [name for name in self.shared.gain_channels if name in channels]
+        position = np.array([self.shared.gain_channels.index(name) for name in known], dtype=np.int64)
+        column = [channels.index(name) for name in known]
         acting = [k for k in range(candidate.size) if data.trial.kind in candidate.acting(k)]
         own, count = len(parts.local), len(parts.parameters)
         blocks = [parts.local * gains, parts.parameters * gains]
@@ -369,19 +349,6 @@ class Problem:
             [*range(count), *(count + position), *(self.shared.size + k for k in acting)], dtype=np.int64
         )
         return TrialDerivatives(rows, owners, local, index)
-
-    def _gain_entries(self, channels: tuple[str, ...]) -> tuple[IntArray, IntArray]:
-        """Return which gains act in a trial, and on which of its columns."""
-        found = self._gains.get(channels)
-        if found is None:
-            entries = [
-                (position, channels.index(name))
-                for position, name in enumerate(self.shared.gain_channels)
-                if name in channels
-            ]
-            table = np.array(entries, dtype=np.int64).reshape(-1, 2)
-            found = self._gains[channels] = (table[:, 0], table[:, 1])
-        return found
 
     # -------------------------------------------------------------------------- likelihood
 

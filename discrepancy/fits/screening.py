@@ -28,7 +28,8 @@ from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 from .candidate import Candidate, Term
 from .cholesky import Cholesky, finite
 from .derivatives import TrialDerivatives
-from .fitting import LARGEST_EFFECT, CandidateFit, trial_block
+from .elimination import eliminated
+from .fitting import LARGEST_EFFECT, CandidateFit
 from .problem import Problem
 
 FloatArray = NDArray[np.float64]
@@ -107,36 +108,20 @@ class Screen:
         known = problem.freedom > 0.0
         left = problem.precisions(fit.sums)
         precision = np.where(known, 1.0, left) if record_noise else left
-        candidate = Candidate()
-        size = problem.shared.size
-        matrix = np.diag(problem.shared.precision + 1e-12)
-        gradient = -problem.shared.precision * fit.point.shared
+        blocks, matrix, gradient, _ = eliminated(problem, fit, Candidate(), precision)
         self._pieces: list[_Piece] = []
-        for number in range(len(problem.trials)):
-            block = trial_block(
-                problem, number, fit.point, fit.linearisations[number], candidate,
-                fit.residuals[number], precision,
-            )  # fmt: skip
-            factor = Cholesky.of(block.local)
-            inner = factor.solve(block.cross)
-            matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
-            np.add.at(gradient, block.index, block.shared_gradient - inner.T @ block.local_gradient)
+        for block, residual in zip(blocks, fit.residuals, strict=True):
             root = np.sqrt(block.precision)[:, np.newaxis]
-            own = factor.half(np.eye(len(block.local)))
+            own = block.factor.half(np.eye(len(block.local)))
             self._pieces.append(
                 _Piece(
-                    block.derivatives,
-                    own,
-                    inner.T,
-                    root,
-                    np.ascontiguousarray(fit.residuals[number].T) * root,
-                    own @ block.local_gradient,
-                    np.zeros(fit.residuals[number].size),
+                    block.derivatives, own, block.followed.T, root, np.ascontiguousarray(residual.T) * root,
+                    own @ block.local_gradient, np.zeros(residual.size),
                 )
-            )
-        self._inverse = Cholesky.of(matrix).half(np.eye(size))
+            )  # fmt: skip
+        self._size = problem.shared.size
+        self._inverse = Cholesky.of(matrix).half(np.eye(self._size))
         self._gradient = self._inverse @ gradient
-        self._size = size
 
     def change(self, term: Term, start: FloatArray) -> Change:
         """Return what a term does at scaled parameters, besides the effects of the fit."""

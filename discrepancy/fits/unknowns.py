@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.wrapped import initial_sizes
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -188,7 +187,7 @@ def global_unknowns(
     """
     prior = [campaign.parameters.get(item.name, (item.mean, item.deviation)) for item in model.parameters]
     used = {name for trial in trials for name in trial.channels}
-    names, centre, scale, precision = [], [], [], []
+    gains: list[tuple[str, float, float, float]] = []  # channel, centre, scale, precision
     fixed: dict[str, float] = {}
     for name, channel in campaign.channels.items():
         if name not in used:
@@ -198,26 +197,15 @@ def global_unknowns(
             if channel.quantity is Quantity.SIGNAL and not fixed:
                 fixed[name] = estimate  # it defines the scale of the release amplitudes
                 continue
-            names.append(name)
-            centre.append(estimate)
-            scale.append(max(abs(1.0 + estimate), 1e-12))
-            precision.append(0.0)
+            gains.append((name, estimate, max(abs(1.0 + estimate), 1e-12), 0.0))
         elif channel.gain_deviation > 0.0:
-            names.append(name)
-            centre.append(0.0)
-            scale.append(channel.gain_deviation)
-            precision.append(1.0)
-    return GlobalUnknowns(
-        parameter_mean=np.array([mean for mean, _ in prior], dtype=np.float64),
-        parameter_scale=np.array([deviation for _, deviation in prior], dtype=np.float64),
-        parameter_low=np.array([item.low for item in model.parameters], dtype=np.float64),
-        parameter_high=np.array([item.high for item in model.parameters], dtype=np.float64),
-        gain_channels=tuple(names),
-        gain_centre=np.array(centre, dtype=np.float64),
-        gain_scale=np.array(scale, dtype=np.float64),
-        gain_precision=np.array(precision, dtype=np.float64),
-        fixed_gain=fixed,
-    )
+            gains.append((name, 0.0, channel.gain_deviation, 1.0))
+    means, deviations = np.array(prior, dtype=np.float64).reshape(-1, 2).T
+    ranges = np.array([(item.low, item.high) for item in model.parameters], dtype=np.float64)
+    centre, scale, precision = np.array([item[1:] for item in gains], dtype=np.float64).reshape(-1, 3).T
+    names = tuple(name for name, *_ in gains)
+    low, high = ranges.reshape(-1, 2).T
+    return GlobalUnknowns(means, deviations, low, high, names, centre, scale, precision, fixed)
 
 
 def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray, model: Model) -> LocalUnknowns:
@@ -232,7 +220,7 @@ def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray, mode
         scale = release.deviation if release.at_rest else FREE_MOTION
         time_zero = release.time_zero_deviation
     elif trial.begins is Start.UNKNOWN:
-        sizes = initial_sizes(model, campaign, trial)
+        sizes = model.initial_sizes(campaign, trial)
         shape, scale = (-(-len(sizes) // 2), 2), FREE_MOTION
         sizes = np.pad(sizes, (0, len(sizes) % 2))
     uncertain = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation

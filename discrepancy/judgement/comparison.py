@@ -22,7 +22,6 @@ from discrepancy.missing_force.force import missing_force, told_force
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share
-from discrepancy.models.port_units import port_unit
 from discrepancy.search.starting_points import are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
@@ -97,14 +96,14 @@ class ByForce(Court[Explained]):
         """Return the unit of the force at the port of a hypothesis."""
         ports = self.force.ports
         places = [t.place for t in item.candidate.terms if t.place in ports]
-        return port_unit(places[0] if places else ports[next(iter(item.processes))], self.problem.model.inner)
+        return self.problem.model.port_unit(places[0] if places else ports[next(iter(item.processes))])
 
     def gap(self) -> str:
         """Return size and port of the missing force, and the variable that orders it."""
         missing = missing_force(self.force, self.force.best())
         if missing is None:
             return ""
-        told = told_force(missing, self.problem.model.inner)
+        told = told_force(missing, self.problem.model)
         order = said("verdict.not_ordered")
         if told.ordered_by:
             most = 100.0 * max(told.orders.values())

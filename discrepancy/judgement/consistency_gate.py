@@ -17,7 +17,8 @@ from scipy.stats import chi2, f
 from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.cholesky import Cholesky
-from discrepancy.fits.fitting import CandidateFit, trial_block
+from discrepancy.fits.elimination import trial_block
+from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.trial_data import TrialData
 from discrepancy.sentences import said
@@ -205,9 +206,7 @@ def _projected(
     weights = problem.precisions(fit.sums)
     for number, data in enumerate(problem.trials):
         residual = fit.residuals[number]
-        block = trial_block(
-            problem, number, fit.point, fit.linearisations[number], fit.candidate, residual, weights
-        )
+        block = trial_block(problem, number, fit, fit.candidate, weights)
         acting = np.array([k for k, item in enumerate(directions) if number in item], dtype=np.int64)
         extra = [problem.trials[number].standardised(directions[k][number]) for k in acting]
         weighted = [column * weights[data.groups] for column in extra]
@@ -221,7 +220,7 @@ def _projected(
         shared = np.block([[block.shared, between], [between.T, products]])
         along = np.array([np.vdot(residual, column) for column in weighted])
         index = np.concatenate((block.index, size + acting))
-        inner = Cholesky.of(block.local).solve(cross)
+        inner = block.factor.solve(cross)
         matrix[np.ix_(index, index)] += shared - cross.T @ inner
         np.add.at(
             gradient, index,

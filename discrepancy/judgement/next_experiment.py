@@ -18,7 +18,6 @@ from discrepancy.fits.cholesky import finite
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.models.wrapped import PatchedModel
 from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import Experiment
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass
@@ -106,7 +105,7 @@ def mutual_information(
     weights : (H,) ndarray
         Their probabilities, of sum one.
     """
-    model = PatchedModel(problem.model, proposal.added) if len(proposal.added) else problem.model
+    model = problem.model.patched(proposal.added) if len(proposal.added) else problem.model
     there = Problem(problem.campaign, model, problem.setting, (proposal.trial,), like=problem)
     data = there.trials[0]
     # without a record, what the most probable hypothesis left stands for the noise
@@ -117,8 +116,9 @@ def mutual_information(
     for item in fits:
         point = Point(item.point.shared, (np.zeros(data.unknowns.size),), item.point.effect)
         parts = there.linearise(0, point, item.candidate)
-        local, shared, index = there.jacobian(0, point, parts, item.candidate)
-        local, shared = local * noise_units, shared * noise_units
+        derivatives = there.derivatives(0, point, parts, item.candidate)
+        index = derivatives.index
+        local, shared = (part * noise_units for part in derivatives.dense())
         means.append(data.standardised(there.prediction(0, point, parts.response)).ravel() * noise_units)
         root = np.linalg.cholesky(item.covariance[np.ix_(index, index)] + 1e-12 * np.eye(len(index)))
         precision = np.maximum(data.unknowns.precision, 1e-4)  # a free zero is known to a hundred s0

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from discrepancy.fits.cholesky import Cholesky
-from discrepancy.fits.fitting import CandidateFit, trial_block
+from discrepancy.fits.elimination import trial_block
+from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import is_magnitude
 from discrepancy.sentences import said
@@ -86,13 +86,9 @@ def sizes_by_trial(problem: Problem, found: CandidateFit) -> list[SizeByTrial]:
     rows: list[list[tuple[str, float, float]]] = [[] for _ in found.candidate.terms]
     first = problem.shared.size
     for number, data in enumerate(problem.trials):
-        block = trial_block(
-            problem, number, found.point, found.linearisations[number], found.candidate,
-            found.residuals[number], precision,
-        )  # fmt: skip
-        inner = Cholesky.of(block.local).solve(np.column_stack((block.cross, block.local_gradient)))
-        matrix = block.shared - block.cross.T @ inner[:, :-1]
-        gradient = block.shared_gradient - block.cross.T @ inner[:, -1]
+        block = trial_block(problem, number, found, found.candidate, precision)
+        matrix = block.shared - block.cross.T @ block.followed
+        gradient = block.shared_gradient - block.followed.T @ block.local_gradient
         at = first
         for row, term in zip(rows, found.candidate.terms, strict=True):
             for place, item in enumerate(term.parameters):

@@ -110,8 +110,8 @@ class Columns:
         return Part(readings, added, forces)
 
     def _at_ports(self, trial: SeenTrial, laws: ModelPatch) -> list[tuple[int, PortForce]]:
-        names, model = trial.system.ports, self.problem.model.inner
-        forces = model.at_ports(laws) if hasattr(model, "at_ports") else laws
+        names, model = trial.system.ports, self.problem.model
+        forces = model.at_ports(laws)
         return [(names.index(law.port), law) for law in forces if isinstance(law, PortForce)]
 
     def _changed(self, number: int, patch: ModelPatch, trial: SeenTrial) -> FloatArray:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.models.interface import Model
-from discrepancy.models.port_units import port_unit
 from discrepancy.verdict import ForceAtPort, ForceMoment
 
 from .hypotheses import scaled
@@ -118,7 +117,7 @@ def told_force(missing: MissingForce, model: Model) -> ForceAtPort:
     k = int(np.abs(course.force).argmax())
     most = (float(item[k]) for item in (course.time, course.force, course.position, course.speed))
     return ForceAtPort(
-        missing.port, port_unit(missing.port, model), rms, displacement, velocity,
+        missing.port, model.port_unit(missing.port), rms, displacement, velocity,
         ForceMoment(course.trial, *most), missing.evidence, missing.correlation_time, by_variable,
         ordered_by, missing.law,
     )  # fmt: skip

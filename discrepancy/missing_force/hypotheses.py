@@ -12,7 +12,6 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import SHAPE_GAIN
 from discrepancy.fits.problem import Problem
-from discrepancy.models.wrapped import shows_ports
 from discrepancy.search_settings import SEARCH
 
 from .filtered import Process
@@ -32,9 +31,9 @@ LARGEST = 4.0
 
 def sees_forces(problem: Problem) -> bool:
     """Whether missing forces can be seen: in trials in motion, of a model that tells how its ports move."""
-    model = problem.model.inner
+    model = problem.model
     moving = any(data.trial.is_dynamic for data in problem.trials)
-    return moving and shows_ports(model) and bool(model.ports())
+    return moving and model.shows_ports and bool(model.ports())
 
 
 def key_of(candidate: Candidate) -> Key:

@@ -18,7 +18,6 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.models.wrapped import apart
 
 from .columns import Columns
 from .filtered import Process
@@ -150,7 +149,7 @@ class ForceSearch:
     """
 
     def __init__(self, problem: Problem) -> None:
-        linear, self.laws = apart(problem.model.inner)
+        linear, self.laws = problem.model.apart()
         trials = tuple(data.trial for data in problem.trials)
         self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]

@@ -104,7 +104,7 @@ class ForceShares:
         self._bare: dict[bool, tuple[View, list[Motion]]] = {}
         if held:
             problem = Problem(
-                campaign, search.problem.model.inner, search.problem.setting, held, like=search.problem
+                campaign, search.problem.model, search.problem.setting, held, like=search.problem
             )
             numbers = range(len(problem.trials))
             point = Point(search.point.shared, problem.start(search.whole.candidate).local, np.zeros(0))

@@ -236,7 +236,7 @@ def decaying_part(noise: NoiseModel, interval: float) -> tuple[float, float] | N
 
 def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     """Return a dynamic trial of a problem, linear about a point; its model must tell how ports move."""
-    data, model, campaign = problem.trials[number], problem.model.inner, problem.campaign
+    data, model, campaign = problem.trials[number], problem.model, problem.campaign
     trial, shared, unknowns = data.trial, problem.shared, data.unknowns
     parts = problem.linearise(number, point, Candidate())
     gains = 1.0 + shared.gains(point.shared, trial.channels)
@@ -273,7 +273,7 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
 
     def moving(of_all: FloatArray, local: FloatArray) -> FloatArray:
         conditions = unknowns.conditions(trial, shared.parameters(of_all), local)
-        return np.stack(model.port_motion(fine, conditions))  # type: ignore[attr-defined]
+        return np.stack(model.port_motion(fine, conditions))
 
     here, local = moving(point.shared, point.local[number]), point.local[number]
     by_unknowns = [
@@ -303,10 +303,10 @@ def _ported(
     problem: Problem, trial: Trial, outputs: Outputs, shared: FloatArray
 ) -> tuple[PortedSystem, list[PortedSystem | None]]:
     """Return how the ports of a trial move, and the derivatives of that by the shared unknowns."""
-    model, unknowns = problem.model.inner, problem.shared
+    model, unknowns = problem.model, problem.shared
 
     def system(u: FloatArray) -> PortedSystem:
-        return model.ported(trial, outputs, unknowns.parameters(u))  # type: ignore[attr-defined, no-any-return]
+        return model.ported(trial, outputs, unknowns.parameters(u))
 
     def slope(k: int) -> PortedSystem | None:
         above, below = (system(moved(shared, k, sign * SMALL)) for sign in (1.0, -1.0))

@@ -19,7 +19,6 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.interface import PortedSystem
-from discrepancy.models.wrapped import shows_ports
 from discrepancy.verdict import GapWindow, Moment
 
 from .events import GROUND, MOST_EVENTS, Events, changes, events
@@ -56,7 +55,7 @@ def gap_windows(
         Of the draw that restores what the fit has absorbed.
     """
     dynamic = tuple(item.trial for item in residuals.trials if item.trial.is_dynamic)
-    if not dynamic or not shows_ports(problem.model.inner):
+    if not dynamic or not problem.model.shows_ports:
         return residual_windows(residuals, seed=seed)
     try:
         found = _of_force(problem.with_trials(dynamic), fit)

@@ -45,11 +45,6 @@ class Course:
         key = (known, time.tobytes(), values.tobytes())
         return _courses.get(key, lambda: Course(time, values, known))
 
-    @staticmethod
-    def of_force(trial: Trial, gain: float = 0.0, tare: float = 0.0) -> "Course":
-        """Return the course of the force of a forced trial, see `acting_force`."""
-        return Course.of(trial.time, acting_force(trial, gain, tare), trial.hold)
-
     @property
     def edges(self) -> tuple[float, ...]:
         """Moments at which it jumps between the stamps: none."""
@@ -207,8 +202,8 @@ class Acting:
         Constant load.
     loads : sequence of Load
         What else pushes.
-    drives : sequence of Drive
-        Prescribed motions, in the order of `LinearSystem.drives`.
+    drives : mapping of str to Drive
+        Prescribed motions by their inputs, in the order of `LinearSystem.drives`.
     begins : Start
         How it began, where it was not released.
     initial : (L,) or (R, 2) ndarray
@@ -226,7 +221,7 @@ class Acting:
     time: FloatArray
     constant: FloatArray
     loads: Sequence[Load] = ()
-    drives: Sequence[Drive] = ()
+    drives: Mapping[str, Drive] = field(default_factory=dict)
     begins: Start = Start.SETTLED
     initial: FloatArray = field(default_factory=lambda: np.zeros(0))
     clock: tuple[float, float] = (0.0, 0.0)

@@ -69,6 +69,14 @@ class Steps(NamedTuple):
     time: FloatArray
     sample: IntArray
 
+    def between(self, first: int, last: int) -> "Steps":
+        """Return the steps between two boundaries, each of which is a sample."""
+        steps, boundaries = slice(first, last), slice(first, last + 1)
+        return self._replace(
+            which=self.which[steps], push=self.push[steps], begin=self.begin[steps], end=self.end[steps],
+            feed=self.feed[boundaries], time=self.time[boundaries], sample=np.arange(last - first + 1),
+        )  # fmt: skip
+
 
 class Structure(NamedTuple):
     """What moves: `coupled`, `stiffness` (M,), `damping` (M, M) and `rate` as in `Linear`; `known` memory."""

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from discrepancy.models.fmu_ports import SAFE_TURN
 from discrepancy.models.fmu_runs import FmuRuns, Run, State
 from discrepancy.models.fmu_trials import FmuPatch, FmuTrials, sampled
 from discrepancy.models.interface import (
-    NO_PATCH,
     Conditions,
     Outputs,
     PortedSystem,
@@ -22,14 +22,17 @@ from discrepancy.models.interface import (
     Response,
     Scales,
     campaign_sizes,
+)
+from discrepancy.models.model_file import DescribedModel
+from discrepancy.models.port_system import PortSystem
+from discrepancy.models.questions import (
     check_outputs,
     check_parameters,
     check_plain,
+    laws_at,
     prior_mean,
+    sorted_patch,
 )
-from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.patch_parts import laws_at, sorted_patch
-from discrepancy.models.port_system import PortSystem
 from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import (
     INTERNAL_FORCES,
@@ -70,7 +73,7 @@ class FmuModel(DescribedModel):
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description
         self.runs = FmuRuns(description, Path(folder))
-        super().__init__(description.name, description.parameter, description.port, self.runs.quantities)
+        super().__init__(description, self.runs.quantities)
         self._trials = FmuTrials(description, self.runs)
         self._check_settings()
         means = Conditions(np.array([item.mean for item in self.parameters]))
@@ -121,6 +124,8 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ what it is
 
+    shows_ports: ClassVar[bool] = True
+
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
         description, forces = self.description, bool(self.description.inputs.forces)
@@ -139,7 +144,7 @@ class FmuModel(DescribedModel):
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
-        given, conditions = self.description.scales, Conditions(prior_mean(campaign, self.parameters))
+        given, conditions = self.description.scales, Conditions(prior_mean(campaign, self.declared))
         largest = np.zeros(len(self.ports()))
         for trial in campaign.trials:
             if trial.is_dynamic:
@@ -188,8 +193,8 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ response
 
-    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial, see `Model.respond`; `transverse` and `shear` are never known.
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
+        """Return the response of a trial; `transverse` and `shear` are never known.
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
@@ -203,34 +208,32 @@ class FmuModel(DescribedModel):
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
             return Response(self._at_rest_values(trial, conditions, parts)[:, columns])
-        values, step = self._moving(trial, conditions, parts, columns)
-        rate, zero = conditions.clock
-        quantities = self.runs.quantities
-        derivatives = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
-        return sampled(values[:, columns], step, (1.0 + rate) * trial.time + zero, derivatives)
+        return self._moving(trial, conditions, parts, columns, self._orders(outputs))
 
     def _moving(
         self,
         trial: Trial,
         conditions: Conditions,
         patch: FmuPatch,
-        columns: Sequence[int] = (),
-    ) -> tuple[FloatArray, float]:
-        """Return all outputs (K, C) on the grid of the communication step [s], and the step."""
+        columns: Sequence[int],
+        orders: Sequence[int],
+    ) -> Response:
+        """Return columns of the FMU's outputs at the samples of a dynamic trial, derived so many times."""
 
         def excite(refined: int) -> Run:
             return self._trials.run(trial, conditions, patch, self.motion, refined)
 
         if len(patch.laws):
-            return self.motion.with_laws(patch.laws, excite, trial, conditions.refinement, columns)
-        run = excite(conditions.refinement)
-        return self.motion.free(run), run.step
+            values, step = self.motion.with_laws(patch.laws, excite, trial, conditions.refinement, columns)
+        else:
+            run = excite(conditions.refinement)
+            values, step = self.motion.free(run), run.step
+        rate, zero = conditions.clock
+        return sampled(values[:, columns], step, (1.0 + rate) * trial.time + zero, orders)
 
     # ------------------------------------------------------------ ports
 
-    def ported(
-        self, trial: Trial, outputs: Outputs, parameters: FloatArray, patch: ModelPatch = NO_PATCH
-    ) -> PortedSystem:
+    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the state of that of the prior means.
 
         Raises
@@ -238,17 +241,15 @@ class FmuModel(DescribedModel):
         ModelError
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
-        means = np.array([item.mean for item in self.parameters])
-        settings = self._parts(patch).settings
+        means = np.array([item.mean for item in self.declared])
+        settings = self._parts(self.patch).settings
         base, found = (self._port_system(trial, values, settings) for values in (means, parameters))
         if base is None or found is None or len(base.transition) != len(found.transition):
             raise ModelError(
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
                 "move; it is not linear, or they are too few or too rough."
             )
-        quantities = self.runs.quantities
-        orders = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
-        shown = list(zip(self._columns(outputs), orders, strict=True))
+        shown = list(zip(self._columns(outputs), self._orders(outputs), strict=True))
         return found.in_state_of(base).ported(self.ports(), self.motion.ports.x, self.motion.ports.v, shown)
 
     def _port_system(
@@ -264,15 +265,10 @@ class FmuModel(DescribedModel):
                 return found
         return None
 
-    def port_motion(
-        self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
-    ) -> tuple[FloatArray, FloatArray]:
+    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        parts = self._parts(patch)._replace(laws=NO_LAWS)
-        values, step = self._moving(trial, conditions, parts)
-        rate, zero = conditions.clock
-        moved = values[:, self.motion.ports.x]
-        found = sampled(moved, step, (1.0 + rate) * trial.time + zero, [0] * len(self.ports()))
+        parts = self._parts(self.patch)._replace(laws=NO_LAWS)
+        found = self._moving(trial, conditions, parts, self.motion.ports.x, [0] * len(self.ports()))
         assert found.rates is not None  # of a motion there are
         return found.values, found.rates
 
@@ -319,6 +315,10 @@ class FmuModel(DescribedModel):
     def _columns(self, outputs: Outputs) -> list[int]:
         check_outputs(f"The FMU model {self.name!r}", self, outputs, self.quantities)
         return [self.runs.columns[output] for output, _ in outputs]
+
+    def _orders(self, outputs: Outputs) -> list[int]:
+        """Return how often each output is derived."""
+        return [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
 
 
 def _any_trial(kind: TrialKind, interval: float) -> Trial:

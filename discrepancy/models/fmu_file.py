@@ -10,6 +10,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.model_file import (
     ModelDescription,
     Name,
+    NamedSection,
     Number,
     ParameterSection,
     Positive,
@@ -120,26 +121,23 @@ class ReleaseOf(Section):
         return self
 
 
-class InputOf(Section):
+class InputOf(NamedSection):
     """`[[input]]`: an input that static trials hold in each row; `name` as in the campaign."""
 
-    name: Name
     variable: Name | None = None
     quantity: Quantity = Quantity.SIGNAL
 
 
-class OutputOf(Section):
+class OutputOf(NamedSection):
     """`[[output]]`: what a channel's `output` names; `{a..b}` stands for all numbers from a to b."""
 
-    name: Name
     variable: Name | None = None
     quantity: Quantity = Quantity.DISPLACEMENT
 
 
-class PortOf(Section):
+class PortOf(NamedSection):
     """`[[port]]`: where an internal force can act; `rotation`: a moment and an angle."""
 
-    name: Name
     force: Name
     displacement: Name
     velocity: Name | None = None

@@ -13,7 +13,7 @@ from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_ports import LINEAR, FmuPorts
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State, is_affine
 from discrepancy.models.linear_system import solved
-from discrepancy.models.port_coupling import LawStepper, coupled_motion
+from discrepancy.models.port_coupling import coupled_motion, stepper
 from discrepancy.models.port_system import PortSystem
 from fe.runtime.motion import Laws
 from fmu_asset.door.session import FmiAsset
@@ -432,8 +432,7 @@ class FmuMotion:
         gain = self._runs.remembered(
             ("gain", *run[:2]), lambda: self.ports.records(run.state, run.step, 1)[0]
         )[self.ports.v]
-        push = (free[1] - free[0])[self.ports.v] / run.step
-        stepper = LawStepper(laws, port_of, gain, run.step, free[0, self.ports.x], push)
+        forces = stepper(laws, port_of, gain, run.step, free[:2, self.ports.x], free[:2, self.ports.v])
         asset, first, histories = self._begin(run)
         values = np.empty((run.steps + 1, len(first)))
         values[0] = first
@@ -442,6 +441,6 @@ class FmuMotion:
         at = [names.index(name) for name in self.ports.forces]
         for k in range(run.steps):
             now = rows[k].copy()
-            np.add.at(now, at, stepper.forces(values[k, self.ports.x], values[k, self.ports.v]))
+            np.add.at(now, at, forces(values[k, self.ports.x], values[k, self.ports.v]))
             values[k + 1] = self._runs.stepped(asset, dict(zip(names, now.tolist(), strict=True)))
         return values

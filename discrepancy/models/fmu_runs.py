@@ -1,7 +1,7 @@
 """Runs of an FMU for a model: an instance for each step size, kept and reset; results are remembered."""
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from math import pi
@@ -110,22 +110,25 @@ class FmuRuns:
     def __init__(self, description: FmuModelDescription, folder: Path) -> None:
         self._description = description
         self._path = folder / description.fmu
-        self._assets: OrderedDict[float, FmiAsset] = OrderedDict()
+        self._assets = Memory(MOST_INSTANCES, end=FmiAsset.close)
         self._kept = Memory(KEPT_BYTES, lambda found: found.nbytes)
         self.run_count = self.step_count = 0
-        try:
-            self._base = self._base_binding(folder)
+        with self._refusals():
+            file = binding_file(description, folder)
+            self._base = None if file is None else load_binding(file)
             self._binding = self._made_binding()
             self._first = FmiAsset(self._path, self._binding, isolated=description.isolated)
-        except FmuError as cause:
-            raise ModelError(f"The FMU model {description.name!r}: {cause}") from cause
         self._none = dict.fromkeys(self._first.binding.load, 0.0)
 
-    # ------------------------------------------------------------ names
+    @contextmanager
+    def _refusals(self) -> Iterator[None]:
+        """Say of which model it is what the FMU refuses."""
+        try:
+            yield
+        except FmuError as cause:
+            raise ModelError(f"The FMU model {self._description.name!r}: {cause}") from cause
 
-    def _base_binding(self, folder: Path) -> Binding | None:
-        file = binding_file(self._description, folder)
-        return None if file is None else load_binding(file)
+    # ------------------------------------------------------------ names
 
     def variable(self, name: str) -> str:
         """Return the FMU's name of an input or output that the description names."""
@@ -249,21 +252,17 @@ class FmuRuns:
 
     def open(self, step: float) -> FmiAsset:
         """Return the instance of a step size [s], as it was left."""
-        asset = self._assets.get(step)
-        if asset is not None:
-            self._assets.move_to_end(step)
-            return asset
-        header = self._binding.binding.model_copy(update={"step_size": step})
-        binding = self._binding.model_copy(update={"binding": header})
-        asset = self._assets[step] = FmiAsset(self._path, binding, isolated=self._description.isolated)
-        if len(self._assets) > MOST_INSTANCES:
-            self._assets.popitem(last=False)[1].close()
-        return asset
+
+        def opened() -> FmiAsset:
+            header = self._binding.binding.model_copy(update={"step_size": step})
+            binding = self._binding.model_copy(update={"binding": header})
+            return FmiAsset(self._path, binding, isolated=self._description.isolated)
+
+        return self._assets.get(step, opened)
 
     def close(self) -> None:
         """End all instances; they are opened again when they are needed."""
-        while self._assets:
-            self._assets.popitem()[1].close()
+        self._assets.clear()
 
     def inputs(self, state: State, more: Mapping[str, float] = MappingProxyType({})) -> dict[str, float]:
         """Return all inputs in a state, by the FMU's names, with more on some of them."""
@@ -292,12 +291,10 @@ class FmuRuns:
             If the FMU refuses, or does not come to rest.
         """
         self.run_count += 1
-        try:
+        with self._refusals():
             asset = self.open(step)
             asset.reset(parameters, load=inputs or None)
             values = np.array(asset.observe().values)
-        except FmuError as cause:
-            raise ModelError(f"The FMU model {self._description.name!r}: {cause}") from cause
         return asset, self._settled(asset, step) if settle else values
 
     def _settled(self, asset: FmiAsset, step: float) -> FloatArray:
@@ -316,30 +313,24 @@ class FmuRuns:
                 worst = int(np.argmax((high - low) / np.where(largest > 0.0, largest, 1.0)))
                 raise ModelError(
                     f"The FMU {self._path} did not come to rest within {rest.limit:g} s: the output "
-                    f"{self._name(worst)!r} still moves by {high[worst] - low[worst]:.2g}; raise `limit` or "
-                    f"`tolerance` in [static], or give the FMU's parameters for a state at rest there."
+                    f"{self._binding.observation_variables[worst]!r} still moves by "
+                    f"{high[worst] - low[worst]:.2g}; raise `limit` or `tolerance` in "
+                    "[static], or give the FMU's parameters for a state at rest there."
                 )
-
-    def _name(self, column: int) -> str:
-        return self._binding.observation_variables[column]
 
     def advanced(
         self, asset: FmiAsset, histories: Mapping[str, FloatArray | float], steps: int
     ) -> FloatArray:
         """Return the outputs (steps, C) at the ends of steps, inputs held in each; raises `ModelError`."""
         self.step_count += steps
-        try:
+        with self._refusals():
             return asset.simulate(load=histories, steps=steps).values
-        except FmuError as cause:
-            raise ModelError(f"The FMU model {self._description.name!r}: {cause}") from cause
 
     def stepped(self, asset: FmiAsset, inputs: Mapping[str, float]) -> FloatArray:
         """Return the outputs (C,) after one step; `ModelError` if the FMU refuses."""
         self.step_count += 1
-        try:
+        with self._refusals():
             return asset.step(load=inputs).values
-        except FmuError as cause:
-            raise ModelError(f"The FMU model {self._description.name!r}: {cause}") from cause
 
     def input_limit(self, name: str) -> float:
         """Return the largest size that an input may have, both signs."""

@@ -13,8 +13,8 @@ from discrepancy.models.acting import Course, acting_force
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Run, State
-from discrepancy.models.interface import Conditions, Response, place_among, release_of
-from discrepancy.models.patch_parts import LoadChange
+from discrepancy.models.interface import Conditions, Response
+from discrepancy.models.questions import LoadChange, place_among, release_of
 from fe.runtime.motion import NO_LAWS, Laws
 
 SLOPES = (
@@ -116,7 +116,8 @@ class FmuTrials:
     def _forced(
         self, trial: Trial, patch: FmuPatch, step: float, steps: int
     ) -> list[tuple[Excitation, float]]:
-        begins, ends = Course.of_force(trial).ends(np.linspace(0.0, steps * step, steps + 1))
+        course = Course.of(trial.time, trial.force, trial.hold)
+        begins, ends = course.ends(np.linspace(0.0, steps * step, steps + 1))
         held, first = 0.5 * (begins + ends), float(trial.force[0])
         on = ((begins != 0.0) | (ends != 0.0)).astype(float)
         loads = []

@@ -1,19 +1,22 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import ClassVar, Self
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Release, Start, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
-from fe.runtime.patch import ModelPatch, Primitive
-from reporting.words import counted
+from discrepancy.models.memory import Memory
+from fe.runtime.patch import SENSORS, ModelPatch, PortForce, Primitive
 
 Place = str | tuple[float, float]
-DEFAULT_PLACE = "tip_load"
-"""What a campaign says when it does not say where the force acts; a model with one input takes that one."""
+KEPT = 400
+"""Responses that a model keeps; the oldest goes first."""
 
 
 @dataclass(frozen=True)
@@ -237,31 +240,112 @@ Outputs = tuple[tuple[str, Quantity], ...]
 NO_PATCH = ModelPatch()
 
 
-class Model(Protocol):
-    """A model that can be patched."""
+class Model(ABC):
+    """A model that can be patched.
 
-    @property
-    def name(self) -> str:
-        """Name for people."""
+    Parameters
+    ----------
+    name : str
+        For people.
+    parameters : tuple of ModelParameter
+        Calibrated parameters.
 
-    @property
-    def parameters(self) -> tuple[ModelParameter, ...]:
-        """Calibrated parameters."""
+    Attributes
+    ----------
+    patch : ModelPatch
+        What is added to every question: a known addition, or an effect that was found.
+    follows_windows : bool
+        Whether it can follow laws that act in windows only.
+    shows_ports : bool
+        Whether it tells how its ports move (`ported` and `port_motion`).
+    """
 
+    name: str
+    parameters: tuple[ModelParameter, ...]
+    patch: ModelPatch = NO_PATCH
+    follows_windows: ClassVar[bool] = False
+    shows_ports: ClassVar[bool] = False
+    _declared: tuple[ModelParameter, ...] | None = None
+    _kept: Memory | None = None
+
+    def __init__(self, name: str, parameters: tuple[ModelParameter, ...]) -> None:
+        self.name, self.parameters = name, parameters
+
+    # ------------------------------------------------------------ what each model says
+
+    @abstractmethod
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""
 
+    @abstractmethod
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive; sensors are not asked for: they need no model."""
 
+    @abstractmethod
+    def scales(self, campaign: Campaign) -> Scales:
+        """Return the natural scales under a campaign, without what is added."""
+
+    @abstractmethod
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
+        """Return the response of a trial under a patch that holds what is added, see `respond`."""
+
     def ports(self) -> tuple[str, ...]:
         """Names of the ports where internal forces can act on one motion; user effects act at these."""
+        return ()
 
     def stations(self) -> tuple[float, float] | None:
         """Return the least and largest station [m] along the structure, None if it has no length."""
+        return None
 
-    def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign."""
+    def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
+        """Return natural sizes (L,) of the state at the begin of a trial; empty: it is never unknown."""
+        return np.zeros(0)
+
+    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
+        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
+        raise NotImplementedError
+
+    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+        """Return what `ported` does."""
+        raise NotImplementedError
+
+    def at_ports(self, forces: ModelPatch) -> ModelPatch:
+        """Return forces as they act at the ports of `ported`."""
+        return forces
+
+    def turns(self, port: str) -> bool | None:
+        """Return whether a port turns; None where the model does not say it."""
+        return None
+
+    def unit_of_state(self, port: str) -> str:
+        """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
+        return ""
+
+    # ------------------------------------------------------------ what all models do alike
+
+    @property
+    def oscillates(self) -> bool:
+        """Whether it has a mode that vibrates."""
+        return True
+
+    @property
+    def sensors(self) -> ModelPatch:
+        """Sensors that are built in, for channels or for outputs of those names.
+
+        They are no part of its responses: `discrepancy.models.sensing.observe` applies them, since what
+        sensors show of a response depends on all of them together.
+        """
+        return self.patch.of(*SENSORS)
+
+    @property
+    def has_law(self) -> bool:
+        """Whether it has a law of a port of its own, such as one that was found."""
+        return len(self.patch.of(PortForce)) > 0
+
+    @property
+    def declared(self) -> tuple[ModelParameter, ...]:
+        """Calibrated parameters as they are without what is added."""
+        return self.parameters if self._declared is None else self._declared
 
     def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial; sensor primitives in `patch` are ignored here.
@@ -288,77 +372,69 @@ class Model(Protocol):
         ModelError
             If the model lacks an output or cannot carry a primitive.
         """
+        if self._kept is None:
+            return self._respond(trial, outputs, self.patch + patch, conditions)
 
+        def answer() -> tuple[Trial, Response]:  # the trial lives as long, so that its id stays its own
+            return trial, self._respond(trial, outputs, self.patch + patch, conditions)
 
-def prior_mean(campaign: Campaign, parameters: Sequence[ModelParameter]) -> FloatArray:
-    """Return the means (P,) of parameters, those of the campaign where it says them."""
-    return np.array([campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in parameters])
+        key = (id(trial), outputs, patch.primitives, conditions.key)
+        return self._kept.get(key, answer)[1]
 
+    def ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+        """Return the system by which outputs see missing forces, see `PortedSystem`.
 
-def check_parameters(what: str, parameters: Sequence[ModelParameter], values: FloatArray) -> None:
-    """Refuse values of another number than a model, `what`, has parameters."""
-    if values.shape != (len(parameters),):
-        raise ModelError(f"{what} has {counted(len(parameters), 'parameter')}, but {values.size} came.")
-
-
-def check_outputs(what: str, model: Model, outputs: Outputs, known: Iterable[str]) -> None:
-    """Refuse outputs that a model, `what`, does not have beside those `known`, or no channel can measure."""
-    for output, quantity in outputs:
-        own = model.output_quantity(output)
-        if own is None:
-            raise ModelError(f"{what} has no output {output!r}; it has {', '.join(known)}.")
-        if not quantity.shows(own):
+        Raises
+        ------
+        ModelError
+            If sensors are built in: what they make of a missing force is not known here.
+        """
+        if len(self.sensors):
             raise ModelError(
-                f"{what}: the output {output!r} is a {own.value}, but a channel measures {quantity.value}."
+                f"{self.name} has sensors built in, through which no missing force is seen; leave them out."
             )
+        return self._ported(trial, outputs, parameters)
 
+    def remembering(self) -> Self:
+        """Return the model as one that keeps responses: sensors are tried by the dozen on one motion."""
+        return self if self._kept is not None else self._changed(_kept=Memory(KEPT))
 
-def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:
-    """Return the load place of a model, `what`, that a trial means: the only one where it says none.
+    def patched(
+        self, patch: ModelPatch, calibrated: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    ) -> Self:
+        """Return the model with a patch added to every question.
 
-    Raises
-    ------
-    ModelError
-        If there is no such place, or none is named of several.
-    """
-    if place == DEFAULT_PLACE and place not in places and len(places) == 1:
-        return places[0]
-    if not isinstance(place, str) or place not in places:
-        said = "no load_place is said" if place == DEFAULT_PLACE else f"the load place is {place!r}"
-        known = f"forces at {', '.join(places)}: name one of these" if places else "no force"
-        raise ModelError(f"In {where} {said}, and {what} takes {known}.")
-    return place
-
-
-def release_of(trial: Trial) -> Release:
-    """Return how a ring-down began; raises `ModelError` where it does not say it."""
-    if trial.release is None:
-        raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
-    return trial.release
-
-
-def check_no_inputs(trial: Trial, what: str) -> None:
-    """Refuse a static trial under other inputs than a force, for a model that has none."""
-    if trial.kind is TrialKind.STATIC and trial.inputs:
-        names = ", ".join(repr(item.name) for item in trial.inputs)
-        raise ModelError(
-            f"The trial {trial.name!r} is static under the inputs {names}, which {what} does not have at "
-            'rest: describe the asset as an FMU model with [[input]], or record the trial as "driven".'
+        Parameters
+        ----------
+        patch : ModelPatch
+            What is added; its sensors name channels of a campaign, or outputs of the model, and come before
+            those of a question.
+        calibrated : mapping of str to (float, float)
+            Mean and standard deviation of calibrated parameters, where they are not those of the model.
+        """
+        parameters = tuple(
+            replace(item, mean=mean, deviation=deviation)
+            for item in self.parameters
+            for mean, deviation in [calibrated.get(item.name, (item.mean, item.deviation))]
+        )
+        return self._changed(
+            patch=self.patch + patch, parameters=parameters, _declared=self.declared, _kept=None
         )
 
+    def apart(self) -> tuple[Self, ModelPatch]:
+        """Return the model without laws at its ports, and these at the prior means."""
+        laws = self.patch.of(PortForce)
+        rest = ModelPatch(tuple(item for item in self.patch if not isinstance(item, PortForce)))
+        return self._changed(patch=rest, _kept=None), laws
 
-def check_lumped(trial: Trial, what: str) -> None:
-    """Refuse a flight, and a static trial under other inputs than a force, for a model without either."""
-    if trial.kind is TrialKind.FLIGHT:
-        raise ModelError(f"The trial {trial.name!r} is a flight, but {what} has no lift; leave it out.")
-    check_no_inputs(trial, what)
+    def port_unit(self, port: str) -> str:
+        """Return the unit of a force: "N", "N m", both where the model does not say it, or that of a flow."""
+        if state := self.unit_of_state(port):
+            return f"{state}/s times capacity"
+        return {True: "N m", False: "N", None: "N or N m"}[self.turns(port)]
 
-
-def check_plain(trial: Trial, what: str) -> None:
-    """Refuse a driven trial, and a forced one that is not settled, for a model that cannot follow them."""
-    if trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED:
-        came = "is driven" if trial.kind is TrialKind.DRIVEN else f"begins {trial.begins.value}"
-        raise ModelError(
-            f"The trial {trial.name!r} {came}, which {what} cannot follow: describe the rig as a lumped "
-            "model, or record it forced from rest."
-        )
+    def _changed(self, **attributes: object) -> Self:
+        """Return the model with other attributes."""
+        found = copy(self)
+        vars(found).update(attributes)
+        return found

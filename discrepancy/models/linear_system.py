@@ -308,7 +308,7 @@ class LinearSystem:
     def forces_at(self, acting: Acting, time: FloatArray) -> FloatArray:
         """Return the modal forces (T, M) of loads and drives at times."""
         total = acting.load_at(time, self.shapes)
-        for number, drive in enumerate(acting.drives):
+        for number, drive in enumerate(acting.drives.values()):
             for order, part in enumerate(self.driven(number)):
                 total -= np.outer(drive.at(time, order), part)
         return np.asarray(total)

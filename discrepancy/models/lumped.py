@@ -2,30 +2,35 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
+from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import (
-    NO_PATCH,
     Conditions,
     Outputs,
     PortedSystem,
     Response,
     Scales,
-    check_lumped,
-    check_outputs,
-    check_parameters,
-    prior_mean,
 )
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped
 from discrepancy.models.lumped_rig import LumpedRig
 from discrepancy.models.lumped_scales import lumped_scales, state_sizes
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.patch_parts import LoadChange, SortedPatch, laws_at, sorted_patch
+from discrepancy.models.questions import (
+    LoadChange,
+    SortedPatch,
+    check_lumped,
+    check_outputs,
+    check_parameters,
+    laws_at,
+    prior_mean,
+    sorted_patch,
+)
 from fe.runtime.laws import LAWS
 from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.patch import (
@@ -64,8 +69,7 @@ class LumpedModel(DescribedModel):
 
     def __init__(self, description: LumpedDescription) -> None:
         self.description = description
-        quantities = {item.name: item.quantity for item in description.output}
-        super().__init__(description.name, description.parameter, description.port, quantities)
+        super().__init__(description, {item.name: item.quantity for item in description.output})
         self._ports = {item.name: np.array(item.vector) for item in description.port}
         self._stations = sorted(place.station for place in description.place)
         self._rigs = Memory(KEPT_RIGS)
@@ -96,6 +100,7 @@ class LumpedModel(DescribedModel):
         return primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(self._ports))
 
     follows_windows: ClassVar[bool] = True
+    shows_ports: ClassVar[bool] = True
 
     def stations(self) -> tuple[float, float] | None:
         """Return the least and largest station [m] of the places, None without places."""
@@ -103,13 +108,13 @@ class LumpedModel(DescribedModel):
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
-        mean = prior_mean(campaign, self.parameters)
+        mean = prior_mean(campaign, self.declared)
         return lumped_scales(self.rig(mean), mean, campaign, self.stations())
 
     # ------------------------------------------------------------ response
 
-    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial, see `Model.respond`; `transverse` and `shear` are never known.
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
+        """Return the response of a trial; `transverse` and `shear` are never known.
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
@@ -125,8 +130,8 @@ class LumpedModel(DescribedModel):
                 )
             return self._static(trial, outputs, structure, laws, change, conditions)
         rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
-        motion, drives = rig.moved(trial, conditions, laws, change, loads)
-        return motion.seen(rig.shown(outputs, drives, motion.acting.references))
+        motion = rig.moved(trial, conditions, laws, change, loads)
+        return motion.seen(rig.shown(outputs, motion.acting))
 
     def _static(
         self,
@@ -167,38 +172,67 @@ class LumpedModel(DescribedModel):
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
-        mean = prior_mean(campaign, self.parameters)
+        mean = prior_mean(campaign, self.declared)
         return state_sizes(self.rig(mean), campaign, trial, Conditions(mean))
 
     # ------------------------------------------------------------ ports
 
-    def ported(
-        self, trial: Trial, outputs: Outputs, parameters: FloatArray, patch: ModelPatch = NO_PATCH
-    ) -> PortedSystem:
+    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the modes of the prior means."""
-        warm, structure = float(trial.temperature[0]), self._parts(patch).structure
+        warm, structure = float(trial.temperature[0]), self._parts(self.patch).structure
         rig = self.rig(parameters, structure, warm)
-        drives = rig.acting(trial, Conditions(parameters))[1]
-        base = self.rig(self._mean, structure, warm).system(drives)
-        return rig.system(drives).seen_by(rig.shown(outputs, drives), base.shapes)
+        acting = rig.acting(trial, Conditions(parameters))
+        base = self.rig(self._mean, structure, warm).system(tuple(acting.drives))
+        return rig.system(tuple(acting.drives)).seen_by(rig.shown(outputs, acting), base.shapes)
 
-    def port_motion(
-        self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
-    ) -> tuple[FloatArray, FloatArray]:
+    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        structure, _, change, loads = self._parts(patch.in_trial(trial.name))
+        structure, _, change, loads = self._parts(self.patch.in_trial(trial.name))
         rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
-        motion, _ = rig.moved(trial, conditions, NO_LAWS, change, loads)
+        motion = rig.moved(trial, conditions, NO_LAWS, change, loads)
         rows = np.array(list(motion.system.ports.values())).reshape(-1, rig.width)
         shapes = rows @ motion.system.all_shapes
         return motion.q @ shapes.T, motion.velocity @ shapes.T
 
-    def apart(self) -> "tuple[LumpedModel, ModelPatch]":
+    @property
+    def has_law(self) -> bool:
+        """Whether it has a law of a port of its own, in its file or found."""
+        return bool(self.description.law) or super().has_law
+
+    def apart(self) -> tuple[Self, ModelPatch]:
         """Return the linear model, and the laws that it has beside that, at the prior means."""
-        if not self.description.law:
-            return self, NO_PATCH
-        linear = self.description.model_copy(update={"law": []})
-        return LumpedModel(linear), self.description.own_laws(self._factors(self._mean))
+        linear, laws = super().apart()
+        description = self.description.model_copy(update={"law": []})
+        own = self.description.own_laws(self._factors(self._mean))
+        return linear._changed(description=description, _rigs=Memory(KEPT_RIGS)), own + laws
+
+    def unit_of_state(self, port: str) -> str:
+        """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
+        first = self.description.size
+        if not np.any(self._ports.get(port, np.zeros(0))[first:]):
+            return ""
+        shown = {
+            item.quantity for item in self.description.output if item.vector and any(item.vector[first:])
+        }
+        return UNITS[shown.pop()].si if len(shown) == 1 else "of the state's unit"
+
+    def turns(self, port: str) -> bool | None:
+        """Return whether a port turns; None where the model does not say it.
+
+        It moves or turns as the unknowns do of which it is a sum or difference, and these as what is measured
+        or prescribed of them.
+        """
+        vector = self._ports.get(port)
+        if vector is None or not np.all(np.isin(vector, (-1.0, 0.0, 1.0))):
+            return None
+        told: dict[int, set[bool]] = {}
+        known = [(item.vector, item.quantity.moving) for item in self.description.output]
+        known += [(item.vector, item.quantity.moving) for item in self.description.input]
+        for row, moving in known:
+            if row is not None and moving and np.count_nonzero(row) == 1 and max(row) == 1.0:
+                told.setdefault(int(np.argmax(row)), set()).add(Quantity.ANGLE in moving)
+        kinds = set().union(*(told.get(int(at), {True, False}) for at in np.flatnonzero(vector)))
+        return kinds.pop() if len(kinds) == 1 else None
 
     # ------------------------------------------------------------ parts
 
@@ -207,7 +241,7 @@ class LumpedModel(DescribedModel):
 
     @property
     def _mean(self) -> FloatArray:
-        return np.array([item.mean for item in self.parameters])
+        return np.array([item.mean for item in self.declared])
 
     def rig(
         self, parameters: FloatArray, structure: tuple[Primitive, ...] = (), temperature: float = 0.0

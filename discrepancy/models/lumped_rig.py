@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 from scipy.linalg import eigh
@@ -20,11 +19,11 @@ from discrepancy.models.acting import (
     acting_force,
     order_of,
 )
-from discrepancy.models.interface import Conditions, Place, place_among, release_of
+from discrepancy.models.interface import Conditions, Place
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
 from discrepancy.models.lumped_sections import InputSection
-from discrepancy.models.patch_parts import LoadChange
+from discrepancy.models.questions import LoadChange, place_among, release_of
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import PointMass, PortLoad, Primitive, RootCompliance, course_of
@@ -182,10 +181,8 @@ class LumpedRig:
 
     # ------------------------------------------------------------ trials
 
-    def acting(
-        self, trial: Trial, conditions: Conditions, change: LoadChange = UNCHANGED
-    ) -> tuple[Acting, tuple[str, ...]]:
-        """Return what acts in a dynamic trial, and the inputs whose motion is prescribed.
+    def acting(self, trial: Trial, conditions: Conditions, change: LoadChange = UNCHANGED) -> Acting:
+        """Return what acts in a dynamic trial.
 
         Every motion that an input can prescribe and that the trial does not record is held at zero, if an
         output is its reaction; else it is free.
@@ -200,7 +197,7 @@ class LumpedRig:
             release = (row, release_of(trial))
             return Acting(
                 trial.time, self._constant, initial=initial, clock=conditions.clock, release=release
-            ), ()
+            )
         recorded = self.recorded(trial)
         loads, drives, references = list[Load](), dict[str, Drive](), dict[str, Sequence[Load]]()
         offsets = (*conditions.offset, *(0.0,) * len(recorded))
@@ -232,11 +229,10 @@ class LumpedRig:
         for name, section in self._inputs.items():
             if section.quantity.moving and name in reactions and name not in named:
                 drives[name] = Drive.of(trial.time, np.zeros(len(trial.time)))
-        acts = Acting(
-            trial.time, self._constant, loads, tuple(drives.values()), trial.begins,
+        return Acting(
+            trial.time, self._constant, loads, drives, trial.begins,
             conditions.initial.ravel(), conditions.clock, references,
         )  # fmt: skip
-        return acts, tuple(drives)
 
     def recorded(self, trial: Trial) -> tuple[RecordedInput, ...]:
         """Return the recorded inputs of a trial; of one under a force this at its place."""
@@ -288,8 +284,8 @@ class LumpedRig:
         at_ports: Sequence[PortLoad] = (),
         *,
         still: bool = False,
-    ) -> tuple[Motion, tuple[str, ...]]:
-        """Return the motion of a dynamic trial, and the inputs whose motion is prescribed; `still`: at rest.
+    ) -> Motion:
+        """Return the motion of a dynamic trial; `still`: begun at rest.
 
         Raises
         ------
@@ -298,15 +294,15 @@ class LumpedRig:
         """
         if trial.kind is TrialKind.RINGDOWN:
             self._check_released(trial, at_ports)
-        acting, drives = self.acting(trial, conditions, change)
-        system = self.system(drives)
+        acting = self.acting(trial, conditions, change)
+        system = self.system(tuple(acting.drives))
         if at_ports:
             pushed = [self._at_port(item, system) for item in at_ports]
             acting = replace(acting, loads=[*acting.loads, *pushed])
         if still:
             acting = replace(acting, begins=Start.STILL)
         try:
-            return system.motion(acting, laws, conditions.refinement), drives
+            return system.motion(acting, laws, conditions.refinement)
         except ModelError as cause:
             name = self.description.name
             raise ModelError(f"The trial {trial.name!r} of {name!r}: {cause}") from cause
@@ -348,14 +344,10 @@ class LumpedRig:
         shape = self.system().flexibility(row)
         return np.asarray(trial.release.displacement / float(row @ shape) * shape)[None]
 
-    def shown(
-        self,
-        outputs: Sequence[tuple[str, Quantity]],
-        drives: Sequence[str] = (),
-        references: Mapping[str, Sequence[Load]] = MappingProxyType({}),
-    ) -> list[Shown]:
-        """Return what each output shows of a system with some motions prescribed."""
+    def shown(self, outputs: Sequence[tuple[str, Quantity]], acting: Acting | None = None) -> list[Shown]:
+        """Return what each output shows under what acts; None: at rest."""
         known = {item.name: item for item in self.description.output}
+        drives, references = ({}, {}) if acting is None else (acting.drives, acting.references)
         found = []
         for name, quantity in outputs:
             item = known[name]

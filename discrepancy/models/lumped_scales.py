@@ -13,14 +13,14 @@ from discrepancy.models.second_order import Motion
 
 def state_sizes(lumped: LumpedRig, campaign: Campaign, trial: Trial, conditions: Conditions) -> FloatArray:
     """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
-    moved, drives = lumped.moved(trial, conditions, lumped.own_laws, still=True)
+    moved = lumped.moved(trial, conditions, lumped.own_laws, still=True)
     rig = moved.system
     count, moving = len(rig.angular_frequency), rig.moving
     x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
     pace = np.maximum(rig.angular_frequency[:moving], 1.0 / float(trial.time[-1] - trial.time[0]))
     n, shapes = rig.displacements, rig.shapes
     channels = [campaign.channels[name] for name in trial.channels]
-    shown = lumped.shown([(channel.output, channel.quantity) for channel in channels], drives)
+    shown = lumped.shown([(channel.output, channel.quantity) for channel in channels], moved.acting)
     for column, item in enumerate(shown):
         kept = trial.values[trial.used[:, column], column] - item.constant
         if item.reaction is not None or item.speed is not None or not kept.size:
@@ -146,12 +146,12 @@ def lumped_scales(
         if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
             continue
         try:
-            motion, _ = lumped.moved(trial, conditions, lumped.own_laws)
+            motion = lumped.moved(trial, conditions, lumped.own_laws)
         except ModelError:
-            motion, _ = lumped.moved(trial, conditions, lumped.own_laws, still=True)
+            motion = lumped.moved(trial, conditions, lumped.own_laws, still=True)
         if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
             sizes_of_state = state_sizes(lumped, campaign, trial, conditions)
-            motion, _ = lumped.moved(trial, replace(conditions, initial=sizes_of_state), lumped.own_laws)
+            motion = lumped.moved(trial, replace(conditions, initial=sizes_of_state), lumped.own_laws)
         pushes = [
             float(np.max(np.abs(trial.values[trial.used[:, column], column]), initial=0.0))
             for column, name in enumerate(trial.channels)

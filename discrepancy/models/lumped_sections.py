@@ -1,6 +1,6 @@
 """The tables of a lumped model's file: matrices, named vectors, laws, controllers and parameters."""
 
-from dataclasses import fields
+from dataclasses import replace
 from math import isfinite
 from typing import Annotated, Literal, Self
 
@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from discrepancy.campaign.records import Quantity
 from discrepancy.models.model_file import (
     Name,
+    NamedSection,
     NotNegative,
     Number,
     ParameterSection,
@@ -74,17 +75,15 @@ class Damping(Section):
         return self
 
 
-class PartSection(Section):
+class PartSection(NamedSection):
     """`[[mass_part]]` and the like: a part that a parameter can scale, added to the base matrix."""
 
-    name: Name
     matrix: Matrix
 
 
-class NamedVector(Section):
+class NamedVector(NamedSection):
     """A row of the unknowns with a name."""
 
-    name: Name
     vector: Vector
 
 
@@ -101,14 +100,13 @@ class InputSection(NamedVector):
     chord_derivative: Vector | None = None
 
 
-class OutputSection(Section):
+class OutputSection(NamedSection):
     """`[[output]]`: what can be measured; velocity and acceleration come from a displacement.
 
     vector . u + constant, or the force by which a prescribed motion is made (`reaction`, an input's name),
     or what a controller gives (`controller`, its name).
     """
 
-    name: Name
     vector: Vector | None = None
     quantity: Annotated[Quantity, Field(strict=False)] = Quantity.DISPLACEMENT
     reaction: Name | None = None
@@ -186,17 +184,10 @@ class LawSection(Section):
         law = self.primitive
         if factor == 1.0:
             return law
-        return type(law)(
-            **{
-                item.name: getattr(law, item.name) * (factor if item.name in law.proportional else 1)
-                if item.type is float
-                else getattr(law, item.name)
-                for item in fields(law)
-            }
-        )
+        return replace(law, **{name: factor * getattr(law, name) for name in law.proportional})
 
 
-class ControllerSection(Section):
+class ControllerSection(NamedSection):
     """`[[controller]]`: acts . (P e + D e' + I s), e = reference - vector . z, s' = e, which closes a loop.
 
     z are the unknowns, or their speeds where `quantity` is a speed; the reference is an input of the
@@ -204,7 +195,6 @@ class ControllerSection(Section):
     `derivative_of = "measurement"` D acts on -vector . z' alone.
     """
 
-    name: Name
     vector: Vector
     acts: Vector
     quantity: Annotated[Quantity, Field(strict=False)]

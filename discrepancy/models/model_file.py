@@ -1,12 +1,12 @@
 """What the TOML files of models share: their tables and kinds of numbers."""
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal, Protocol, Self
+from collections.abc import Mapping
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from discrepancy.campaign.records import Quantity
-from discrepancy.models.interface import ModelParameter
+from discrepancy.models.interface import Model, ModelParameter
 
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0, strict=True)]
@@ -22,10 +22,15 @@ class Section(BaseModel):
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
-class ParameterSection(Section):
-    """`[[parameter]]`: a calibrated parameter with its posterior as prior."""
+class NamedSection(Section):
+    """A table with a name."""
 
     name: Name
+
+
+class ParameterSection(NamedSection):
+    """`[[parameter]]`: a calibrated parameter with its posterior as prior."""
+
     mean: Number
     deviation: NotNegative
     low: Number
@@ -45,43 +50,28 @@ class ParameterSection(Section):
 
 
 class ModelDescription(Section):
-    """What every description of a model begins with: version of the format, and a name for people."""
+    """What every description of a model has: version of the format, name for people, parameters, ports."""
 
     format: Literal[1]
     name: Name
+    parameter: tuple[ParameterSection, ...] = ()
+    port: tuple[NamedSection, ...] = ()
 
 
-class Named(Protocol):
-    """A table with a name."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-
-
-class DescribedModel:
+class DescribedModel(Model):
     """What models of a file know of themselves.
 
     Parameters
     ----------
-    name : str
-        For people.
-    parameters, ports : sequence of section
-        Of the file.
+    description : ModelDescription
+        Content of the file.
     quantities : mapping of str to Quantity
         What each output is.
     """
 
-    def __init__(
-        self,
-        name: str,
-        parameters: Sequence[ParameterSection],
-        ports: Sequence[Named],
-        quantities: Mapping[str, Quantity],
-    ) -> None:
-        self.name, self.quantities = name, quantities
-        self.parameters = tuple(item.calibrated for item in parameters)
-        self._port_names = tuple(item.name for item in ports)
+    def __init__(self, description: ModelDescription, quantities: Mapping[str, Quantity]) -> None:
+        super().__init__(description.name, tuple(item.calibrated for item in description.parameter))
+        self.quantities, self._port_names = quantities, tuple(item.name for item in description.port)
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""

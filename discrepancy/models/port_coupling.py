@@ -22,25 +22,29 @@ from fe.runtime.motion_arrays import FIRST_PARTS, IntArray, Ports
 
 
 def held_forces(
-    x: FloatArray, v: FloatArray, push: FloatArray, before: FloatArray, gain: FloatArray, h: float,
-    ports: Ports, memory: FloatArray, forces: FloatArray, taken: FloatArray,
+    x: FloatArray, v: FloatArray, last: FloatArray, gain: FloatArray, h: float, ports: Ports,
+    memory: FloatArray, forces: FloatArray, room: FloatArray,
 ) -> None:  # fmt: skip
-    """Set `forces` (J,) of the laws over the next step; the memory is carried to its middle.
+    """Take `forces` (J,) of the laws from those over the last step to those over the next.
+
+    The memory is carried to the middle of the step, and `last` to `v`.
 
     Parameters
     ----------
-    x, v, push : (J,) ndarray
-        Displacement, velocity and acceleration without the laws of each law's port.
-    before, taken : (J,) ndarray
-        Forces of the last step; room for the speeds that they took.
+    x, v, last : (J,) ndarray
+        Displacement and velocity of each law's port, and its velocity a step before.
     gain : (J, J) ndarray
         Speed that a unit force of each law (column) takes from the port of another over a step of `h`.
+    room : (2, J) ndarray
+        For the speeds that the forces took over the last step, and for accelerations without them.
     """
-    count = len(ports.numbers)
+    count, taken, push = len(ports.numbers), room[0], room[1]
     for j in range(count):
         taken[j] = 0.0
         for i in range(count):
-            taken[j] += gain[j, i] * before[i]
+            taken[j] += gain[j, i] * forces[i]
+        push[j] = (v[j] - last[j] + taken[j]) / h
+        last[j] = v[j]
     for j in range(count):
         forces[j] = taken[j]
     for j in range(count):
@@ -75,31 +79,22 @@ def couple(
     free_x, free_v = free
     count, size = len(applied), len(ports.numbers)
     order, width = transition.shape[0], applied.shape[1]
-    x, v, push, last = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
-    before, forces, taken = np.zeros(size), np.zeros(size), np.zeros(size)
+    rows = np.zeros((6, size))
+    x, v, last, forces, room = rows[0], rows[1], rows[2], rows[3], rows[4:]
+    for j in range(size):
+        last[j] = 2.0 * free_v[0, port_of[j]] - free_v[1, port_of[j]]
     for k in range(count):
         for j in range(size):
             p = port_of[j]
-            place, speed = free_x[k, p], free_v[k, p]
+            x[j], v[j] = free_x[k, p], free_v[k, p]
             for n in range(order):
-                place += x_rows[p, n] * states[k, n]
-                speed += v_rows[p, n] * states[k, n]
-            if k > 0:
-                for i in range(width):
-                    place += x_direct[p, i] * applied[k - 1, i]
-                    speed += v_direct[p, i] * applied[k - 1, i]
-            x[j], v[j] = place, speed
-            if k == 0:
-                push[j] = (free_v[1, p] - free_v[0, p]) / h
-            else:
-                push[j] = speed - last[j]
-                for i in range(size):
-                    push[j] += gain[j, i] * before[i]
-                push[j] /= h
-            last[j] = speed
-        held_forces(x, v, push, before, gain, h, ports, memory, forces, taken)
+                x[j] += x_rows[p, n] * states[k, n]
+                v[j] += v_rows[p, n] * states[k, n]
+            for i in range(width if k > 0 else 0):
+                x[j] += x_direct[p, i] * applied[k - 1, i]
+                v[j] += v_direct[p, i] * applied[k - 1, i]
+        held_forces(x, v, last, gain, h, ports, memory, forces, room)
         for j in range(size):
-            before[j] = forces[j]
             applied[k, port_of[j]] -= forces[j]
         for n in range(order):
             total = 0.0
@@ -158,8 +153,10 @@ def coupled_motion(
     return states, applied
 
 
-class LawStepper:
-    """The laws beside an FMU that is stepped: displacement and velocity of the ports in, forces out.
+def stepper(
+    laws: Laws, port_of: list[int], gain: FloatArray, step: float, free_x: FloatArray, free_v: FloatArray
+) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """Return what gives the forces (P,) over the next step of an FMU, from how its ports are and move.
 
     Parameters
     ----------
@@ -171,40 +168,18 @@ class LawStepper:
         Speed of each port after a step with a unit force at another.
     step : float
         [s].
-    displacement, push : (P,) ndarray
-        Displacement of the ports at the start, and their acceleration without the laws.
+    free_x, free_v : (2, P) ndarray
+        Displacement and velocity of the ports without the laws, at the start and a step later.
     """
+    index, ports = np.array(port_of, dtype=np.int64), _ports(laws)
+    own = np.ascontiguousarray(gain[np.ix_(index, index)])
+    memory, last = first_memory(laws, free_x[0, index]), (2.0 * free_v[0] - free_v[1])[index]
+    forces, room = np.zeros(len(laws)), np.zeros((2, len(laws)))
 
-    def __init__(
-        self,
-        laws: Laws,
-        port_of: list[int],
-        gain: FloatArray,
-        step: float,
-        displacement: FloatArray,
-        push: FloatArray,
-    ) -> None:
-        self._laws, self._index, self._step = laws, np.array(port_of, dtype=np.int64), step
-        self._gain = np.ascontiguousarray(gain[np.ix_(self._index, self._index)])
-        self._push = push[self._index]
-        self._memory = first_memory(laws, displacement[self._index])
-        self._acting = _ports(laws)
-        self._before, self._forces, self._taken = np.zeros((3, len(laws)))
-        self._last: FloatArray | None = None
-        self._ports = len(displacement)
-
-    def forces(self, displacement: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return what the FMU is given (P,) over the next step."""
-        x, v = displacement[self._index], velocity[self._index]
-        push = self._push
-        if self._last is not None:
-            push = (v - self._last + self._gain @ self._before) / self._step
-        self._last = v
-        _compiled(held_forces)(
-            x, v, push, self._before, self._gain, self._step, self._acting, self._memory, self._forces,
-            self._taken,
-        )  # fmt: skip
-        self._before[:] = self._forces
-        given = np.zeros(self._ports)
-        np.subtract.at(given, self._index, self._forces)
+    def forces_at(x: FloatArray, v: FloatArray) -> FloatArray:
+        _compiled(held_forces)(x[index], v[index], last, own, step, ports, memory, forces, room)
+        given = np.zeros(len(gain))
+        np.subtract.at(given, index, forces)
         return given
+
+    return forces_at

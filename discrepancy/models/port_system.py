@@ -192,18 +192,10 @@ class PortSystem:
 
     def free(self, start: FloatArray, steps: int) -> FloatArray:
         """Return the free motion (steps + 1, C) from a state (n,)."""
-        states = np.empty((steps + 1, len(start)))
-        states[0] = start
-        block = [np.eye(len(start))]
-        for _ in range(min(64, steps + 1)):
-            block.append(self.transition @ block[-1])
-        jump, powers = block.pop(), np.stack(block)
-        now = start
-        for k in range(0, steps + 1, len(powers)):
-            part = powers @ now
-            states[k : k + len(powers)] = part[: steps + 1 - k]
-            now = jump @ now
-        return np.asarray(states @ self.outputs.T)
+        states, power = start[np.newaxis], self.transition
+        while len(states) <= steps:
+            states, power = np.concatenate((states, states @ power.T)), power @ power
+        return np.asarray(states[: steps + 1] @ self.outputs.T)
 
     def gain(self) -> FloatArray:
         """Return the outputs (C, P) at rest under constant unit forces."""

@@ -8,8 +8,9 @@ from scipy.linalg import inv
 
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import ModelParameter, Outputs, Place, check_outputs, place_among
+from discrepancy.models.interface import ModelParameter, Outputs, Place
 from discrepancy.models.memory import Memory
+from discrepancy.models.questions import check_outputs, place_among
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.structural import Moving, State, StructuralModel
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, ModelPatch, Primitive

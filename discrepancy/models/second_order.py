@@ -79,7 +79,7 @@ class Motion:
         if len(self.laws):
             rows = self.laws.rows(system.modal.actions or system.modal.ports, self.q.shape[1])
             found[:, :count] -= self.port_forces @ rows[:, :count]
-        for number, drive in enumerate(self.acting.drives):
+        for number, drive in enumerate(self.acting.drives.values()):
             found[:, count + number] = system.heaviness * drive.at(self.time, 2)
         found[: self.held] = 0.0
         return found
@@ -232,8 +232,10 @@ class SecondOrderSystem(LinearSystem):
         """Return the state at the first stamp."""
         count, moving, first = len(self.angular_frequency), self.moving, acting.time[:1]
         known = acting.begins is not Start.UNKNOWN and acting.clock[1] == 0.0  # dry friction is zero at rest
-        drive = np.array([float(item.at(first, 0)[0]) for item in acting.drives])
-        speeds = [item.first_speed if known else float(item.at(first, 1)[0]) for item in acting.drives]
+        drive = np.array([float(item.at(first, 0)[0]) for item in acting.drives.values()])
+        speeds = [
+            item.first_speed if known else float(item.at(first, 1)[0]) for item in acting.drives.values()
+        ]
         (q, v), memory = np.zeros((2, count + len(drive))), None
         if acting.begins is Start.SETTLED:
             parts = (float(course.at(first)[0]) * row for row, course in acting.loads)
@@ -365,7 +367,7 @@ class SecondOrderSystem(LinearSystem):
                 np.zeros((len(push), 2 * whole)),
             )
             transition[:, at[:, None], at], push[:, at] = exact.transition, moved
-        for number, drive in enumerate(acting.drives):
+        for number, drive in enumerate(acting.drives.values()):
             for first, order in ((count, 0), (whole + count, 1)):
                 push[:, first + number] = self.heaviness * drive.at(time[1:], order)
         return Steps(transition, exact.length, exact.which, push, begin, end, feed, time, boundaries.sample)
@@ -380,7 +382,7 @@ class SecondOrderSystem(LinearSystem):
         if acting.drives:
             begin, end = (np.pad(side, ((0, 0), (0, len(acting.drives)))) for side in (begin, end))
         bend = boundaries.lengths**2 / 12.0
-        for number, drive in enumerate(acting.drives):
+        for number, drive in enumerate(acting.drives.values()):
             parts = self.driven(number)
             for side, time in ((begin, boundaries.time[:-1]), (end, boundaries.time[1:])):
                 w = [drive.at(time, order) for order in range(4)]

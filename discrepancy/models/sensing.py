@@ -8,7 +8,6 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
 from discrepancy.models.interface import Conditions, Model, Response
-from discrepancy.models.wrapped import built_in_sensors
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive
 from fe.runtime.sensors import (
@@ -29,7 +28,6 @@ def observe(
     trial: Trial,
     patch: ModelPatch,
     conditions: Conditions,
-    refinement: int = 1,
 ) -> Response:
     """Return what the channels of a trial would show; gains and zeros that are nuisances are not in it.
 
@@ -47,8 +45,6 @@ def observe(
         (`fe.runtime.sensors`).
     conditions : Conditions
         Parameters, initial state, clock and health.
-    refinement : int
-        As of `Conditions`.
 
     Raises
     ------
@@ -60,9 +56,7 @@ def observe(
     outputs = tuple(
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
-    patch = (_by_channels(built_in_sensors(model), campaign) + patch).in_trial(trial.name)
-    if refinement != 1:
-        conditions = replace(conditions, refinement=refinement)
+    patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
     if not uses_sensors(patch):
         return model.respond(trial, outputs, patch, conditions)
     rate, zero = clock_of(patch)

@@ -187,78 +187,47 @@ def advance(system: CoupledModes, laws: Laws, steps: Steps, begin: Begin) -> Mod
     """Return the motion at the samples of known steps.
 
     Where laws begin or end, a new section does: modes and the laws that go on keep their state, a law that
-    begins has been loaded from zero to where its port is.
+    begins has been loaded from zero to where its port is. A stamp at an edge belongs to what begins there.
     """
-    (q, v, memory), modes, count = begin, len(begin.q), len(steps.sample)
-    result = ModalMotion(
-        np.empty((count, modes)), np.empty((count, modes)), np.empty((count, len(laws))),
-        laws.memory() if memory is None else memory.copy(), np.empty((count, len(laws))),
-    )  # fmt: skip
-    state = State(np.array(q, dtype=float), np.array(v, dtype=float), result.memory, np.zeros(len(laws)))
+    (q, v, memory), modes, count = begin, len(begin.q), len(laws)
+    sample = np.arange(len(steps.time)) if laws.spans else steps.sample
+    out = Samples(*(np.empty((len(sample), width)) for width in (modes, modes, count, count)))
+    kept = laws.memory() if memory is None else memory.copy()
+    state = State(np.array(q, dtype=float), np.array(v, dtype=float), kept, np.zeros(count))
     rows = laws.rows(system.ports, modes)
     acts = laws.rows(system.actions, modes) if system.actions else rows
     flexibility = port_flexibility(system, laws)
-    before = np.ones(len(laws), dtype=bool)
-    for section in _sections(laws, steps):
-        first, last = section.first, section.last
-        now = section.acts[:, None]
-        ports = laws.at(rows * now, flexibility, system.relaxation, np.zeros((2, len(laws))), acts * now)
-        started = section.acts & ~before
+    before = np.ones(count, dtype=bool)
+    for first, last, acting in _sections(laws, steps.time):
+        now = acting[:, None]
+        ports = laws.at(rows * now, flexibility, system.relaxation, np.zeros((2, count)), acts * now)
+        started = acting & ~before
         state.memory[started] = 0.0
         moving = started & (laws.of_speed == 1)
         state.memory[moving, 1] = rows[moving] @ state.q
         state.current[:] = 0.0
-        between = (steps.which, steps.push, steps.begin, steps.end)
-        arrays = (
-            steps.transition, steps.length, *(item[first:last] for item in between),
-            steps.feed[first : last + 1], steps.time[first : last + 1],
-        )  # fmt: skip
-        given = (*(np.ascontiguousarray(item) for item in arrays), section.record)  # fields of `Steps`
+        own, part = steps, out
+        if laws.spans:
+            own = steps.between(first, last)
+            part = Samples(*(item[first : last + 1] for item in out))
         structure = Structure(
             system.coupled, system.stiffness, np.ascontiguousarray(system.damping), laws.rate,
             memory is not None or first > 0,
         )  # fmt: skip
-        out = Samples(*(np.empty((len(section.record), item.shape[1])) for item in _samples(result)))
-        compiled_steps()(given, tuple(structure), tuple(ports), tuple(state), tuple(out))
-        for whole, part in zip(_samples(result), out, strict=True):
-            whole[section.samples] = part[section.kept]
-        before = section.acts
-    return result
+        given = (np.ascontiguousarray(item) for item in own)
+        compiled_steps()(tuple(given), tuple(structure), tuple(ports), tuple(state), tuple(part))
+        before = acting
+    if laws.spans:
+        out = Samples(*(item[steps.sample] for item in out))
+    return ModalMotion(out.q, out.v, out.forces, kept, out.lagged)
 
 
-def _samples(motion: ModalMotion) -> Samples:
-    return Samples(motion.q, motion.v, motion.port_forces, motion.lagged)
-
-
-class _Section(NamedTuple):
-    """Steps during which the same laws act: boundaries `first` to `last`, `acts` (J,).
-
-    The loop records at `record`, counted from `first`; of these `kept` are the `samples` of the motion.
-    """
-
-    first: int
-    last: int
-    acts: BoolArray
-    record: IntArray
-    kept: IntArray | slice
-    samples: IntArray | slice
-
-
-def _sections(laws: Laws, steps: Steps) -> Iterator[_Section]:
-    """Yield the sections; one where all laws always act. A stamp at an edge belongs to what begins there."""
-    time, sample, count = steps.time, steps.sample, len(steps.which)
-    if not laws.spans:
-        every = slice(None)
-        yield _Section(0, count, np.ones(len(laws), dtype=bool), sample, every, every)
-        return
-    inside = np.array([moment for moment in laws.edges if time[0] < moment < time[-1]])
-    cuts = np.unique(np.concatenate(([0, count], np.searchsorted(time, inside)))).tolist()
-    for first, last in pairwise(cuts):
-        own = (sample >= first) & ((sample < last) | ((sample == last) & (last == count)))
-        kept = sample[own] - first
-        record = np.unique(np.concatenate(([0], kept, [last - first]))).astype(np.int64)
-        acts = laws.act_at(0.5 * float(time[first] + time[first + 1]))
-        yield _Section(first, last, acts, record, np.searchsorted(record, kept), np.flatnonzero(own))
+def _sections(laws: Laws, time: FloatArray) -> Iterator[tuple[int, int, BoolArray]]:
+    """Yield first and last boundary of the steps during which the same laws act, and which (J,) these are."""
+    inside = [moment for moment in laws.edges if time[0] < moment < time[-1]]
+    cuts = np.unique(np.concatenate(([0, len(time) - 1], np.searchsorted(time, inside)))).astype(int)
+    for first, last in pairwise(cuts.tolist()):
+        yield first, last, laws.act_at(0.5 * float(time[first] + time[first + 1]))
 
 
 def _substeps(system: CoupledModes, laws: Laws, lengths: FloatArray) -> IntArray:

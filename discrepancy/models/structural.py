@@ -1,18 +1,19 @@
 """A structure whose matrices are known as a model: under patches, at rest, in ring-downs and under forces."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, acting_force
 from discrepancy.models.interface import (
     NO_PATCH,
     Conditions,
+    Model,
     ModelParameter,
     Outputs,
     Place,
@@ -21,15 +22,17 @@ from discrepancy.models.interface import (
     Response,
     Scales,
     campaign_sizes,
+)
+from discrepancy.models.linear_system import solved
+from discrepancy.models.memory import Memory
+from discrepancy.models.questions import (
+    LoadChange,
     check_no_inputs,
     check_parameters,
     check_plain,
     prior_mean,
     release_of,
 )
-from discrepancy.models.linear_system import solved
-from discrepancy.models.memory import Memory
-from discrepancy.models.patch_parts import LoadChange
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
@@ -42,7 +45,6 @@ from fe.runtime.patch import (
     ModelPatch,
     ModulusTemperature,
     PointMass,
-    Primitive,
 )
 from fe.runtime.state import Losses
 
@@ -70,7 +72,7 @@ class Solver(Protocol):
         """Return K^-1 loads, (n,) or (n, k)."""
 
 
-class StructuralModel(ABC):
+class StructuralModel(Model):
     """A structure by its matrices (`discrepancy.models.interface.Model`), in n coordinates of its own.
 
     Parameters
@@ -102,24 +104,17 @@ class StructuralModel(ABC):
     missing: tuple[str, ...] = ()
     length: float | None = None
     reference: str
+    shows_ports: ClassVar[bool] = True
 
     def __init__(self, name: str, parameters: tuple[ModelParameter, ...]) -> None:
-        self.name, self.parameters = name, parameters
+        super().__init__(name, parameters)
         self._statics = Memory(2048)
 
     # ------------------------------------------------------------ what each structure says
 
     @abstractmethod
-    def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if the model has no such output."""
-
-    @abstractmethod
     def output_rows(self, outputs: Outputs, component: int, losses: ModelPatch) -> FloatArray:
         """Return the rows (C, n) of outputs; `component` 1 and 2: transverse and shear strain."""
-
-    @abstractmethod
-    def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the model can carry a primitive."""
 
     @abstractmethod
     def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
@@ -141,10 +136,6 @@ class StructuralModel(ABC):
         """Return the load (n,) that acts in every motion, too; None: all loads are recorded."""
         return None
 
-    def at_ports(self, forces: ModelPatch) -> ModelPatch:
-        """Return forces as they act at ports of `port_rows`."""
-        return forces
-
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of forces that are spread over the structure, by the first mode (n,)."""
         return {}
@@ -161,7 +152,7 @@ class StructuralModel(ABC):
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, by the structure without a patch."""
-        values = prior_mean(campaign, self.parameters)
+        values = prior_mean(campaign, self.declared)
         healthy = State(values, (0.0,) * len(self.regions))
         static, moved = self.stiffness(healthy), self.moving(healthy, self.reference)
         tip = self.force_row(self.reference, values, NO_PATCH)
@@ -191,8 +182,8 @@ class StructuralModel(ABC):
 
     # ------------------------------------------------------------ response
 
-    def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial, see `Model.respond`.
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
+        """Return the response of a trial.
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero. In a
         dynamic trial the structure is that at its first temperature.
@@ -325,11 +316,9 @@ class StructuralModel(ABC):
 
     # ------------------------------------------------------------ ports
 
-    def ported(
-        self, trial: Trial, outputs: Outputs, parameters: FloatArray, patch: ModelPatch = NO_PATCH
-    ) -> PortedSystem:
+    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the modes of the prior means."""
-        means = np.array([item.mean for item in self.parameters])
+        patch, means = self.patch, np.array([item.mean for item in self.declared])
         of = (Conditions(values, health=trial.health[:1]) for values in (means, parameters))
         base, moved = (self._moved(trial, conditions, patch, self.missing) for conditions in of)
         rows = self.output_rows(outputs, 0, patch.of(LocalStiffnessLoss))
@@ -337,12 +326,10 @@ class StructuralModel(ABC):
         shapes = np.linalg.lstsq(moved.basis, base.basis @ base.system.shapes, rcond=None)[0]
         return moved.system.ported(rows @ moved.basis, [item for _, item in outputs], np.asarray(shapes))
 
-    def port_motion(
-        self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
-    ) -> tuple[FloatArray, FloatArray]:
+    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        moved = self._moved(trial, conditions, patch, self.missing)
-        motion = self._motion(moved, trial, conditions, patch)
+        moved = self._moved(trial, conditions, self.patch, self.missing)
+        motion = self._motion(moved, trial, conditions, self.patch)
         rows = np.array(list(moved.system.ports.values()))
         return motion.values(rows), motion.velocity @ (rows @ moved.system.shapes).T
 

@@ -13,8 +13,9 @@ from calibration.result.file import load_calibration
 from calibration.result.record import STATE
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale, check_outputs
+from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale
 from discrepancy.models.memory import Memory
+from discrepancy.models.questions import check_outputs
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.structural import Moving, State, StructuralModel
 from fe.reduction.model_cache import patch_arrays
@@ -41,7 +42,7 @@ from fe.runtime.patched_wing import (
 )
 from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import wing_names
-from fe.wing.design import load_design
+from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress
 
 SHIPPED_PRIOR = {
@@ -53,6 +54,9 @@ SHIPPED_PRIOR = {
 }
 """Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e of the
 paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
+
+
+ROTATING_PORT = "root"
 
 
 class Stiffness:
@@ -84,6 +88,8 @@ class WingModel(StructuralModel):
     prior : mapping of str to (float, float)
         Mean and standard deviation of the calibrated parameters, by the names of
         `calibration.result.record.STATE`.
+    design : WingDesign, optional
+        What the arrays were made of.
 
     Notes
     -----
@@ -95,8 +101,13 @@ class WingModel(StructuralModel):
     reference = LOAD_PLACE
 
     def __init__(
-        self, arrays: PatchArrays, name: str = "wing", prior: dict[str, tuple[float, float]] | None = None
+        self,
+        arrays: PatchArrays,
+        name: str = "wing",
+        prior: dict[str, tuple[float, float]] | None = None,
+        design: WingDesign | None = None,
     ) -> None:
+        self.design = design
         self.wing = wing = PatchedWing(arrays)
         prior = prior or SHIPPED_PRIOR
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
@@ -125,7 +136,7 @@ class WingModel(StructuralModel):
         """
         try:
             design = load_design(path)
-            return cls(patch_arrays(design, progress), design.name)
+            return cls(patch_arrays(design, progress), design.name, design=design)
         except FiniteElementError as cause:
             raise ModelError(str(cause)) from cause
 
@@ -141,7 +152,8 @@ class WingModel(StructuralModel):
         try:
             result = load_calibration(path)
             prior = {name: (result.mean(name), float(np.std(result.draws_of(name)))) for name in STATE}
-            return cls(patch_arrays(result.wing_design, progress), result.asset, prior)
+            design = result.wing_design
+            return cls(patch_arrays(design, progress), result.asset, prior, design)
         except (FiniteElementError, CalibrationError, OSError) as cause:
             raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
 
@@ -181,6 +193,10 @@ class WingModel(StructuralModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
         return primitive in PRIMITIVES.values() and primitive is not PortLoad
+
+    def turns(self, port: str) -> bool | None:
+        """Return whether a port turns; the others move up and down."""
+        return port == ROTATING_PORT
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at ports of `port_rows`."""

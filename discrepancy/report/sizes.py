@@ -8,7 +8,6 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.document_types import PRIMITIVE_UNITS
 from discrepancy.files.patch import PrimitiveInterval
 from discrepancy.models.interface import Model
-from discrepancy.models.port_units import turns, unit_of_state
 from discrepancy.report.text import NAMING, rounded, unit_text
 from discrepancy.verdict import NamedEffect
 from discrepancy.workflow import Investigation
@@ -110,8 +109,8 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
         return unit_text(units.pop()) if len(units) == 1 and unit == CHANNEL_UNIT else ""
     if " or " in unit:
         port = str(getattr(primitive, "port", ""))
-        if state := unit_of_state(port, model):
+        if state := model.unit_of_state(port):
             return state if unit.startswith("m/s") else f"{state}/s times capacity"
         moving, turning = unit.split(" or ")
-        return {True: turning, False: moving, None: unit}[turns(port, model)]
+        return {True: turning, False: moving, None: unit}[model.turns(port)]
     return unit_text(unit)

@@ -18,7 +18,6 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.missing_force.hypotheses import key_of, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.models.wrapped import has_law
 from discrepancy.search_settings import SEARCH
 
 from .growing_records import Beginnings
@@ -433,7 +432,7 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     """
     tell("fitting the model as it is")
     none = fit(problem, Candidate(), problem.start(Candidate()))
-    if has_law(problem.model) and absolute_gate(problem, none).passed is False:
+    if problem.model.has_law and absolute_gate(problem, none).passed is False:
         again = Beginnings(problem, tell, none.residuals).again(none)
         none = none if again is None else again
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)

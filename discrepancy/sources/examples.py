@@ -18,7 +18,6 @@ from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.reduced_structure import StructureModel
 from discrepancy.models.sensing import observe
-from discrepancy.models.wrapped import innermost
 from fe.runtime.patch import ModelPatch
 
 ExampleKind = Literal["static", "ringdown", "flight", "laboratory", "complete"]
@@ -90,7 +89,7 @@ def plan_of(model: Model) -> ExamplePlan:
     ModelError
         If no force can act on the model.
     """
-    bare, largest = innermost(model), np.inf
+    bare, largest = model, np.inf
     if isinstance(bare, LumpedModel):
         places = [item.name for item in bare.description.input]
         outputs = [item.name for item in bare.description.output]

@@ -17,7 +17,6 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.models.interface import Model
 from discrepancy.models.wing import WingModel
-from discrepancy.models.wrapped import PatchedModel
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.packing.patched_runtime import output_channels
@@ -179,7 +178,7 @@ def run_model(folder: Path | str) -> Model:
         except FmuError as cause:
             raise CampaignFileError(f"The patch of the twin's model cannot be read: {cause}") from cause
         for effect in effects:
-            model = PatchedModel(model, effect.patch)
+            model = model.patched(effect.patch)
     return model
 
 

@@ -29,7 +29,6 @@ from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
 from discrepancy.models.sensing import observe
-from discrepancy.models.wrapped import PatchedModel
 from discrepancy.search.strategy import search
 from discrepancy.sources.examples import example_campaign, plan_of, write_example
 from discrepancy.verdict import VerdictKind
@@ -190,7 +189,7 @@ def test_there_and_back_from_python(
     out = "'verdicts/a campaign_patched'"
     assert applied.command.endswith(f"--model {tmp_path / 'patched.json'} --out {out}")
     patched = choose_model(applied.path)
-    assert isinstance(patched.model, PatchedModel)
+    assert len(patched.model.patch)
     assert patched.model.patch == found.verdict.effects[0].patch
     for item, calibrated in zip(patched.model.parameters, found.verdict.parameters, strict=True):
         assert (item.mean, item.deviation) == (calibrated.mean, calibrated.deviation)
@@ -325,7 +324,7 @@ def test_a_model_is_found_beside_its_patch(laboratory: Path, tmp_path: Path) -> 
     (tmp_path / "there" / "verdict" / "verdict.json").write_text(json.dumps(content), encoding="utf-8")
     apply_verdict(tmp_path / "there" / "verdict", tmp_path / "there" / "patched.json")
     (tmp_path / "there").rename(moved)
-    assert isinstance(uav_twin.load_model(moved / "patched.json"), PatchedModel)
+    assert len(uav_twin.load_model(moved / "patched.json").patch)
     (moved / "rig.toml").unlink()
     with pytest.raises(ModelError, match="is gone: put it back there, or beside patched"):
         uav_twin.load_model(moved / "patched.json")
@@ -360,7 +359,7 @@ def test_a_verdict_of_an_earlier_version_asks_for_another_run(laboratory: Path, 
 def test_effects_are_applied_upon_each_other(laboratory: Path, tmp_path: Path) -> None:
     """What a patched model lacks goes into one file with what it had."""
     first = choose_model(apply_verdict(laboratory / "verdict", tmp_path / "first.json").path)
-    assert isinstance(first.model, PatchedModel)
+    assert len(first.model.patch)
     plan = plan_of(first.model)
     drag = ModelPatch((PowerDamping("slide", 0.1, 2.0, 0.0, 0.05, 0.01),))
     campaign = write_example(first.model, tmp_path / "campaign", "ringdown", 5, plan, drag)
@@ -414,7 +413,7 @@ def test_a_built_in_sensor_is_that_of_its_channel() -> None:
     plan = replace(plan_of(model), channels=channels)
     campaign = example_campaign(model, "static", 0, plan)
     trial = campaign.trials[0]
-    patched = PatchedModel(model, ModelPatch((SensorGain("laser", 0.1),)))
+    patched = model.patched(ModelPatch((SensorGain("laser", 0.1),)))
     conditions = Conditions(np.ones(len(model.parameters)))
     seen = observe(patched, campaign, trial, ModelPatch(), conditions).values
     np.testing.assert_allclose(seen[:, 0], 1.1 * seen[:, 1], rtol=1e-12)
@@ -428,7 +427,7 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings() -> None:
     bare = example_campaign(model, "ringdown", 1, plan)
     patch = hidden(model, bare, "coulomb_friction", {"friction_ratio": 0.04}, "slide")
     campaign = example_campaign(model, "ringdown", 1, plan, patch)
-    patched = PatchedModel(model, patch)
+    patched = model.patched(patch)
     problem = Problem(campaign, patched, Setting(campaign, patched, patched.scales(campaign)))
     count = problem.counts.sum()
     assert fit(problem, Candidate(), problem.start(Candidate())).chi_square > 10.0 * count

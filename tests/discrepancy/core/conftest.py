@@ -18,7 +18,7 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import Conditions, Model, ModelParameter, PortScale, Response, Scales
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch, Primitive, RunOffset, SensorDrift
@@ -33,7 +33,7 @@ FREQUENCIES, DECAYS = np.array([3.0, 11.0]), np.array([0.25, 0.6])
 
 
 @dataclass(frozen=True)
-class ClosedForm:
+class ClosedForm(Model):
     """Responses that are linear in everything a hypothesis can move, or bent where `bent` says so.
 
     Static: y_c = sum_p theta_p F^(p+1) S_pc, times 1 + z . H_c if `bent`. Ring-down: two decaying modes of
@@ -55,17 +55,11 @@ class ClosedForm:
     def supports(self, primitive: type[Primitive]) -> bool:
         return False
 
-    def ports(self) -> tuple[str, ...]:
-        return ()
-
-    def stations(self) -> None:
-        return None
-
     def scales(self, campaign: Campaign) -> Scales:
         w = 2.0 * np.pi * float(FREQUENCIES[0])
         return Scales(1.0, 1.0, 1.0, w, 10.0, 1.0, 1.0, 100.0, {"y": PortScale(1.0, 1.0, w)})
 
-    def respond(
+    def _respond(
         self,
         trial: Trial,
         outputs: tuple[tuple[str, Quantity], ...],
@@ -349,8 +343,8 @@ class Bench:
             initial = np.zeros((rows, 2))
             if trial.release is not None:
                 initial[:, 0] = trial.release.deviation * generator.standard_normal(rows)
-            conditions = Conditions(theta, initial, (0.0, 0.0), trial.health)
-            values = observe(self.model, self.campaign, trial, patch, conditions, refinement=2).values.copy()
+            conditions = Conditions(theta, initial, (0.0, 0.0), trial.health, refinement=2)
+            values = observe(self.model, self.campaign, trial, patch, conditions).values.copy()
             drawn = (noise or (lambda g, shape: g.standard_normal(shape)))(generator, values.shape)
             for column, name in enumerate(trial.channels):
                 channel = self.campaign.channels[name]

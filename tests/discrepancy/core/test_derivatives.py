@@ -47,7 +47,8 @@ def check(kit, problem, candidate, effect=None, tolerance=TOLERANCE, spread=0.5)
     at, first = 0, problem.shared.size + candidate.size
     for number, data in enumerate(problem.trials):
         parts = problem.linearise(number, point, candidate)
-        local, shared, index = problem.jacobian(number, point, parts, candidate)
+        derivatives = problem.derivatives(number, point, parts, candidate)
+        (local, shared), index = derivatives.dense(), derivatives.index
         counts = (data.weight > 0.0).ravel()
         assert np.all(local[:, ~counts] == 0.0)
         assert np.all(shared[:, ~counts] == 0.0)
@@ -81,7 +82,7 @@ def test_health_of_each_level_moves_its_own_row(kit) -> None:  # type: ignore[no
     data = problem.trials[0]
     candidate = Candidate()
     point = problem.start(candidate)
-    local, _, _ = problem.jacobian(0, point, problem.linearise(0, point, candidate), candidate)
+    local, _ = problem.derivatives(0, point, problem.linearise(0, point, candidate), candidate).dense()
     by_health = local[data.unknowns.size - len(data.unknowns.health_rows) :].reshape(-1, *data.weight.shape)
     for entry, row in enumerate(data.unknowns.health_rows):
         assert np.flatnonzero(np.any(by_health[entry] != 0.0, axis=1)).tolist() in ([row], [])
@@ -179,7 +180,7 @@ def test_products_by_channel_are_those_of_all_readings(kit) -> None:  # type: ig
     )
     for number, data in enumerate(problem.trials):
         found = problem.derivatives(number, point, problem.linearise(number, point, candidate), candidate)
-        dense = found.dense()
+        dense = np.vstack(found.dense())
         count = len(data.trial.channels)
         weights = generator.uniform(0.5, 2.0, count)
         products = found.products()

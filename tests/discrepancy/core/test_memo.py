@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.models.interface import Conditions
-from discrepancy.models.wrapped import MemoModel
 from fe.runtime.patch import ModelPatch
 
 
@@ -18,7 +17,8 @@ def test_trials_that_came_and_went_are_not_mistaken_for_each_other(kit) -> None:
     template = problem.campaign.trials[0]
     channels = problem.campaign.channels
     outputs = tuple((channels[name].output, channels[name].quantity) for name in template.channels)
-    plain, memo = problem.model.inner, MemoModel(problem.model.inner)
+    memo = problem.model
+    plain = memo.patched(ModelPatch())
     conditions = Conditions(np.array([1.0, 0.5]), health=np.zeros((9, 2)))
     for number in range(200):
         trial = replace(template, force=float(number) * template.force)

@@ -66,7 +66,7 @@ def test_held_out_trials_move_nothing_that_is_shared(kit) -> None:  # type: igno
     # its own nuisances are at their optimum given the rest: the dense solution of one trial
     for number, data in enumerate(there.trials):
         parts = there.linearise(number, start, Candidate())
-        local, _, _ = there.jacobian(number, start, parts, Candidate())
+        local, _ = there.derivatives(number, start, parts, Candidate()).dense()
         residual = there.residual(number, start, parts.response).ravel()
         exact = np.linalg.solve(local @ local.T + np.diag(data.unknowns.precision), local @ residual)
         np.testing.assert_allclose(adapted.point.local[number], exact, atol=0.02)

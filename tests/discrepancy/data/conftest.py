@@ -9,7 +9,7 @@ import pytest
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import Conditions, Model, ModelParameter, PortScale, Response, Scales
 from fe.runtime.patch import ModelPatch, Primitive
 
 # Gauges of a square patch of skin in plane stress: strain along, across, shear per metre of displacement.
@@ -21,7 +21,7 @@ GAUGES = {
 
 
 @dataclass(frozen=True)
-class Oscillator:
+class Oscillator(Model):
     """m x'' + c x' + k x = f from rest or released; three gauges proportional to x; outputs x and gauges."""
 
     stiffness: float = 400.0
@@ -40,16 +40,13 @@ class Oscillator:
     def ports(self) -> tuple[str, ...]:
         return ("x",)
 
-    def stations(self) -> None:
-        return None
-
     def scales(self, campaign: Campaign) -> Scales:
         w = float(np.sqrt(self.stiffness / self.mass))
         return Scales(
             1.0, self.stiffness, self.mass, w, 1.0, 1.0, 1.0, 1.0, {"x": PortScale(0.01, self.stiffness, w)}
         )
 
-    def respond(
+    def _respond(
         self,
         trial: Trial,
         outputs: tuple[tuple[str, Quantity], ...],

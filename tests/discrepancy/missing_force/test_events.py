@@ -129,7 +129,7 @@ def test_a_window_of_a_campaign_is_told_and_drawn(make_bench) -> None:  # type: 
 
 def test_a_verdict_tells_when_a_store_leaked(tmp_path: Path) -> None:
     case = drawn(tmp_path / "leak", "leak", (1, 5, 1))
-    found = investigate(problem_of(case).campaign, problem_of(case).model.inner)
+    found = investigate(problem_of(case).campaign, problem_of(case).model)
     told = [window for window in found.verdict.windows if not window.with_effect]
     assert len(told) == len(case.windows)
     for window, (begin, end) in zip(told, case.windows, strict=True):

@@ -27,7 +27,6 @@ from discrepancy.models.acting import refined
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.wrapped import PatchedModel, apart, has_law
 from discrepancy.report.force_figure import missing_force_figure
 from discrepancy.report.text import force_sentence
 from discrepancy.search.strategy import Search
@@ -204,7 +203,7 @@ def test_a_rig_without_a_gap_misses_no_force(tmp_path: Path) -> None:
         response = problem.prediction(number, start, bare)
         data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
     assert seen_force(problem) is None
-    found = investigate(problem.campaign, problem.model.inner)
+    found = investigate(problem.campaign, problem.model)
     assert found.verdict.kind is VerdictKind.NOTHING_MISSING
     assert found.missing is None
 
@@ -216,10 +215,10 @@ def test_a_finer_trial_has_the_inputs_of_the_coarse_one(tmp_path: Path) -> None:
     np.testing.assert_array_equal(finer.time[::4], trial.time)
     for one, other in zip(trial.inputs, finer.inputs, strict=True):
         np.testing.assert_allclose(other.values[::4], one.values, rtol=1e-12)
-    model = problem.model.inner
+    model = problem.model
     data, start = problem.trials[0], problem.start(Candidate())
     conditions = data.unknowns.conditions(trial, problem.shared.parameters(start.shared), start.local[0])
-    coarse, fine = (model.port_motion(item, conditions)[0] for item in (trial, finer))  # type: ignore[attr-defined]
+    coarse, fine = (model.port_motion(item, conditions)[0] for item in (trial, finer))
     np.testing.assert_allclose(fine[::4], coarse, atol=1e-6 * np.ptp(coarse))
 
 
@@ -275,13 +274,13 @@ def test_a_patch_and_the_same_in_the_file_of_a_model_miss_the_same_force() -> No
     """A law and a mass, which a patch adds to one model and the file of the other has."""
     campaign, rig = released(ModelPatch((STIFF, DAMPED))), LumpedModel.load("single_mass_rig")
     heavier = rig.description.model_copy(update={"mass": [2.1]})
-    patched = PatchedModel(rig, ModelPatch((PointMass(0.1, 0.4), STIFF)))
-    assert_alike(campaign, PatchedModel(LumpedModel(heavier), ModelPatch((STIFF,))), patched, 1e-6)
-    within = PatchedModel(PatchedModel(rig, ModelPatch((STIFF,))), ModelPatch((PointMass(0.1, 0.4),)))
+    patched = rig.patched(ModelPatch((PointMass(0.1, 0.4), STIFF)))
+    assert_alike(campaign, LumpedModel(heavier).patched(ModelPatch((STIFF,))), patched, 1e-6)
+    within = rig.patched(ModelPatch((STIFF,))).patched(ModelPatch((PointMass(0.1, 0.4),)))
     assert_alike(campaign, patched, within, 1e-9)
-    linear, laws = apart(within)
+    linear, laws = within.apart()
     assert laws == ModelPatch((STIFF,))
-    assert not has_law(linear)
+    assert not linear.has_law
 
 
 def seen_force(problem: Problem, effect: Effect | None = None, place: str = "") -> MissingForce | None:
@@ -384,7 +383,7 @@ def test_a_verdict_that_is_no_law_at_a_port_shows_no_force(tmp_path: Path) -> No
         bare, _ = problem.response(number, start.shared, start.local[number], ModelPatch())
         response = 1.05 * problem.prediction(number, start, bare)
         data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
-    found = investigate(problem.campaign, problem.model.inner)
+    found = investigate(problem.campaign, problem.model)
     assert found.missing is None or not found.verdict.effects
 
 

@@ -18,7 +18,7 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Quantity, Trial
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.model_choice import ModelChoice, ModelKind, choose_model
-from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import Conditions, Model, ModelParameter, PortScale, Response, Scales
 from discrepancy.parameters.calibration import calibrate_parameters
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.patch import ModelPatch, Primitive
@@ -30,7 +30,7 @@ NOISE = 0.02
 
 
 @dataclass(frozen=True)
-class Curve:
+class Curve(Model):
     """A model at rest whose only output is any function of force and parameters."""
 
     law: Callable[[Float, Float], Float]
@@ -43,17 +43,11 @@ class Curve:
     def supports(self, primitive: type[Primitive]) -> bool:
         return False
 
-    def ports(self) -> tuple[str, ...]:
-        return ()
-
-    def stations(self) -> tuple[float, float] | None:
-        return None
-
     def scales(self, campaign: Campaign) -> Scales:
         ports: Mapping[str, PortScale] = {}
         return Scales(1.0, 1.0, 1.0, 1.0, 60.0, 0.0, 1.0, 1.0, ports)
 
-    def respond(
+    def _respond(
         self,
         trial: Trial,
         outputs: tuple[tuple[str, Quantity], ...],

@@ -17,7 +17,6 @@ from discrepancy.judgement.conclusion import named_effects
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
-from discrepancy.models.port_units import port_unit
 from discrepancy.models.wing import WingModel
 from discrepancy.report.residual_figures import (
     gauge_places,
@@ -187,7 +186,7 @@ port = [
 ]
 """
     model = LumpedModel(parse_lumped(tomllib.loads(text)))
-    assert [port_unit(name, model) for name in ("one", "other", "between")] == units
+    assert [model.port_unit(name) for name in ("one", "other", "between")] == units
 
 
 def test_a_name_that_holds_its_identifier_is_said_once(drag: Investigation) -> None:

@@ -26,7 +26,6 @@ from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import choice_of_run, choose_model
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
-from discrepancy.models.wrapped import MemoModel
 from discrepancy.sources.from_run import held_out_turns, run_campaign, run_model
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
@@ -143,7 +142,7 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) 
     np.testing.assert_allclose(shown, truth, atol=2e-4 * np.abs(truth).max())
     # those of a question come after them: a gauge that was turned back reads as the others do
     back = ModelPatch((SensorRotation("g9", -0.4),))
-    again = observe(MemoModel(model), campaign, campaign.trials[0], back, conditions).values
+    again = observe(model.remembering(), campaign, campaign.trials[0], back, conditions).values
     outputs = tuple((f"strain[{number}]", Quantity.STRAIN) for number in range(1, 25))
     plain = model.respond(campaign.trials[0], outputs, ModelPatch(), conditions).values
     np.testing.assert_allclose(again[:, 8], 1.05 * plain[:, 8], rtol=1e-12)

@@ -1,0 +1,186 @@
+"""What is asked of a model, checked, and a patch sorted by what its primitives change."""
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from discrepancy.campaign.records import Campaign, FloatArray, Release, Start, Trial, TrialKind
+from discrepancy.errors import ModelError
+from discrepancy.models.interface import Model, ModelParameter, Outputs, Place
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from fe.runtime.patch import (
+    INTERNAL_FORCES,
+    SENSORS,
+    LoadGain,
+    LoadPlace,
+    ModelPatch,
+    PortForce,
+    PortLoad,
+    Primitive,
+)
+from reporting.words import counted
+
+DEFAULT_PLACE = "tip_load"
+"""What a campaign says when it does not say where the force acts; a model with one input takes that one."""
+
+
+class LoadChange(NamedTuple):
+    """What of recorded loads changes.
+
+    Attributes
+    ----------
+    gain, tare : float
+        The acting force is (1 + gain) times the recorded one, plus the tare [N] where it is not zero.
+    along_span, along_chord : float
+        How far the acting force is moved [m].
+    """
+
+    gain: float = 0.0
+    tare: float = 0.0
+    along_span: float = 0.0
+    along_chord: float = 0.0
+
+    @classmethod
+    def of(cls, patch: Iterable[Primitive]) -> "LoadChange":
+        """Return the change by gains and places, one upon the other."""
+        gain, tare, span, chord = cls()
+        for item in patch:
+            if isinstance(item, LoadGain):
+                gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare * (1.0 + item.gain) + item.tare
+            elif isinstance(item, LoadPlace):
+                span, chord = span + item.along_span, chord + item.along_chord
+        return cls(gain, tare, span, chord)
+
+
+class SortedPatch(NamedTuple):
+    """Structure (or what the model carries itself), internal forces, change of loads, loads at ports."""
+
+    structure: tuple[Primitive, ...]
+    forces: ModelPatch
+    change: LoadChange
+    loads: tuple[PortLoad, ...]
+
+
+def sorted_patch(patch: ModelPatch, model: Model, what: str, own: Collection[str] = ()) -> SortedPatch:
+    """Return the primitives of a patch by what they change; those of sensors are left out.
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        The patch.
+    model : Model
+        Which shall carry it.
+    what : str
+        Its name in sentences.
+    own : collection of str
+        Kinds of primitives that it carries itself, whatever they change elsewhere.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot carry one of them.
+    """
+    structure, forces, changes = list[Primitive](), list[Primitive](), list[Primitive]()
+    loads = list[PortLoad]()
+    for item in patch:
+        internal = isinstance(item, INTERNAL_FORCES)
+        if isinstance(item, SENSORS):
+            continue
+        if item.kind in own:
+            structure.append(item)
+        elif not (model.supports(type(item)) or (isinstance(item, PortForce) and item.port in model.ports())):
+            port = " (it has no port)" if internal and not model.ports() else ""
+            raise ModelError(f"{what} cannot carry the primitive {item.kind!r}{port}.")
+        elif internal:
+            forces.append(item)
+        elif isinstance(item, PortLoad):
+            loads.append(item)
+        else:
+            (changes if isinstance(item, LoadGain | LoadPlace) else structure).append(item)
+    return SortedPatch(tuple(structure), ModelPatch(tuple(forces)), LoadChange.of(changes), tuple(loads))
+
+
+def laws_at(forces: ModelPatch, ports: Collection[str], *, in_windows: bool = True) -> Laws:
+    """Return the laws of internal forces at ports; raises `ModelError` where one cannot be."""
+    if not len(forces):
+        return NO_LAWS
+    try:
+        return laws_of(forces, ports, in_windows=in_windows)
+    except InvalidPatchError as cause:
+        raise ModelError(str(cause)) from cause
+
+
+def prior_mean(campaign: Campaign, parameters: Sequence[ModelParameter]) -> FloatArray:
+    """Return the means (P,) of parameters, those of the campaign where it says them."""
+    return np.array([campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in parameters])
+
+
+def check_parameters(what: str, parameters: Sequence[ModelParameter], values: FloatArray) -> None:
+    """Refuse values of another number than a model, `what`, has parameters."""
+    if values.shape != (len(parameters),):
+        raise ModelError(f"{what} has {counted(len(parameters), 'parameter')}, but {values.size} came.")
+
+
+def check_outputs(what: str, model: Model, outputs: Outputs, known: Iterable[str]) -> None:
+    """Refuse outputs that a model, `what`, does not have beside those `known`, or no channel can measure."""
+    for output, quantity in outputs:
+        own = model.output_quantity(output)
+        if own is None:
+            raise ModelError(f"{what} has no output {output!r}; it has {', '.join(known)}.")
+        if not quantity.shows(own):
+            raise ModelError(
+                f"{what}: the output {output!r} is a {own.value}, but a channel measures {quantity.value}."
+            )
+
+
+def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:
+    """Return the load place of a model, `what`, that a trial means: the only one where it says none.
+
+    Raises
+    ------
+    ModelError
+        If there is no such place, or none is named of several.
+    """
+    if place == DEFAULT_PLACE and place not in places and len(places) == 1:
+        return places[0]
+    if not isinstance(place, str) or place not in places:
+        said = "no load_place is said" if place == DEFAULT_PLACE else f"the load place is {place!r}"
+        known = f"forces at {', '.join(places)}: name one of these" if places else "no force"
+        raise ModelError(f"In {where} {said}, and {what} takes {known}.")
+    return place
+
+
+def release_of(trial: Trial) -> Release:
+    """Return how a ring-down began; raises `ModelError` where it does not say it."""
+    if trial.release is None:
+        raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
+    return trial.release
+
+
+def check_no_inputs(trial: Trial, what: str) -> None:
+    """Refuse a static trial under other inputs than a force, for a model that has none."""
+    if trial.kind is TrialKind.STATIC and trial.inputs:
+        names = ", ".join(repr(item.name) for item in trial.inputs)
+        raise ModelError(
+            f"The trial {trial.name!r} is static under the inputs {names}, which {what} does not have at "
+            'rest: describe the asset as an FMU model with [[input]], or record the trial as "driven".'
+        )
+
+
+def check_lumped(trial: Trial, what: str) -> None:
+    """Refuse a flight, and a static trial under other inputs than a force, for a model without either."""
+    if trial.kind is TrialKind.FLIGHT:
+        raise ModelError(f"The trial {trial.name!r} is a flight, but {what} has no lift; leave it out.")
+    check_no_inputs(trial, what)
+
+
+def check_plain(trial: Trial, what: str) -> None:
+    """Refuse a driven trial, and a forced one that is not settled, for a model that cannot follow them."""
+    if trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED:
+        came = "is driven" if trial.kind is TrialKind.DRIVEN else f"begins {trial.begins.value}"
+        raise ModelError(
+            f"The trial {trial.name!r} {came}, which {what} cannot follow: describe the rig as a lumped "
+            "model, or record it forced from rest."
+        )
