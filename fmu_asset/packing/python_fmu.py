@@ -2,52 +2,9 @@
 
 from collections.abc import Mapping
 
-from fmu_asset.description import PLACEHOLDER, Declaration, documentation_page, model_description
+from fmu_asset.description import PLACEHOLDER, Declaration, documentation_page, model_description, rendered
 
 from .contents import BASE_CLASS_FILES, pythonfmu_members, pythonfmu_version, room_members
-
-_SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
-from {module}_runtime.entry import Fmi2Slave, Slave, keep_alive
-
-# The wrapper runs this file once for each instance and drops one reference to its globals too many.
-keep_alive(globals())
-
-
-class {class_name}(Slave, Fmi2Slave):
-    """The FMU."""
-
-    content_tag = "{tag}"
-'''
-
-_ENTRY = '''"""Joins the slave, its contents and pythonfmu's base class."""
-import ctypes
-
-from .pythonfmu.fmi2slave import Fmi2Slave
-from .slaves.base import Slave as _Slave
-{imports}
-
-__all__ = ["Fmi2Slave", "Slave", "keep_alive"]
-
-_contents = []
-
-
-def keep_alive(thing):
-    """Hold one more reference for ever, also while the interpreter shuts down and clears this module."""
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
-
-
-def load_once(resources):
-    """Read the contents once in a process: this package's name is a hash of them."""
-    if not _contents:
-        _contents.append(load_contents(resources))
-    return _contents[0]
-
-
-class Slave(_Slave):
-    """The slave with its resources."""
-
-    load_contents = staticmethod(load_once)
-'''
 
 
 def python_members(
@@ -75,15 +32,15 @@ def python_members(
     """
     module = declared.identifier
     runtime = f"resources/{module}_runtime"
-    script = _SCRIPT.format(module=module, class_name=f"{class_name}{PLACEHOLDER}", tag=PLACEHOLDER)
+    names = {"module": module, "class_name": f"{class_name}{PLACEHOLDER}", "tag": PLACEHOLDER}
     tool = f"uav-twin with PythonFMU {pythonfmu_version()}"
     return {
         "modelDescription.xml": model_description(declared, generation_tool=tool),
         "documentation/index.html": documentation_page(declared, host),
         **{f"resources/{file}": content for file, content in resources.items()},
-        f"resources/{module}.py": script.encode(),
+        f"resources/{module}.py": rendered("slave.py", **names),
         f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
-        f"{runtime}/entry.py": _ENTRY.format(imports=imports).encode(),
+        f"{runtime}/entry.py": rendered("entry.py", imports=imports),
         f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
         **room_members("fmu_asset.slaves", f"{runtime}/slaves"),
         **pythonfmu_members(module, f"{runtime}/pythonfmu", BASE_CLASS_FILES),
