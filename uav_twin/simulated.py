@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from fmu_asset.door.binding import Binding, Interpolation
-    from fmu_asset.door.simulation import ObservationHistory, SteppedAsset
+    from fmu_asset.door.reading import ObservationHistory
+    from fmu_asset.door.simulation import SteppedAsset
 
 OutFile = Annotated[Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")]
 PlotFile = Annotated[Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")]

@@ -9,9 +9,9 @@ import numpy as np
 
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.exchange import Inputs, Values, check_roles
-from fmu_asset.door.reading import Observation
+from fmu_asset.door.reading import Observation, ObservationHistory
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.simulation import ObservationHistory, SteppedAsset
+from fmu_asset.door.simulation import SteppedAsset
 from fmu_asset.errors import (
     AlgebraicLoopError,
     BindingError,

@@ -1,13 +1,12 @@
 """A binding resolved against an FMU: what is sent and read, where it stands in the blocks, in which units."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
-from fmu_asset.archive.declared import FmuDescription, VariableInfo
+from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
@@ -20,14 +19,11 @@ from .layout import (
     element_names,
     find,
     in_unit,
-    put,
     start_values,
     value_range,
 )
-from .reading import OutputTable, Selection
+from .reading import OutputTable
 from .units import IDENTITY, conversion
-
-_LARGEST = sys.float_info.max
 
 Values = Mapping[str, float | Sequence[float]]
 """Values by the binding's names: a number, or as many as the bound array or port has."""
@@ -197,15 +193,6 @@ class Exchange:
                     )
                 taken[position] = label
             self._slots[role][name] = self._slot(label, item, found[0].variable, positions)
-        # A float within these limits is sent as it is; NaN and infinities are not within them.
-        self._direct = {
-            role: {
-                name: (slot.positions[0], max(slot.low, -_LARGEST), min(slot.high, _LARGEST))
-                for name, slot in slots.items()
-                if slot.conversion == IDENTITY and not slot.whole and len(slot.positions) == 1
-            }
-            for role, slots in self._slots.items()
-        }
         self._parameter_slots = {
             name: self._parameter_slot(name, item) for name, item in self._binding.parameter.items()
         }
@@ -256,7 +243,8 @@ class Exchange:
                 f"The range of {label} {self._whose} lies outside that of {variable.name!r}, {low:g} to "
                 f"{high:g}{in_unit(variable)}; correct minimum or maximum."
             )
-        return Slot(label, positions, max(low, least), min(high, most), scale, variable)
+        plain = scale == IDENTITY and variable.kind in FLOAT_KINDS and len(positions) == 1
+        return Slot(label, positions, max(low, least), min(high, most), scale, variable, plain)
 
     def _make_outputs(self) -> None:
         """Lay out the reply block: observations, monitors, records, outputs of ports."""
@@ -290,13 +278,9 @@ class Exchange:
         positions = [self._outputs.positions(place)[0] for place in places]
         # A name that stands there twice is that of its last value.
         extra = {name: which for which, (name, *_) in enumerate(wanted[count:], count)}
+        read = [*range(count), *extra.values()]
         self.outputs = OutputTable(
-            observed=Selection(positions[:count], conversions[:count]),
-            extra_names=tuple(extra),
-            extra=Selection(
-                [positions[which] for which in extra.values()],
-                [conversions[which] for which in extra.values()],
-            ),
+            count, [*extra], [positions[which] for which in read], [conversions[which] for which in read]
         )
         self.recorded_units = {
             name: unit or place.variable.unit or "1"
@@ -362,7 +346,9 @@ class Exchange:
                 whole = len(slots[name].positions) == variable.size
                 start = start_values(self._description, variable, given=whole)
                 set_values[variable.name] = (kind, variable.reference, start)
-            put(set_values[variable.name][2], slots[name], value)
+            numbers = slots[name].numbers(value).tolist()
+            for position, number in zip(slots[name].positions, numbers, strict=True):
+                set_values[variable.name][2][position] = number
         return list(set_values.values())
 
     def place(self, target: Any, inputs: Mapping[str, Any]) -> bool:
@@ -384,17 +370,14 @@ class Exchange:
         """
         there = False
         for role, values in inputs.items():
-            if not values:
-                continue
-            there, direct = True, self._direct.get(role, {})
-            for name, value in values.items():
-                limits = direct.get(name)
-                if limits is not None and isinstance(value, float):
-                    position, low, high = limits
-                    if low <= value <= high:
-                        target[position] = value
-                        continue
-                put(target, self.slot(role, name), value)
+            for name, value in (values or {}).items():
+                there, slot = True, self.slot(role, name)
+                plain = slot.plain and isinstance(value, float) and slot.low <= value <= slot.high
+                if plain and value - value == 0.0:  # finite
+                    target[slot.positions[0]] = value
+                    continue
+                for position, number in zip(slot.positions, slot.numbers(value).tolist(), strict=True):
+                    target[position] = number
         return there
 
     def slot(self, role: str, name: str) -> Slot:

@@ -13,9 +13,9 @@ from reporting.progress import Progress
 from .binding import INPUT_ROLES, Binding
 from .draft import trial_binding
 from .history_file import InputHistories
-from .reading import Observation
+from .reading import Observation, ObservationHistory
 from .session import FmiAsset
-from .simulation import ObservationHistory, SteppedAsset
+from .simulation import SteppedAsset
 
 _STEPS = 500
 _MOST_STEPS = 10_000_000

@@ -14,7 +14,8 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table
 
 from .binding import INPUT_ROLES, Binding
-from .simulation import ObservationHistory, SteppedAsset
+from .reading import ObservationHistory
+from .simulation import SteppedAsset
 
 Roles = dict[str, dict[str, npt.NDArray[np.float64]]]
 

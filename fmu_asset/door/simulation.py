@@ -3,7 +3,6 @@
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self, Unpack
 
@@ -16,61 +15,12 @@ from reporting.progress import Progress
 
 from .binding import Binding
 from .exchange import Exchange, Inputs, Values
-from .layout import Slot, checked
-from .reading import Observation, OutputTable
-from .units import IDENTITY
+from .reading import Observation, ObservationHistory
 
 Histories = Mapping[str, npt.ArrayLike]
 """Inputs by the binding's names: a number for all steps, or one for each; (n,) or (N, n) for an array."""
 
 _BLOCK_BYTES = 2**20
-
-
-@dataclass(frozen=True)
-class ObservationHistory:
-    """What came out of N steps.
-
-    Attributes
-    ----------
-    time : (N,) ndarray
-        Time at the end of each step [s].
-    values : (N, n_obs) ndarray
-        The observations of the binding in their order and units.
-    extra : dict of str to (N,) ndarray
-        Monitors, recorded variables and outputs of ports.
-    ended : str
-        What the FMU did if it ended the simulation by itself: fewer steps were made then than were asked
-        for, and the last time is where it ended, within a step perhaps.
-    """
-
-    time: npt.NDArray[np.float64]
-    values: npt.NDArray[np.float64]
-    extra: dict[str, npt.NDArray[np.float64]]
-    ended: str = ""
-
-    @classmethod
-    def of(
-        cls,
-        table: OutputTable,
-        time: npt.NDArray[np.float64],
-        replies: npt.NDArray[np.float64],
-        ended: str = "",
-    ) -> "ObservationHistory":
-        """Return what the reply blocks of N steps hold.
-
-        Parameters
-        ----------
-        table : OutputTable
-            What is read of a reply block.
-        time : (N,) ndarray
-            Time at the end of each step [s].
-        replies : (N, n_outputs) ndarray
-            The reply blocks.
-        ended : str
-            What the FMU did if it ended the simulation by itself.
-        """
-        extra = np.ascontiguousarray(table.extra.of(replies).T)
-        return cls(time, table.observed.of(replies), dict(zip(table.extra_names, extra, strict=True)), ended)
 
 
 def request_rows(
@@ -109,12 +59,12 @@ def request_rows(
         for role, histories in roles.items()
         for name, values in (histories or {}).items()
     ]
-    arrays = [(slot, _numbers(slot, values)) for slot, values in given]
+    arrays = [(slot, slot.numbers(values, history=True)) for slot, values in given]
     count, source = steps, "`steps`"
     if count is not None and (count := operator.index(count)) < 1:
         raise FmuInputError(f"steps must be at least 1, but is {count}.")
     for slot, array in arrays:
-        if array.ndim > (len(slot.positions) != 1):
+        if array.ndim == 2:
             if count is None:
                 count, source = len(array), slot.label
             elif len(array) != count:
@@ -125,45 +75,8 @@ def request_rows(
         raise FmuInputError("Nothing says how many steps to make: give `steps`, or a history of an input.")
     rows = np.tile(held, (count, 1))
     for slot, array in arrays:
-        _fill(rows, slot, array)
+        rows[:, list(slot.positions)] = array
     return rows
-
-
-def _numbers(slot: Slot, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise FmuInputError(f"{slot.label} must be numbers ({error}).") from error
-    count = len(slot.positions)
-    if count == 1 and array.ndim == 2 and array.shape[1] == 1:
-        array = array[:, 0]
-    if array.ndim > 1 + (count != 1) or (count != 1 and (array.ndim == 0 or array.shape[-1] != count)):
-        wanted = (
-            "a number, or one for each step" if count == 1 else f"{count} values, or as many for each step"
-        )
-        raise FmuInputError(f"{slot.label} must be {wanted}, but has the shape {array.shape}.")
-    return array
-
-
-def _fill(rows: npt.NDArray[np.float64], slot: Slot, array: npt.NDArray[np.float64]) -> None:
-    """Put a history into its columns; what is not plainly in range is looked at one by one, as in a step."""
-    per_step = array.ndim > (len(slot.positions) != 1)
-    values = array if per_step else array[np.newaxis]
-    values = values.reshape(len(values), len(slot.positions))
-    with np.errstate(all="ignore"):
-        # The arithmetic of `Conversion.to_fmu`: the bits are those of a step.
-        scale = slot.conversion
-        numbers = values.copy() if scale == IDENTITY else scale.factor * values + scale.offset
-        plain = (slot.low <= numbers) & (numbers <= slot.high) & np.isfinite(numbers)
-        if slot.whole:
-            plain &= numbers == np.floor(numbers)
-    for step, element in np.argwhere(~plain).tolist():
-        try:
-            numbers[step, element] = checked(slot, values.item(step, element))
-        except FmuInputError as error:
-            where = f" It is the value of step {step} of the {len(rows)}." if per_step else ""
-            raise FmuInputError(f"{error.sentence}{where}") from error
-    rows[:, list(slot.positions)] = numbers
 
 
 def blocks(requests: npt.NDArray[np.float64], replies: npt.NDArray[np.float64]) -> Sequence[Series]:
