@@ -228,6 +228,10 @@ class FmuDescription:
             if v.causality in READABLE
         }
 
+    def units_of(self, variable: VariableInfo) -> tuple[UnitInfo, ...]:
+        """Return the definitions of units that hold for a variable."""
+        return self.units
+
     def exchange_kind(self, variable: VariableInfo) -> str:
         """Return the base type in which a variable is set and read: enumerations are integers."""
         if variable.kind != "Enumeration":

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.draft import trial_binding
+from fmu_asset.door.experiment import whole_binding
 from fmu_asset.errors import BindingError, FmuError, visible
 from reporting.progress import Progress, SilentProgress
 
@@ -109,7 +109,7 @@ def check_fmu(
     description = read_fmu(path, given.binding.interface if given else None)
     found = list(check_file(description))
     try:
-        used = given or trial_binding(description, step_size=step_size)
+        used = given or whole_binding(description, step_size=step_size)
         flights = Flights(description, used, step_timeout, memory_limit)
     except FmuError as error:
         if isinstance(error, BindingError) and given is None:

@@ -1,16 +1,15 @@
 """A system and a binding as its components see them: what each is fed, and its own binding."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
-from fmu_asset.door.units import IDENTITY
-from fmu_asset.errors import BindingError, CouplingError, FmuError
+from fmu_asset.door.exchange import Exchange
+from fmu_asset.errors import BindingError, CouplingError
 
-from .roles import Roles
 from .structure import Component, Endpoint
 from .wiring import ConnectedVariable, Wiring
 
@@ -52,78 +51,55 @@ class Part:
     binding: Binding
 
 
-class Taps:
-    """Outputs that are wanted together, in the units of who wants them.
-
-    Parameters
-    ----------
-    ports : iterable of ConnectedVariable
-        The outputs, in order.
-    place : mapping of Endpoint to int
-        Where each output stands among all that are read.
-    """
-
-    def __init__(self, ports: Iterable[ConnectedVariable], place: Mapping[Endpoint, int]) -> None:
-        wanted = list(ports)
-        self._index = np.array([place[port.end] for port in wanted], dtype=np.intp)
-        self._delayed = np.flatnonzero([port.delayed for port in wanted])
-        scales = np.array([port.conversion for port in wanted]).reshape(-1, 2)
-        self._scale = None if (scales == IDENTITY).all() else (scales[:, 0], scales[:, 1])
-
-    def of(self, now: FloatArray, before: FloatArray) -> FloatArray:
-        """Return the values, from all outputs of this moment and of the beginning of the step."""
-        values = now[self._index]
-        if self._delayed.size:
-            values[self._delayed] = before[self._index[self._delayed]]
-        if self._scale is not None:
-            values = self._scale[0] * values + self._scale[1]
-        return values
-
-
-def parts_of(wiring: Wiring, binding: Binding, roles: Roles) -> dict[str, Part]:
+def parts_of(wiring: Wiring, exchange: Exchange, *, linear: bool = False) -> dict[str, Part]:
     """Return the components of a system as they are stepped, by name.
 
     Parameters
     ----------
     wiring : Wiring
         The system.
-    binding : Binding
-        The binding.
-    roles : Roles
-        What its names stand for.
+    exchange : Exchange
+        A binding of its description.
+    linear : bool
+        Whether inputs move in straight lines where they can.
 
     Raises
     ------
     CouplingError
         If a component has no output.
     BindingError
-        If the binding asks for lines, and no input can follow them.
+        If lines are wanted, and no input can follow them.
     """
-    parts = {c.name: _part(wiring, binding, roles, c) for c in wiring.structure.components}
-    if binding.binding.interpolation == "linear" and not any(part.linear for part in parts.values()):
+    parts = {c.name: _part(wiring, exchange, c, linear=linear) for c in wiring.structure.components}
+    if linear and not any(part.linear for part in parts.values()):
         raise BindingError(
-            f"The binding {binding.name} asks for linear interpolation of inputs, but no component of the "
-            f"system {wiring.structure.name} has a continuous input and takes its derivatives "
+            f"The binding {exchange.binding.name} asks for linear interpolation of inputs, but no component "
+            f"of the system {wiring.structure.name} has a continuous input and takes its derivatives "
             "(`canInterpolateInputs`, or model exchange); leave it out."
         )
     return parts
 
 
-def _part(wiring: Wiring, binding: Binding, roles: Roles, component: Component) -> Part:
-    name = component.name
+def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: bool) -> Part:
+    name, binding = component.name, exchange.binding
+
+    def bound(variables: Iterable[str]) -> list[Endpoint]:
+        """Return the ends at this component of variables of the system."""
+        ports = [port for variable in variables for port in exchange.description.ends[variable]]  # type: ignore[attr-defined]
+        return [port.end for port in ports if port.end.component == name]
+
     fed = {target.variable: port for target, port in wiring.feeds.items() if target.component == name}
-    read = [*wiring.feeds.values(), *roles.observations, *roles.monitors.values()]
-    ends = tuple(dict.fromkeys(port.end for port in read if port.end.component == name))
+    sources = [port.end for port in wiring.feeds.values() if port.end.component == name]
+    ends = tuple(dict.fromkeys([*sources, *bound(variable.name for variable in exchange.read)]))
     ends = ends or (_any_output(wiring, name),)
-    ports = [port for table in roles.inputs.values() for ports in table.values() for port in ports]
-    given = [port.end for port in ports if port.end.component == name]
+    given = bound(variable.name for variable in exchange.sent)
     moving = frozenset(
         variable
         for variable, port in fed.items()
         if wiring.variable(port.end).continuous and wiring.variable(Endpoint(name, variable)).continuous
     )
     linear = (
-        binding.binding.interpolation == "linear"
+        linear
         and wiring.declared[name].can_interpolate_inputs
         and (bool(moving) or any(wiring.variable(end).continuous for end in given))
     )
@@ -131,7 +107,7 @@ def _part(wiring: Wiring, binding: Binding, roles: Roles, component: Component) 
     for variable, number in wiring.settings[name].items():
         is_input = wiring.variable(Endpoint(name, variable)).causality == "input"
         starts["input" if is_input else "parameter"][variable] = number
-    tuned = [port.end for ports in roles.parameters.values() for port in ports if port.end.component == name]
+    tuned = bound(item.variable for item in binding.parameter.values())
 
     def unit(variable: str) -> str:
         return wiring.variable(Endpoint(name, variable)).unit or "1"
@@ -165,17 +141,3 @@ def _any_output(wiring: Wiring, name: str) -> Endpoint:
     raise CouplingError(
         f"The component {name!r} has no output of a single number, so it takes no part; leave it out."
     )
-
-
-class naming:  # noqa: N801 - cheaper than one made of a generator
-    """A block in which an error of an FMU gets the name of its component."""
-
-    def __init__(self, component: str) -> None:
-        self._component = component
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, FmuError):
-            sentence = f"component {self._component}: {error.sentence}"
-            raise type(error)(sentence, error.messages, error.time) from error

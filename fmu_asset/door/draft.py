@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError
 
-from .binding import PORT_QUANTITIES, Binding, parse_binding
+from .binding import PORT_QUANTITIES, parse_binding
 from .exchange import Exchange
 from .units import same_dimension
 
@@ -24,6 +24,7 @@ _PORT = re.compile(
     r"(?P<stem>.*?)[._ ]?(?P<quantity>force|displacement|velocity)(?P<rest>\[\d+\])?", re.IGNORECASE
 )
 _NUMBERED = re.compile(r"(?P<stem>.*\D|)(?P<number>\d+)(?P<rest>\D*)", re.DOTALL)
+_INNER = ("local", "calculatedParameter", "none")
 _PATTERN = re.compile(r"\{\d+\.\.\d+\}")
 
 
@@ -53,9 +54,26 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
     return text
 
 
-def trial_binding(description: FmuDescription, *, step_size: float | None = None) -> Binding:
-    """Return the drafted binding itself."""
-    return parse_binding(tomllib.loads(draft_binding(description, step_size=step_size)), where="the draft")
+def bindable(variable: VariableInfo) -> bool:
+    """Return whether a variable can be bound; a pattern of ours in somebody's name would be expanded."""
+    return bool(
+        variable.numeric and not variable.clocked and variable.size and not _PATTERN.search(variable.name)
+    )
+
+
+def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> list[VariableInfo]:
+    """Return the outputs, those of real numbers if there are; a local variable where there is no output.
+
+    Raises
+    ------
+    BindingError
+        If there is nothing.
+    """
+    outputs = [variable for variable in usable if variable.causality == "output"]
+    inner = [v for v in usable if v.causality in _INNER and v.kind in FLOAT_KINDS]
+    if not (outputs or inner):
+        raise BindingError(f"{description.path} has no number that could be observed.")
+    return outputs or inner[:1]
 
 
 class _Draft:
@@ -63,13 +81,12 @@ class _Draft:
         if step_size is not None and not (math.isfinite(step_size) and step_size > 0.0):
             raise BindingError(f"The step size must be a positive number of seconds, and {step_size:g} came.")
         self._description = description
-        usable = [v for v in description.variables if v.numeric and not v.clocked and v.size]
-        # A pattern of ours in somebody's name would be expanded.
-        usable = [v for v in usable if not _PATTERN.search(v.name)]
+        usable = [v for v in description.variables if bindable(v)]
         self._inputs = [v for v in usable if v.causality == "input"]
         self._outputs = [v for v in usable if v.causality == "output"]
         self._parameters = [v for v in usable if v.causality == "parameter" and v.variability != "constant"]
-        self._others = [v for v in usable if v.causality in ("local", "calculatedParameter", "none")]
+        self._others = [v for v in usable if v.causality in _INNER]
+        self._observable = observable(description, usable)
         names = {v.name for v in usable}
         self._left_out = [v for v in description.variables if v.name not in names and v.causality != "local"]
         declared = step_size or description.fixed_step or description.step_size
@@ -84,13 +101,8 @@ class _Draft:
         for variable in self._inputs:
             if variable.name not in bound:
                 lines += self._table(self._role(variable), variable)
-        observed = [v for v in self._outputs if v.kind in FLOAT_KINDS and not _AUXILIARY.search(v.name)]
-        if not observed:
-            observed = [v for v in self._outputs if v.kind in FLOAT_KINDS] or self._outputs
-        if not observed:
-            observed = [v for v in self._others if v.kind in FLOAT_KINDS][:1]
-        if not observed:
-            raise BindingError(f"{self._description.path} has no number that could be observed.")
+        reals = [v for v in self._observable if v.kind in FLOAT_KINDS]
+        observed = [v for v in reals if not _AUXILIARY.search(v.name)] or reals or self._observable
         for group in _groups(observed):
             lines += self._table("observation", *group, key="variables")
         names = {variable.name for variable in observed}

@@ -66,6 +66,8 @@ class Exchange:
         For the instance; its folder is still empty.
     outputs : OutputTable
         What is read of the reply block.
+    sent, read : tuple of VariableInfo
+        What stands in the request and in the reply block, in order.
 
     Raises
     ------
@@ -88,6 +90,7 @@ class Exchange:
         self._reads_ports = self._port_directions()
         self._make_outputs()
         self._make_inputs()
+        self.sent, self.read = self._inputs.variables, self._outputs.variables
         self.plan = Plan(
             folder="",
             fmi_version=description.major_version,
@@ -235,7 +238,7 @@ class Exchange:
         return self._parameter_slot(name, Input(variable=name, unit=variable.unit or "1"))
 
     def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
-        scale = conversion(item.unit, variable, self._description.units, where=label)
+        scale = conversion(item.unit, variable, self._description.units_of(variable), where=label)
         low, high = value_range(variable)
         least, most = sorted(scale.to_fmu(end) for end in item.ends)
         if least > high or most < low:
@@ -271,7 +274,10 @@ class Exchange:
         self._output_names = self._outputs.names()
         conversions = [
             conversion(
-                unit or place.variable.unit or "1", place.variable, self._description.units, where=where
+                unit or place.variable.unit or "1",
+                place.variable,
+                self._description.units_of(place.variable),
+                where=where,
             )
             for (_, _, unit, where), place in zip(wanted, places, strict=True)
         ]

@@ -5,12 +5,11 @@ from typing import Self
 import numpy as np
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError
-from fmu_asset.instances.series import Series
+from fmu_asset.instances.series import Instance, Series
 from reporting.progress import Progress, SilentProgress, Stage
 
 from .exchange import Values, plain_values
 from .life import OpenedFmu
-from .placement import Instance
 from .reading import Observation, ObservationHistory
 from .saved_state import SavedState
 from .simulation import Histories, blocks, request_rows

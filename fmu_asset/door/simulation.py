@@ -1,21 +1,15 @@
-"""What is stepped: one FMU or several, and many steps under histories that are checked as a whole."""
+"""Many steps under histories that are checked as a whole."""
 
 import operator
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from types import TracebackType
-from typing import Literal, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.errors import FmuInputError
 from fmu_asset.instances.series import Series
-from reporting.progress import Progress
 
-from .binding import Binding
-from .exchange import Exchange, Inputs, Values
-from .reading import Observation, ObservationHistory
+from .exchange import Exchange
 
 Histories = Mapping[str, npt.ArrayLike]
 """Inputs by the binding's names: a number for all steps, or one for each; (n,) or (N, n) for an array."""
@@ -86,59 +80,3 @@ def blocks(requests: npt.NDArray[np.float64], replies: npt.NDArray[np.float64]) 
         Series(requests[begin : begin + length], replies[begin : begin + length])
         for begin in range(0, len(requests), length)
     ]
-
-
-class SteppedAsset(ABC):
-    """An asset that is stepped through a binding, and opened by `with` or `reset`."""
-
-    def __init__(self, binding: Binding) -> None:
-        self._binding = binding
-        self._start_time, self._interval = binding.binding.start_time, binding.interval
-        self._phase: Literal["new", "ready", "broken", "closed"] = "new"
-        self._index = 0
-
-    @property
-    def binding(self) -> Binding:
-        """The binding; of one FMU, with arrays that are observed or recorded as their elements."""
-        return self._binding
-
-    @property
-    def time(self) -> float:
-        """Time of the asset [s]: start + i * interval, never accumulated."""
-        return self._start_time + self._index * self._interval
-
-    @property
-    def step_index(self) -> int:
-        """Number of steps since the last reset."""
-        return self._index
-
-    @property
-    @abstractmethod
-    def recorded_units(self) -> dict[str, str]:
-        """Units of `Observation.extra` by name."""
-
-    @abstractmethod
-    def reset(self, parameters: Values | None = None, **inputs: Unpack[Inputs]) -> None:
-        """Go back to the start."""
-
-    @abstractmethod
-    def observe(self) -> Observation:
-        """Return the observation of this moment without a step."""
-
-    @abstractmethod
-    def simulate(self, *, steps: int | None = None, progress: Progress | None = None) -> ObservationHistory:
-        """Make many steps from where the asset is, its inputs held."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """End what runs; the asset can be opened again by `reset`."""
-
-    def __enter__(self) -> Self:
-        if self._phase != "ready":
-            self.reset()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

@@ -91,12 +91,12 @@ def test_a_state_of_something_else_is_refused(three: SystemStructure, readings: 
         asset.step({"load_factor": 2.0})
         state = asset.save_state()
         for damaged in (b"", state[:-1], b"x" + state[1:], state[:40]):
-            with pytest.raises(FmuStateError, match="not a state of coupled FMUs, or it is damaged"):
+            with pytest.raises(FmuStateError, match="not a state of .*, or it is damaged"):
                 asset.restore_state(damaged)
     delayed = tuple(replace(c, delayed=bool(c.source.component)) for c in three.connections)
     with (
         CoupledAsset(replace(three, connections=delayed), readings, isolated=False) as other,
-        pytest.raises(FmuStateError, match="another system of FMUs"),
+        pytest.raises(FmuStateError, match="another FMU than the system test"),
     ):
         other.restore_state(state)
     with pytest.raises(FmuStateError, match="no state to save"):
