@@ -1,5 +1,6 @@
 """What an FMU declares, and the texts that are made of it by the templates of this package."""
 
+import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -70,8 +71,13 @@ def _templates() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"c_text": _c_text, "c_number": _c_number}
+    environment.filters |= {"c_text": _c_text, "c_number": _c_number, "quoted": _quoted}
     return environment
+
+
+def _quoted(text: str) -> str:
+    """Return a text as JSON and TOML have it."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def rendered(name: str, /, **values: Any) -> bytes:

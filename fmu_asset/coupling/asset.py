@@ -133,7 +133,9 @@ class CoupledAsset(FmiAsset):
     def log(self) -> tuple[tuple[str, str], ...]:
         """The last messages of the FMUs: status, and component with text."""
         return tuple(
-            (status, f"{name}: {text}") for name, asset in cast("CoupledFmus", self._housing).assets.items() for status, text in asset.log
+            (status, f"{name}: {text}")
+            for name, asset in cast("CoupledFmus", self._housing).assets.items()
+            for status, text in asset.log
         )
 
     def describe(self) -> dict[str, Any]:
