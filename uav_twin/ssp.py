@@ -1,6 +1,5 @@
 """`uav-twin ssp ...`."""
 
-import dataclasses
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -116,8 +115,7 @@ def simulate(
         system = read_ssp(file, folder)
         wiring = join_ssp(system, delay or ())
         _warn(left_out_sentence(wiring, file))
-        start, end = system.span
-        described = dataclasses.replace(system_description(wiring), start_time=start, stop_time=end)
+        described = system_description(wiring, span=system.span)
         planned = default_experiment(described, stop_time=stop_time, step_size=step_size, values=given)
         with CoupledAsset(
             wiring,

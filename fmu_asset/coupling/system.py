@@ -44,7 +44,9 @@ class SystemDescription(FmuDescription):
         return found
 
 
-def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
+def system_description(
+    wiring: Wiring, sha256: str = "", span: tuple[float | None, float | None] = (None, None)
+) -> SystemDescription:
     """Return a system as the description of one FMU, all of whose variables are real numbers.
 
     Outputs of components that a connector shows are local variables; the ranges and types of inputs are
@@ -56,6 +58,8 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
         The system.
     sha256 : str
         Stands for all that the meaning of a state depends on.
+    span : (float or None, float or None)
+        Start and end of the default experiment [s].
     """
     shown = {port.end for port in wiring.outward.values()}
     found = [_of_connector(wiring, connector) for connector in wiring.structure.connectors]
@@ -98,6 +102,8 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
             for number, (variable, _, _) in enumerate(found)
         ),
         units=(),
+        start_time=span[0],
+        stop_time=span[1],
         step_size=min((size for size in steps if size is not None), default=None),
         ends={variable.name: ends for variable, ends, _ in found},
         definitions={variable.name: units for variable, _, units in found},

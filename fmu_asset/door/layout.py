@@ -271,7 +271,8 @@ class Slot(NamedTuple):
         if len(wrong_ones):
             step, element = wrong_ones[0].tolist()
             where = f" It is the value of step {step} of the {len(rows)}." if per_step else ""
-            raise FmuInputError(self._refusal(rows[step, element].item(), values[step, element]) + where)
+            shown = given if isinstance(given, int | float) else rows[step, element].item()
+            raise FmuInputError(self._refusal(shown, values[step, element]) + where)
         inside = np.where((self.low <= values) & (values <= self.high), values, inside)
         return inside if per_step else inside[0]
 
