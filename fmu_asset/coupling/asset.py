@@ -9,10 +9,9 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import AlgebraicLoopError, BindingError, CouplingError
 
 from .instance import CoupledFmus, Coupling, naming
-from .layout import parts_of
 from .schedule import Schedule, loop_sentence
 from .structure import SystemStructure, listed
-from .system import system_description, wiring_hash
+from .system import parts_of, system_description, wiring_hash
 from .wiring import Wiring
 
 Algorithm = Literal["gauss_seidel", "jacobi"]

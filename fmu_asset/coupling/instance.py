@@ -8,6 +8,7 @@ from itertools import accumulate, pairwise
 from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 
 from fmu_asset.archive.declared import VariableInfo
 from fmu_asset.door.placement import Housing, ResetTrial, Start
@@ -18,11 +19,12 @@ from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, IterationEr
 from fmu_asset.instances.plan import Settings
 from fmu_asset.instances.series import Instance, Series, run
 
-from .layout import FloatArray, Part
 from .schedule import Schedule
 from .structure import Endpoint, listed
-from .system import SystemDescription
+from .system import Part, SystemDescription
 from .wiring import ConnectedVariable
+
+FloatArray = npt.NDArray[np.float64]
 
 
 class CoupledState(PackedState):

@@ -34,13 +34,13 @@ from .contents import (
     emptied,
     filled,
     guid_of,
+    python_members,
     room_members,
     tag_of,
     write_fmu,
 )
 from .patch_file import PatchFile
 from .patched_runtime import output_channels, patched_members, plain_effects
-from .python_fmu import python_members
 
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""

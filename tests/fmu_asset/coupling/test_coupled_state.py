@@ -91,7 +91,7 @@ def test_a_state_of_something_else_is_refused(three: SystemStructure, readings: 
         asset.step({"load_factor": 2.0})
         state = asset.save_state()
         for damaged in (b"", state[:-1], b"x" + state[1:], state[:40]):
-            with pytest.raises(FmuStateError, match="not a state of .*, or it is damaged"):
+            with pytest.raises(FmuStateError, match=r"not a state of .*, or it is damaged"):
                 asset.restore_state(damaged)
     delayed = tuple(replace(c, delayed=bool(c.source.component)) for c in three.connections)
     with (

@@ -294,7 +294,7 @@ def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(
     with CoupledAsset(structure, ranged, isolated=False) as asset:
         asset.step({"push": 2.0})
         before = asset.observe()
-        with pytest.raises(FmuInputError, match="control.push = 2.5 lies outside the range of 'push', -1 to 2"):
+        with pytest.raises(FmuInputError, match=r"push = 2\.5 lies outside .* 'push', -1 to 2"):
             asset.step({"push": 2.5})
         assert asset.step_index == 1
         np.testing.assert_array_equal(asset.observe().values, before.values)

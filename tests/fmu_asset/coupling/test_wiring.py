@@ -211,8 +211,18 @@ def test_bindings_that_do_not_fit(base: SystemStructure) -> None:
         ("observation", "wing.load_factor", "1", "declared as input"),
         ("observation", "percent", "s", "and there is no conversion"),
         ("parameter", "push", "1", "of causality parameter, but 'push' is declared as input"),
-        ("parameter", "wing.load_factor", "1", "of causality parameter, but 'wing.load_factor' is declared as input"),
-        ("monitor", "wing.load", "1", "'wing.load', which is not a variable of the system base; did you mean"),
+        (
+            "parameter",
+            "wing.load_factor",
+            "1",
+            "parameter, but 'wing.load_factor' is declared as input",
+        ),
+        (
+            "monitor",
+            "wing.load",
+            "1",
+            "which is not a variable of the system base; did you mean",
+        ),
     ):
         with pytest.raises(ValueError, match=words):
             CoupledAsset(wiring, parse_binding(bound(role, variable, unit)))
