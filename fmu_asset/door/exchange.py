@@ -1,12 +1,13 @@
 """A binding resolved against an FMU: what is sent and read, where it stands in the blocks, in which units."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
-from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
+from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
@@ -24,6 +25,9 @@ from .layout import (
 )
 from .reading import OutputTable
 from .units import IDENTITY, conversion
+
+_LARGEST = sys.float_info.max
+_NOWHERE = (0, 1.0, 0.0)
 
 Values = Mapping[str, float | Sequence[float]]
 """Values by the binding's names: a number, or as many as the bound array or port has."""
@@ -196,6 +200,15 @@ class Exchange:
                     )
                 taken[position] = label
             self._slots[role][name] = self._slot(label, item, found[0].variable, positions)
+        # What is sent as it is: real numbers within these limits, which NaN and infinities are not.
+        self._plain = {
+            role: {
+                name: (slot.positions[0], max(slot.low, -_LARGEST), min(slot.high, _LARGEST))
+                for name, slot in slots.items()
+                if slot.conversion == IDENTITY and not slot.whole and len(slot.positions) == 1
+            }
+            for role, slots in self._slots.items()
+        }
         self._parameter_slots = {
             name: self._parameter_slot(name, item) for name, item in self._binding.parameter.items()
         }
@@ -246,8 +259,7 @@ class Exchange:
                 f"The range of {label} {self._whose} lies outside that of {variable.name!r}, {low:g} to "
                 f"{high:g}{in_unit(variable)}; correct minimum or maximum."
             )
-        plain = scale == IDENTITY and variable.kind in FLOAT_KINDS and len(positions) == 1
-        return Slot(label, positions, max(low, least), min(high, most), scale, variable, plain)
+        return Slot(label, positions, max(low, least), min(high, most), scale, variable)
 
     def _make_outputs(self) -> None:
         """Lay out the reply block: observations, monitors, records, outputs of ports."""
@@ -376,12 +388,15 @@ class Exchange:
         """
         there = False
         for role, values in inputs.items():
-            for name, value in (values or {}).items():
-                there, slot = True, self.slot(role, name)
-                plain = slot.plain and isinstance(value, float) and slot.low <= value <= slot.high
-                if plain and value - value == 0.0:  # finite
-                    target[slot.positions[0]] = value
+            if not values:
+                continue
+            there, plain = True, self._plain.get(role, {})
+            for name, value in values.items():
+                position, low, high = plain.get(name, _NOWHERE)
+                if isinstance(value, float) and low <= value <= high:
+                    target[position] = value
                     continue
+                slot = self.slot(role, name)
                 for position, number in zip(slot.positions, slot.numbers(value).tolist(), strict=True):
                     target[position] = number
         return there

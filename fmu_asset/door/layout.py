@@ -202,10 +202,7 @@ def start_values(description: FmuDescription, variable: VariableInfo, *, given: 
 
 
 class Slot(NamedTuple):
-    """Where an input goes: positions in the request block, range in the FMU's unit, conversion.
-
-    `plain` is what takes one real number in the FMU's unit.
-    """
+    """Where an input goes: positions in the request block, range in the FMU's unit, conversion."""
 
     label: str
     positions: Sequence[int]
@@ -213,7 +210,6 @@ class Slot(NamedTuple):
     high: float
     conversion: Conversion
     variable: VariableInfo
-    plain: bool = False
 
     @property
     def whole(self) -> bool:

@@ -79,9 +79,8 @@ class OutputTable:
         scales = np.array(conversions).reshape(-1, 2).T
         self._scale = None if all(item == IDENTITY for item in conversions) else scales
 
-    def _picked(self, blocks: Floats) -> Floats:
-        """Return the values in the binding's units; never a view."""
-        values: Floats = blocks[..., self._index]
+    def _converted(self, values: Floats) -> Floats:
+        """Return values in the binding's units; never a view."""
         if self._scale is None:
             return values.copy()
         factor, offset = self._scale
@@ -90,14 +89,14 @@ class OutputTable:
 
     def observation(self, block: Floats, time: float) -> Observation:
         """Return what a block (n_outputs,) of a moment [s] holds."""
-        values = self._picked(block)
+        values = self._converted(block[self._index])
         # Both are of one table; to compare their lengths would take as long as the rest of the line.
         extra = dict(zip(self._extra, values[self._observed :].tolist()))  # noqa: B905
         return Observation(values[: self._observed], time, extra)
 
     def history(self, time: Floats, blocks: Floats, ended: str = "") -> ObservationHistory:
         """Return what the blocks (N, n_outputs) of moments (N,) [s] hold; `ended` as in the history."""
-        values = self._picked(blocks)
+        values = self._converted(blocks[:, self._index])
         extra = np.ascontiguousarray(values[:, self._observed :].T)
         observed = np.ascontiguousarray(values[:, : self._observed])
         return ObservationHistory(time, observed, dict(zip(self._extra, extra, strict=True)), ended)
