@@ -80,17 +80,9 @@ def system_description(
     return SystemDescription(
         path=Path(f"the system {wiring.structure.name}"),
         sha256=sha256,
-        file_size=0,
-        fmi_version="2.0",
         model_name=wiring.structure.name,
-        model_identifier="",
-        guid="",
-        description="",
-        generation_tool="",
-        platforms=(),
         can_get_and_set_state=True,
         can_serialise_state=True,
-        can_vary_step=True,
         # An input that nobody gives keeps the start value of its FMU.
         variables=tuple(
             replace(
@@ -103,7 +95,6 @@ def system_description(
             )
             for number, (variable, _, _) in enumerate(found)
         ),
-        units=(),
         start_time=span[0],
         stop_time=span[1],
         step_size=min((size for size in steps if size is not None), default=None),
@@ -122,19 +113,7 @@ def _of_connector(
         causalities = {wiring.variable(port.end).causality for port in ends} or {"connected to nothing"}
         causality = " and ".join(sorted(causalities))
     units = tuple(unit for port in ends for unit in wiring.declared[port.end.component].units)
-    variable = VariableInfo(
-        name=connector.name,
-        reference=0,
-        kind="Real",
-        causality=causality,
-        variability="continuous",
-        description="",
-        unit=wiring.units[connector.name],
-        display_unit=None,
-        minimum=None,
-        maximum=None,
-        start=None,
-    )
+    variable = VariableInfo(connector.name, 0, causality=causality, unit=wiring.units[connector.name])
     return variable, ends, (*wiring.structure.units, *units)
 
 

@@ -86,6 +86,23 @@ def test_worker_process_and_resumption_are_equal_to_the_bit(
         assert fly(asset, range(3)) != whole[:3]
 
 
+def test_a_system_is_flown_in_one_go_and_forked_as_one_fmu_is(
+    three: SystemStructure, readings: Binding
+) -> None:
+    inner = {"variables": ["wing.tip_displacement", "damage.z2"]}
+    binding = parse_binding(readings.model_dump(exclude_none=True, exclude={"limits"}) | {"record": inner})
+    with CoupledAsset(three, binding, isolated=False) as asset:
+        history = asset.simulate({"load_factor": [2.0, 3.0, 2.0, 3.0]})
+        with asset.fork() as other:
+            there = [other.step({"load_factor": 2.0}).values.tobytes() for _ in range(2)]
+        assert [asset.step({"load_factor": 2.0}).values.tobytes() for _ in range(2)] == there
+        asset.reset()
+        seen = [asset.step({"load_factor": 2.0 + index % 2}) for index in range(4)]
+    assert history.values.tobytes() == np.array([item.values for item in seen]).tobytes()
+    for name in ("z1", "wing.tip_displacement", "damage.z2"):
+        assert history.extra[name].tolist() == [item.extra[name] for item in seen]
+
+
 def test_a_state_of_something_else_is_refused(three: SystemStructure, readings: Binding) -> None:
     with CoupledAsset(three, readings, isolated=False) as asset:
         asset.step({"load_factor": 2.0})
