@@ -11,7 +11,7 @@ from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
-from .binding import INPUT_ROLES, Binding, Input
+from .binding import INPUT_ROLES, Binding, Input, Vector
 from .layout import (
     BlockLayout,
     Place,
@@ -91,7 +91,7 @@ class Exchange:
         self.description = self._description = description
         self.binding = self._binding = binding.with_arrays(self._elements)
         self._whose = f"of the binding {binding.name}"
-        self._reads_ports = self._port_directions()
+        self._ports = self._port_vectors()
         self._make_outputs()
         self._make_inputs()
         self.sent, self.read = self._inputs.variables, self._outputs.variables
@@ -122,11 +122,11 @@ class Exchange:
     def _find(self, name: str, label: str, causality: str) -> Place:
         return find(self._description, name, f"{label} {self._whose}", causality)
 
-    def _port_directions(self) -> dict[str, bool]:
-        """Return for every quantity of a port whether it is read; force and motion go opposite ways."""
-        reads = {}
+    def _port_vectors(self) -> list[tuple[str, Vector, bool]]:
+        """Return what ports have: name, vector, whether it is read; force goes one way and motion the other."""
+        found = []
         for name, port in self._binding.port.items():
-            own = {}
+            reads: dict[str, bool] = {}
             for quantity, vector in port.quantities.items():
                 label = f"port.{name}.{quantity}"
                 if len(vector.variables) != len(port.force.variables):
@@ -137,28 +137,19 @@ class Exchange:
                 causalities = {self._causality(variable) == "input" for variable in vector.variables}
                 if len(causalities) > 1:
                     raise BindingError(f"{label} {self._whose} mixes inputs and outputs of the FMU.")
-                own[quantity] = not causalities.pop()
-                reads[f"{name}.{quantity}"] = own[quantity]
-            force = own.pop("force")
-            if force in own.values():
+                reads[quantity] = not causalities.pop()
+                found.append((f"{name}.{quantity}", vector, reads[quantity]))
+            force = reads.pop("force")
+            if force in reads.values():
                 raise BindingError(
                     f"In port.{name} {self._whose}, force and motion are both "
                     f"{'outputs' if force else 'inputs'} of the FMU; at a port one is given for the other."
                 )
-        return reads
+        return found
 
     def _causality(self, name: str) -> str:
         variable = self._description.variable(name) or self._description.variable(name.rpartition("[")[0])
         return "" if variable is None else variable.causality
-
-    def _port_vectors(self, *, read: bool) -> list[tuple[str, tuple[str, ...], str]]:
-        """Return name, variables and unit of the ports' quantities that are read, or that are sent."""
-        return [
-            (f"{name}.{quantity}", vector.variables, vector.units[0])
-            for name, port in self._binding.port.items()
-            for quantity, vector in port.quantities.items()
-            if self._reads_ports[f"{name}.{quantity}"] == read
-        ]
 
     def _make_inputs(self) -> None:
         """Lay out the request block: time, step size, all inputs."""
@@ -168,8 +159,9 @@ class Exchange:
             for name, item in self._binding.inputs(role).items()
         ]
         wanted += [
-            ("port", name, Input(variable=variables[0], unit=unit), variables)
-            for name, variables, unit in self._port_vectors(read=False)
+            ("port", name, Input(variable=vector.variables[0], unit=vector.units[0]), vector.variables)
+            for name, vector, read in self._ports
+            if not read
         ]
         places = [
             [self._find(variable, f"{role}.{name}", "input") for variable in variables]
@@ -275,11 +267,11 @@ class Exchange:
             for name, scalar in binding.monitor.items()
         ]
         wanted += [(name, name, "", "record.variables") for name in binding.record.variables]
-        for label, variables, unit in self._port_vectors(read=True):
-            several = len(variables) > 1
+        for label, vector, read in self._ports:
+            several = len(vector.variables) > 1
             wanted += [
-                (f"{label}[{number}]" if several else label, name, unit, f"port.{label}")
-                for number, name in enumerate(variables, 1)
+                (f"{label}[{number}]" if several else label, name, vector.units[0], f"port.{label}")
+                for number, name in enumerate(vector.variables if read else (), 1)
             ]
         places = [self._find(name, where, "output") for _, name, _, where in wanted]
         self._outputs = BlockLayout(self._description, [place.variable for place in places], begin=0)
@@ -296,9 +288,9 @@ class Exchange:
         positions = [self._outputs.positions(place)[0] for place in places]
         # A name that stands there twice is that of its last value.
         extra = {name: which for which, (name, *_) in enumerate(wanted[count:], count)}
-        read = [*range(count), *extra.values()]
+        chosen = [*range(count), *extra.values()]
         self.outputs = OutputTable(
-            count, [*extra], [positions[which] for which in read], [conversions[which] for which in read]
+            count, [*extra], [positions[which] for which in chosen], [conversions[which] for which in chosen]
         )
         self.recorded_units = {
             name: unit or place.variable.unit or "1"

@@ -134,10 +134,7 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
                 _last_reach.clear()
                 if not receive(incoming, memoryview(content)) or asked:
                     break
-                call: tuple[str, tuple[Any, ...]] = ("", ())
-                if operation == Operation.CALL:
-                    call = pickle.loads(content)
-                name, arguments = call
+                name, arguments = _called(operation, content)
                 if name == "open":
                     plan = arguments[0]
                 if name in ("open", "renew") and plan is not None:
@@ -170,6 +167,12 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
         send(outgoing, reply_header, payload)
         look(poll)
     return asked, instance
+
+
+def _called(operation: int, content: bytearray) -> tuple[str, tuple[Any, ...]]:
+    """Return the method that is called, and its arguments; an empty name for another operation."""
+    call: tuple[str, tuple[Any, ...]] = pickle.loads(content) if operation == Operation.CALL else ("", ())
+    return call
 
 
 def _run(instance: FmuInstance, content: bytearray, outgoing: int, number: int) -> memoryview:
