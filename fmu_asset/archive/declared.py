@@ -127,7 +127,7 @@ class UnitInfo:
     exponents: tuple[int, ...] | None
     factor: float
     offset: float
-    displays: tuple[tuple[str, float, float], ...]
+    displays: tuple[tuple[str, float, float], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ class Exchange:
         return find(self._description, name, f"{label} {self._whose}", causality)
 
     def _port_vectors(self) -> list[tuple[str, Vector, bool]]:
-        """Return what ports have: name, vector, whether it is read; force goes one way and motion the other."""
+        """Return what ports have: name, vector, and whether it is read, which is so of force or of motion."""
         found = []
         for name, port in self._binding.port.items():
             reads: dict[str, bool] = {}
