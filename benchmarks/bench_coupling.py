@@ -13,11 +13,11 @@ from benchmarks.measurement import Measurement, median_seconds
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.companions.build import build_companion
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.layout import parts_of
-from fmu_asset.coupling.roles import resolve_roles
 from fmu_asset.coupling.structure import Component, Connector, Setting, SystemStructure, expand_connection
+from fmu_asset.coupling.system import parts_of, system_description
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu
 from scenarios import binding_files
@@ -77,7 +77,7 @@ def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, 
 
     The FMUs alone have the bindings and inputs that they have in the system, and nothing passes between them.
     """
-    parts = parts_of(wiring, binding, resolve_roles(wiring, binding))
+    parts = parts_of(wiring, Exchange(system_description(wiring), binding))
     loads = itertools.cycle((2.0, 3.0))
     assets, inputs = [], []
     with CoupledAsset(wiring, binding, isolated=False) as coupled:

@@ -1,12 +1,16 @@
-"""The model description (modelDescription.xml) of FMI 2 or 3 and the documentation page, from the table."""
+"""What an FMU declares, and the texts that are made of it by the templates of this package."""
 
+import json
+import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
+from functools import cache
 from importlib.metadata import version
 from itertools import groupby
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from fmu_asset.slaves.variables import ENUMERATIONS, EnumerationType, FmuVariable, Unit
 
@@ -57,15 +61,42 @@ class Declaration:
         return f"{self.name}_{PLACEHOLDER}"
 
 
-def number(value: float) -> str:
-    """Return a float as the shortest text that reads back to the same bits."""
-    return repr(float(value))
+@cache
+def _templates() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("fmu_asset"),
+        autoescape=select_autoescape(("xml.jinja", "html.jinja", "ssd.jinja", "ssv.jinja", "ssm.jinja")),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"c_text": _c_text, "c_number": _c_number, "quoted": _quoted}
+    return environment
 
 
-def xml_bytes(root: Element) -> bytes:
-    """Return an XML file, indented."""
-    indent(root)
-    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
+def _quoted(text: str) -> str:
+    """Return a text as JSON and TOML have it."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def rendered(name: str, /, **values: Any) -> bytes:
+    """Return what a template of `fmu_asset/templates` makes of values, as UTF-8; floats keep their bits."""
+    return _templates().get_template(f"{name}.jinja").render(**values).encode()
+
+
+def _c_text(text: str) -> str:
+    """Return a text as a C string; units are anything that a user writes, and messages go through printf."""
+    plain = (
+        chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}"
+        for byte in text.encode()
+    )
+    return f'"{"".join(plain)}"'
+
+
+def _c_number(value: float | None, absent: str) -> str:
+    """Return a float as a C constant that has the same bits."""
+    return absent if value is None or math.isinf(value) else repr(float(value))
 
 
 @dataclass(frozen=True)
@@ -86,7 +117,11 @@ class ArrayVariable:
     @property
     def description(self) -> str:
         """Return that of the first element with i in the place of its index or name, and all names."""
-        labels = [_label(row.name) for row in self.rows]
+        labels = [
+            found["index"] or found["label"]
+            for found in (_ELEMENT.fullmatch(row.name) for row in self.rows)
+            if found
+        ]
         text = re.sub(rf"\b{re.escape(labels[0])}\b|\b1\b", "i", self.rows[0].description, count=1)
         return text if labels[0] == "1" else f"{text}; i is one of {', '.join(labels)}"
 
@@ -108,12 +143,6 @@ def arrays_of(table: Sequence[FmuVariable]) -> tuple[ArrayVariable, ...]:
 def _stem(row: FmuVariable) -> str | None:
     match = _ELEMENT.fullmatch(row.name)
     return None if match is None or row.causality == "parameter" or row.kind != "Real" else match["stem"]
-
-
-def _label(name: str) -> str:
-    match = _ELEMENT.fullmatch(name)
-    assert match is not None
-    return match["index"] or match["label"]
 
 
 def model_description(
@@ -147,194 +176,82 @@ def model_description(
     bytes
         UTF-8 XML.
     """
+    heads = {array.rows[0].reference: array for array in arrays}
     inner = {row.reference for array in arrays for row in array.rows[1:]}
     rows = [row for row in declared.table if row.reference not in inner]
-    root = Element(
-        "fmiModelDescription",
-        {
-            "fmiVersion": f"{fmi}.0",
-            "modelName": declared.name,
-            "guid" if fmi == 2 else "instantiationToken": PLACEHOLDER,
-            "description": declared.description,
-            "version": version("uav-twin"),
-            "generationTool": generation_tool,
-            "variableNamingConvention": "structured",
-        },
-    )
-    if fmi == 2:
-        root.set("numberOfEventIndicators", "0")
-    exchange = any(row.causality == "local" for row in rows)
-    _add_interface(root, declared.identifier, source_files, fmi, exchange=exchange)
-    _add_units(root, declared.units)
-    types = SubElement(root, "TypeDefinitions")
-    for enumeration in declared.enumerations:
-        said = {"name": enumeration.name, "description": enumeration.description}
-        if fmi == 2:
-            items = SubElement(SubElement(types, "SimpleType", said), "Enumeration")
-        else:
-            items = SubElement(types, "EnumerationType", said)
-        for name, value, text in enumeration.items:
-            SubElement(items, "Item", name=name, value=str(value), description=text)
-    categories = SubElement(root, "LogCategories")
-    for name, text in LOG_CATEGORIES.items():
-        SubElement(categories, "Category", name=name, description=text.replace("fmi2", f"fmi{fmi}"))
-    SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="50.0", stepSize="1.0")
-    _add_variables(root, rows, {array.rows[0].reference: array for array in arrays}, fmi)
-    _add_structure(root, rows, declared.dependencies, fmi)
-    return xml_bytes(root)
-
-
-_ABILITIES_2 = ("canNotUseMemoryManagementFunctions", "canGetAndSetFMUstate", "canSerializeFMUstate")
-_ABILITIES_3 = (
-    "canGetAndSetFMUState",
-    "canSerializeFMUState",
-    "providesDirectionalDerivatives",
-    "providesAdjointDerivatives",
-)
-_NO_NOTICE = {"completedIntegratorStepNotNeeded": "true"}
-
-
-def _add_interface(
-    root: Element, identifier: str, source_files: Sequence[str], fmi: int, *, exchange: bool
-) -> None:
-    source, steps = "true" if source_files else "false", {"canHandleVariableCommunicationStepSize": "true"}
-    said = {
-        "modelIdentifier": identifier,
-        "needsExecutionTool": "false" if source_files else "true",
-        "canBeInstantiatedOnlyOncePerProcess": "false",
-    }
-    if fmi == 2:
-        said |= dict.fromkeys(_ABILITIES_2, "true")
-        said |= _NO_NOTICE if exchange else {**steps, "canInterpolateInputs": source}
-        if source_files:
-            said["providesDirectionalDerivative"] = "true"
-    else:
-        said |= dict.fromkeys(_ABILITIES_3, "true") | ({} if exchange else steps)
-    interface = SubElement(root, "ModelExchange" if exchange else "CoSimulation", said)
-    if fmi == 2 and source_files:
-        listed = SubElement(interface, "SourceFiles")
-        for name in source_files:
-            SubElement(listed, "File", name=name)
-
-
-def _add_units(root: Element, units: Sequence[Unit]) -> None:
-    defined = SubElement(root, "UnitDefinitions")
-    for unit in units:
-        element = SubElement(defined, "Unit", name=unit.name)
-        SubElement(element, "BaseUnit", {symbol: str(power) for symbol, power in unit.exponents})
-        for name, factor in unit.displays:
-            SubElement(element, "DisplayUnit", name=name, factor=number(factor))
-
-
-def _rates(rows: Sequence[FmuVariable]) -> dict[int, FmuVariable]:
-    """Return the derivatives among rows, by the value reference of their states."""
     local = [row for row in rows if row.causality == "local"]
-    count = len(local) // 2
-    return {state.reference: rate for state, rate in zip(local[:count], local[count:], strict=True)}
-
-
-def _add_variables(
-    root: Element, rows: Sequence[FmuVariable], heads: Mapping[int, ArrayVariable], fmi: int
-) -> None:
-    states = {rate.reference: state for state, rate in _rates(rows).items()}
-    variables = SubElement(root, "ModelVariables")
-    for row in rows:
-        array = heads.get(row.reference)
-        outer = {
-            "name": row.name if array is None else array.name,
-            "valueReference": str(row.reference),
-            "description": row.description if array is None else array.description,
-            "causality": row.causality,
-            "variability": row.variability,
-        }
-        if row.causality in ("parameter", "output", "local"):
-            outer["initial"] = "exact" if row.causality == "parameter" else "calculated"
-        inner = _of_type(row, array)
-        if row.reference in states:
-            # FMI 2 counts variables from 1, and ours stand at their value references.
-            inner["derivative"] = str(states[row.reference] + (fmi == 2))
-        if fmi == 2:
-            SubElement(SubElement(variables, "ScalarVariable", outer), row.kind, inner)
-        else:
-            element = SubElement(variables, "Float64" if row.kind == "Real" else row.kind, outer | inner)
-            if array is not None:
-                SubElement(element, "Dimension", start=str(len(array.rows)))
-
-
-def _of_type(row: FmuVariable, array: ArrayVariable | None) -> dict[str, str]:
-    """Return the attributes of a variable that its type has: unit, range, start value."""
-    write = _WRITERS[row.kind]
-    found = {"declaredType": row.enumeration, "unit": row.unit, "displayUnit": row.display_unit}
-    # An enumeration's range is its items.
-    if row.kind in ("Real", "Integer"):
-        for name, value in (("min", row.minimum), ("max", row.maximum)):
-            found[name] = None if value is None else write(value)
-    if row.start is not None:
-        rows = (row,) if array is None else array.rows
-        found["start"] = " ".join(write(each.start or 0.0) for each in rows)
-    return {name: value for name, value in found.items() if value is not None}
-
-
-def _add_structure(
-    root: Element, rows: Sequence[FmuVariable], dependencies: Mapping[str, Sequence[str]], fmi: int
-) -> None:
-    structure = SubElement(root, "ModelStructure")
-    reference = {row.name: row.reference for row in rows}
+    states, rates = local[: len(local) // 2], local[len(local) // 2 :]
+    # FMI 2 counts variables from 1, and ours stand at their value references.
+    state_of = {
+        rate.reference: state.reference + (fmi == 2) for state, rate in zip(states, rates, strict=True)
+    }
     outputs = [row for row in rows if row.causality == "output"]
-    for group, kind, unknown in (
-        ("Outputs", "Output", outputs),
-        ("Derivatives", "ContinuousStateDerivative", list(_rates(rows).values())),
-        ("InitialUnknowns", "InitialUnknown", [row for row in rows if row.causality in ("output", "local")]),
-    ):
-        if fmi == 3:
-            for row in unknown:
-                SubElement(structure, kind, valueReference=str(row.reference))
-        elif unknown:
-            holder = SubElement(structure, group)
-            for row in unknown:
-                element = SubElement(holder, "Unknown", index=str(row.reference + 1))
-                if group == "Outputs" and row.name in dependencies:
-                    inputs = sorted(reference[source] + 1 for source in dependencies[row.name])
-                    element.set("dependencies", " ".join(map(str, inputs)))
+    unknowns = [row for row in rows if row.causality in ("output", "local")]
+    place = {row.name: row.reference + 1 for row in rows}
+    return rendered(
+        "modelDescription.xml",
+        declared=declared,
+        fmi=fmi,
+        tool=generation_tool,
+        version=version("uav-twin"),
+        token=PLACEHOLDER,
+        sources=source_files,
+        exchange=bool(local),
+        categories=LOG_CATEGORIES,
+        variables=[
+            (row.kind, *_attributes(row, heads.get(row.reference), state_of.get(row.reference)))
+            for row in rows
+        ],
+        dependencies={
+            name: sorted(place[source] for source in sources)
+            for name, sources in declared.dependencies.items()
+        },
+        structure=(
+            ("Outputs", "Output", outputs),
+            ("Derivatives", "ContinuousStateDerivative", rates),
+            ("InitialUnknowns", "InitialUnknown", unknowns),
+        ),
+    )
 
 
-_WRITERS: Mapping[str, Callable[[float], str]] = {
-    "Real": number,
-    "Integer": lambda value: str(int(value)),
-    "Enumeration": lambda value: str(int(value)),
-    "Boolean": lambda value: "true" if value else "false",
-}
+def _attributes(
+    row: FmuVariable, array: ArrayVariable | None, state: int | None
+) -> tuple[dict[str, Any], dict[str, Any], int]:
+    """Return what is said of a variable, what of it belongs to its type, and its length as an array."""
+    said = {
+        "name": row.name if array is None else array.name,
+        "valueReference": row.reference,
+        "description": row.description if array is None else array.description,
+        "causality": row.causality,
+        "variability": row.variability,
+        "initial": {"parameter": "exact", "input": None, "independent": None}.get(
+            row.causality, "calculated"
+        ),
+    }
+    ranged = row.kind in ("Real", "Integer")  # an enumeration's range is its items
+    rows = (row,) if array is None else array.rows
+    of_type = {
+        "declaredType": row.enumeration,
+        "unit": row.unit,
+        "displayUnit": row.display_unit,
+        "min": _written(row.kind, row.minimum) if ranged else None,
+        "max": _written(row.kind, row.maximum) if ranged else None,
+        "start": row.start if row.start is None else " ".join(
+            str(_written(row.kind, each.start or 0.0)) for each in rows
+        ),
+        "derivative": state,
+    }  # fmt: skip
+    return said, of_type, 0 if array is None else len(array.rows)
+
+
+def _written(kind: str, value: float | None) -> str | None:
+    if value is None or kind == "Real":
+        return None if value is None else repr(float(value))
+    return str(bool(value)).lower() if kind == "Boolean" else str(int(value))
 
 
 def documentation_page(
     declared: Declaration, host: str, *, fmi: int = 2, interface: str = "co-simulation"
 ) -> bytes:
     """Return documentation/index.html: what the FMU is and its variables, as UTF-8 without any request."""
-    rows = []
-    for row in declared.table:
-        start = "" if row.start is None else f"{row.start:g}"
-        limits = "".join(
-            f"{sign} {value:g} "
-            for sign, value in (("≥", row.minimum), ("≤", row.maximum))
-            if value is not None
-        )
-        cells = (row.name, row.causality, row.unit or "", limits, start, row.description)
-        rows.append("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>")
-    statuses = "".join(
-        f"<li>{enumeration.name} {value} ({name}): {escape(text)}</li>"
-        for enumeration in declared.enumerations
-        for name, value, text in enumeration.items
-    )
-    body = "\n".join(rows)
-    page = f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{declared.name}</title>
-<style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
-td,th{{text-align:left;padding:.2em .8em .2em 0;border-bottom:1px solid #ddd}}</style></head><body>
-<h1>{declared.name}</h1><p>{escape(declared.description)}</p>
-<p>FMI {fmi}.0 {interface}. {escape(host)} A call that is refused logs why, sets
-<code>status</code> and leaves state and outputs as they were; a refused step returns fmi{fmi}Discard.</p>
-<table><tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>meaning</th></tr>
-{body}
-</table><h2>Enumerations</h2><ul>{statuses}</ul></body></html>
-"""
-    return page.encode("utf-8")
+    return rendered("index.html", declared=declared, host=host, fmi=fmi, interface=interface)

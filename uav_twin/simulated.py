@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from fmu_asset.door.binding import Binding, Interpolation
-    from fmu_asset.door.simulation import ObservationHistory, SteppedAsset
+    from fmu_asset.door.reading import ObservationHistory
+    from fmu_asset.door.session import FmiAsset
 
 OutFile = Annotated[Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")]
 PlotFile = Annotated[Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")]
@@ -76,7 +77,7 @@ def interpolated(binding: "Binding", kind: str | None) -> "Binding":
 
 
 def say(
-    asset: "SteppedAsset",
+    asset: "FmiAsset",
     history: "ObservationHistory",
     file: Path,
     written: list[Path | None],
@@ -99,7 +100,7 @@ def say(
 
 
 def _columns(
-    asset: "SteppedAsset", history: "ObservationHistory"
+    asset: "FmiAsset", history: "ObservationHistory"
 ) -> "list[tuple[str, str, npt.NDArray[np.float64]]]":
     """Return name, unit and values of every output."""
     binding, units = asset.binding, asset.recorded_units
@@ -108,7 +109,7 @@ def _columns(
     return [*names, *((name, units[name], values) for name, values in history.extra.items())]
 
 
-def draw(path: Path, asset: "SteppedAsset", history: "ObservationHistory") -> None:
+def draw(path: Path, asset: "FmiAsset", history: "ObservationHistory") -> None:
     """Draw the outputs over time, those of one unit in one panel, and write the picture."""
     from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
     from reporting.files import atomic_write_bytes

@@ -102,8 +102,8 @@ def simulate(
 ) -> None:
     """Simulate the system of an SSP file from its start; all outputs of the system and its components."""
     from fmu_asset.coupling.asset import CoupledAsset
-    from fmu_asset.coupling.experiment import system_experiment
-    from fmu_asset.door.experiment import fly
+    from fmu_asset.coupling.system import system_description
+    from fmu_asset.door.experiment import default_experiment, fly
     from fmu_asset.door.history_file import write_history
     from fmu_asset.ssp.check import join_ssp, left_out_sentence
     from fmu_asset.ssp.reader import read_ssp
@@ -115,8 +115,8 @@ def simulate(
         system = read_ssp(file, folder)
         wiring = join_ssp(system, delay or ())
         _warn(left_out_sentence(wiring, file))
-        span = (system.span[0], system.span[1] if stop_time is None else stop_time)
-        planned = system_experiment(wiring, span=span, step_size=step_size, values=given)
+        described = system_description(wiring, span=system.span)
+        planned = default_experiment(described, stop_time=stop_time, step_size=step_size, values=given)
         with CoupledAsset(
             wiring,
             interpolated(planned.binding, interpolation),

@@ -57,15 +57,15 @@ class VariableInfo:
 
     name: str
     reference: int
-    kind: str
-    causality: str
-    variability: str
-    description: str
-    unit: str | None
-    display_unit: str | None
-    minimum: float | None
-    maximum: float | None
-    start: str | None
+    kind: str = "Real"
+    causality: str = "local"
+    variability: str = "continuous"
+    description: str = ""
+    unit: str | None = None
+    display_unit: str | None = None
+    minimum: float | None = None
+    maximum: float | None = None
+    start: str | None = None
     shape: tuple[int, ...] = ()
     dimensions: tuple[str | None, ...] = ()
     clocked: bool = False
@@ -127,7 +127,7 @@ class UnitInfo:
     exponents: tuple[int, ...] | None
     factor: float
     offset: float
-    displays: tuple[tuple[str, float, float], ...]
+    displays: tuple[tuple[str, float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -174,20 +174,20 @@ class FmuDescription:
     """
 
     path: Path
-    sha256: str
-    file_size: int
-    fmi_version: str
-    model_name: str
-    model_identifier: str
-    guid: str
-    description: str
-    generation_tool: str
-    platforms: tuple[str, ...]
-    can_get_and_set_state: bool
-    can_serialise_state: bool
-    can_vary_step: bool
-    variables: tuple[VariableInfo, ...]
-    units: tuple[UnitInfo, ...]
+    sha256: str = ""
+    file_size: int = 0
+    fmi_version: str = "2.0"
+    model_name: str = ""
+    model_identifier: str = ""
+    guid: str = ""
+    description: str = ""
+    generation_tool: str = ""
+    platforms: tuple[str, ...] = ()
+    can_get_and_set_state: bool = False
+    can_serialise_state: bool = False
+    can_vary_step: bool = True
+    variables: tuple[VariableInfo, ...] = ()
+    units: tuple[UnitInfo, ...] = ()
     interface: Interface = "co-simulation"
     interfaces: tuple[str, ...] = ("co-simulation",)
     needs_tool: bool = False
@@ -227,6 +227,10 @@ class FmuDescription:
             for v in self.variables
             if v.causality in READABLE
         }
+
+    def units_of(self, variable: VariableInfo) -> tuple[UnitInfo, ...]:
+        """Return the definitions of units that hold for a variable."""
+        return self.units
 
     def exchange_kind(self, variable: VariableInfo) -> str:
         """Return the base type in which a variable is set and read: enumerations are integers."""

@@ -8,11 +8,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from fmu_asset.archive.declared import FmuDescription
-from fmu_asset.door.binding import INPUT_ROLES, Binding
-from fmu_asset.door.layout import find, start_values
+from fmu_asset.archive.declared import FmuDescription, VariableInfo
+from fmu_asset.door.binding import INPUT_ROLES, Binding, Input
+from fmu_asset.door.layout import find
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import conversion
 from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
 from reporting.progress import Progress
 
@@ -106,20 +105,19 @@ class Flights:
         )
 
     def _base_inputs(self) -> Inputs:
-        """Return the start values of the inputs in the binding's units; zeros where a new size took them."""
-        resized = bool(self._binding.binding.structural_parameters)
+        """Return zeros for arrays whose start values a new size took; all else begins at its own."""
         base: Inputs = {role: {} for role in INPUT_ROLES}
-        for role in INPUT_ROLES:
+        for role in INPUT_ROLES if self._binding.binding.structural_parameters else ():
             for name, item in self._binding.inputs(role).items():
-                place = find(self._description, item.variable, f"{role}.{name}", "input")
-                scale = conversion(item.unit, place.variable, self._description.units, where=f"{role}.{name}")
-                count = len((place.variable.start or "0").split())
-                lost = resized and count not in (1, place.variable.size)
-                values = start_values(self._description, place.variable, given=lost)
-                chosen = values if place.element is None else [values[place.element]]
-                given = [scale.from_fmu(value) for value in chosen]
-                base[role][name] = given if place.variable.shape and place.element is None else given[0]
+                variable, size = self._place(role, name, item)
+                if len((variable.start or "0").split()) not in (1, variable.size):
+                    base[role][name] = [0.0] * size
         return base
+
+    def _place(self, role: str, name: str, item: Input) -> tuple[VariableInfo, int]:
+        """Return the variable of an input, and how many values the input has."""
+        place = find(self._description, item.variable, f"{role}.{name}", "input")
+        return place.variable, place.size
 
     def _fly(self, asset: FmiAsset | None = None) -> Series:
         """Return the outputs (N, n) of a flight at the start values, from the start."""
@@ -213,7 +211,7 @@ class Flights:
         return "skipped", "No input has a range."
 
     def _ends(self, asset: FmiAsset, role: str, name: str) -> list[float]:
-        if isinstance(self._base[role][name], list):
+        if self._place(role, name, self._binding.inputs(role)[name])[1] != 1:
             return []
         ends = asset.input_range(role, name)
         return [end for end in ends if math.isfinite(end) and abs(end) < 1e9]

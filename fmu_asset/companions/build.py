@@ -12,10 +12,10 @@ from fmu_asset.packing.contents import (
     FmuInfo,
     check_start,
     checked_target,
+    python_members,
     sealed,
     write_fmu,
 )
-from fmu_asset.packing.python_fmu import python_members
 from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable, Unit
 
 from . import damage_growth, strain_gauges

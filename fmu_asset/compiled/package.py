@@ -8,7 +8,6 @@ from importlib.metadata import distribution
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
-from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 import numpy.typing as npt
@@ -16,19 +15,21 @@ import numpy.typing as npt
 from fe.runtime.reduced_arrays import ReducedArrays
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.description import (
+    LOG_CATEGORIES,
+    PLACEHOLDER,
+    ArrayVariable,
     Declaration,
     arrays_of,
     documentation_page,
     model_description,
-    xml_bytes,
+    rendered,
 )
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.table import Roles
-from fmu_asset.slaves.variables import TRANSIENT, FmuVariable
+from fmu_asset.slaves.variables import ENUMERATIONS, TRANSIENT, FmuVariable
 
 from .compiler import PLATFORM, Platform, compile_library
-from .variable_header import variable_sources
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -215,9 +216,8 @@ def compiled_members(
     arrays = arrays_of(table) if fmi == 3 else ()
     sources |= variable_sources(table, roles, arrays)
     listed = sorted(name for name in sources if name.endswith(".c"))
-    sources["CMakeLists.txt"] = _cmake_lists(declared.identifier, listed, fmi)
-    if fmi == 3:
-        sources["buildDescription.xml"] = _build_description(declared.identifier, listed)
+    for name in ("CMakeLists.txt", "buildDescription.xml")[: fmi - 1]:
+        sources[name] = rendered(name, identifier=declared.identifier, sources=listed, fmi=fmi)
     return {
         "modelDescription.xml": model_description(
             declared, generation_tool="uav-twin", source_files=listed, fmi=fmi, arrays=arrays
@@ -230,53 +230,50 @@ def compiled_members(
     }
 
 
-def _build_description(identifier: str, source_files: Sequence[str]) -> bytes:
-    """Return sources/buildDescription.xml: which sources the binary of that identifier is made of."""
-    root = Element("fmiBuildDescription", fmiVersion="3.0")
-    configuration = SubElement(root, "BuildConfiguration", modelIdentifier=identifier)
-    listed = SubElement(configuration, "SourceFileSet", language="C11")
-    for name in source_files:
-        SubElement(listed, "SourceFile", name=name)
-    return xml_bytes(root)
+def variable_sources(
+    table: Sequence[FmuVariable], roles: Roles, arrays: Sequence[ArrayVariable] = ()
+) -> dict[str, bytes]:
+    """Return the C sources that say what the variables are; placeholders stand for GUID and content tag.
 
+    Parameters
+    ----------
+    table : sequence of FmuVariable
+        The variables, in order of their value reference.
+    roles : Roles
+        Which of them is what.
+    arrays : sequence of ArrayVariable
+        Which rows of the table pass together, in FMI 3.
 
-def _cmake_lists(identifier: str, names: Sequence[str], fmi: FmiVersion) -> bytes:
-    """Return the CMake project that makes the binary of any platform, in its place beside the sources."""
-    folder = (
-        "${machine}-${system}" if fmi == 3 else "${system}64"  # FMI 2 has names for x86-64 alone
-    )
-    systems = {"Windows": "windows" if fmi == 3 else "win", "Darwin": "darwin"}
-    named = "".join(
-        f'elseif(CMAKE_SYSTEM_NAME STREQUAL "{k}")\n  set(system {v})\n' for k, v in systems.items()
-    )
-    text = f"""# cmake -S sources -B build && cmake --build build --config Release
-cmake_minimum_required(VERSION 3.16)
-project({identifier} C)
-if(NOT CMAKE_BUILD_TYPE)
-  set(CMAKE_BUILD_TYPE Release)
-endif()
-set(system linux)
-if(CMAKE_SYSTEM_NAME STREQUAL "Linux")
-{named}endif()
-set(machine x86_64)
-if(CMAKE_SYSTEM_PROCESSOR MATCHES "arm64|aarch64")
-  set(machine aarch64)
-endif()
-add_library({identifier} SHARED {" ".join(names)})
-set_target_properties({identifier} PROPERTIES
-  PREFIX "" C_STANDARD 11 C_VISIBILITY_PRESET hidden
-  LIBRARY_OUTPUT_DIRECTORY "$<1:${{CMAKE_CURRENT_SOURCE_DIR}}/../binaries/{folder}>"
-  RUNTIME_OUTPUT_DIRECTORY "$<1:${{CMAKE_CURRENT_SOURCE_DIR}}/../binaries/{folder}>")
-if(APPLE)
-  set_target_properties({identifier} PROPERTIES SUFFIX ".dylib")
-endif()
-if(NOT MSVC)
-  # Fused multiplications would make the last bit depend on the processor that is compiled for.
-  target_compile_options({identifier} PRIVATE -ffp-contract=off -fno-math-errno)
-  target_link_libraries({identifier} PRIVATE m)
-endif()
-"""
-    return text.encode()
+    Returns
+    -------
+    dict of str to bytes
+        File name to content: `structure_variables.h` and `structure_variables.c`.
+    """
+    outputs = [row for row in table if row.causality == "output"]
+    local = [row.reference for row in table if row.causality == "local"]
+    counts = {
+        "VARIABLE_COUNT": len(table),
+        "INPUT_COUNT": sum(row.causality == "input" for row in table),
+        "FIRST_OUTPUT": outputs[0].reference,
+        "OUTPUT_COUNT": roles.outputs,
+        "OUTPUT_MODES": sum(row.name.startswith("frequency[") for row in outputs),
+        "CHOSEN_COUNT": len(roles.chosen),
+        "POINT_LOAD": roles.point_load,
+        "LOG_CATEGORIES": len(LOG_CATEGORIES),
+        # Of model exchange: states, and then as many rates.
+        "FIRST_STATE": min(local, default=len(table)),
+        "STATE_COUNT": len(local) // 2,
+    }
+    elements = {
+        row.reference: (f"{array.name}[{index + 1}]", 0 if index else len(array.rows))
+        for array in arrays
+        for index, row in enumerate(array.rows)
+    }
+    values = {"table": table, "roles": roles, "counts": counts, "shown": elements, "token": PLACEHOLDER}
+    values |= {"categories": LOG_CATEGORIES, "enumerations": ENUMERATIONS}
+    place = {row.name: row.reference for row in table}
+    names = ("structure_variables.h", "structure_variables.c")
+    return {name: rendered(name, place=place, **values) for name in names}
 
 
 def _sources(fmi: FmiVersion) -> dict[str, bytes]:

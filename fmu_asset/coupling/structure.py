@@ -154,37 +154,15 @@ class SystemStructure:
         CouplingError
             If no connection ends there.
         """
-        ends = {self.locate(target) for target in targets}
-        missing = ends - {connection.target for connection in self.connections}
-        if missing:
+        wanted = set(targets)
+        ends = [str(connection.target) for connection in self.connections]
+        if missing := wanted - {*ends}:
             raise CouplingError(
                 f"No connection of the system {self.name} ends at {listed(sorted(missing))}, so none can be "
-                f"delayed there; connections end at {listed(c.target for c in self.connections)}."
+                f"delayed there; connections end at {listed(ends)}."
             )
-        return replace(
-            self,
-            connections=tuple(replace(c, delayed=c.delayed or c.target in ends) for c in self.connections),
-        )
-
-    def locate(self, text: str) -> Endpoint:
-        """Return the end that a text names: `component.variable`, or a connector of the system.
-
-        Raises
-        ------
-        CouplingError
-            If the system has neither.
-        """
-        if any(connector.name == text for connector in self.connectors):
-            return Endpoint("", text)
-        names = [c.name for c in self.components if text.startswith(f"{c.name}.")]
-        if names:
-            owner = max(names, key=len)
-            return Endpoint(owner, text[len(owner) + 1 :])
-        raise CouplingError(
-            f"The system {self.name} has no connector {text!r} and no component that {text!r} begins with; "
-            f"its connectors are {listed(c.name for c in self.connectors)}, its components "
-            f"{listed(c.name for c in self.components)}."
-        )
+        delayed = [replace(c, delayed=c.delayed or str(c.target) in wanted) for c in self.connections]
+        return replace(self, connections=tuple(delayed))
 
 
 def listed(names: object) -> str:

@@ -161,58 +161,51 @@ class Wiring:
         taken[target] = source
         if not (math.isfinite(connection.factor) and math.isfinite(connection.offset)):
             raise CouplingError(f"The transformation from {source} to {target} must be finite.")
-        if source.component and target.component:
-            self._join(connection)
-        elif target.component:
-            self._enter(connection)
-        elif source.component:
-            self._leave(connection)
-        else:
+        if not (source.component or target.component):
             raise CouplingError(
                 f"The connection from {source} to {target} joins two connectors of the system; one end must "
                 "be a component."
             )
-
-    def _join(self, connection: Connection) -> None:
-        source, target = self._readable(connection.source), self._writable(connection.target, ("input",))
-        self._fit(connection, source, target)
-        conversion = self._converted(connection, source.unit, target.unit)
-        self.feeds[connection.target] = ConnectedVariable(connection.source, conversion, connection.delayed)
-
-    def _enter(self, connection: Connection) -> None:
-        connector = self._connector(connection.source, ("input", "parameter"), "the source")
-        causalities = ("input",) if connector.kind == "input" else ("parameter", "input")
-        target = self._writable(connection.target, causalities)
-        if connection.delayed:
-            raise CouplingError(f"The connection from the input {connection.source} cannot be delayed.")
-        if self.units[connector.name] is None:
-            self.units[connector.name] = target.unit
-        conversion = self._converted(connection, self.units[connector.name], target.unit)
-        self.inward[connector.name] += (ConnectedVariable(connection.target, conversion, False),)
-
-    def _leave(self, connection: Connection) -> None:
-        connector = self._connector(connection.target, ("output",), "the target")
-        source = self._readable(connection.source)
-        if self.units[connector.name] is None:
-            self.units[connector.name] = source.unit
-        conversion = self._converted(connection, source.unit, self.units[connector.name])
-        self.outward[connector.name] = ConnectedVariable(connection.source, conversion, connection.delayed)
-
-    def _readable(self, end: Endpoint) -> VariableInfo:
-        variable = self.variable(end)
-        if variable.causality not in READABLE or not variable.single:
-            raise CouplingError(
-                f"{end} cannot be the source of a connection: it is declared as {variable.causality} of the "
-                f"type {variable.kind}, and an output of a single number is needed."
+        outer = gives = takes = None
+        if source.component:
+            gives = self._single(
+                source, READABLE, "the source of a connection", "an output of a single number is needed"
             )
-        return variable
+        else:
+            outer = self._connector(source, ("input", "parameter"), "the source")
+            if connection.delayed:
+                raise CouplingError(f"The connection from the input {source} cannot be delayed.")
+        if target.component:
+            causalities = ("input",) if outer is None or outer.kind == "input" else ("parameter", "input")
+            needed = f"a single number is needed as {' or '.join(causalities)}"
+            takes = self._single(target, causalities, "the target of this connection", needed)
+        else:
+            outer = self._connector(target, ("output",), "the target")
+        if outer is None:
+            assert gives is not None
+            assert takes is not None
+            self._fit(connection, gives, takes)
+        elif self.units[outer.name] is None:
+            self.units[outer.name] = (gives or takes).unit  # type: ignore[union-attr]
+        own = None if outer is None else self.units[outer.name]
+        conversion = self._converted(
+            connection, own if gives is None else gives.unit, own if takes is None else takes.unit
+        )
+        joined = ConnectedVariable(source if gives else target, conversion, connection.delayed)
+        if outer is None:
+            self.feeds[target] = joined
+        elif gives is None:
+            self.inward[outer.name] += (joined,)
+        else:
+            self.outward[outer.name] = joined
 
-    def _writable(self, end: Endpoint, causalities: tuple[str, ...]) -> VariableInfo:
+    def _single(self, end: Endpoint, causalities: tuple[str, ...], what: str, needed: str) -> VariableInfo:
+        """Return the variable at an end, which must be a single number of one of these causalities."""
         variable = self.variable(end)
         if variable.causality not in causalities or not variable.single:
             raise CouplingError(
-                f"{end} cannot be the target of this connection: it is declared as {variable.causality} of "
-                f"the type {variable.kind}, and a single number is needed as {' or '.join(causalities)}."
+                f"{end} cannot be {what}: it is declared as {variable.causality} of the type "
+                f"{variable.kind}, and {needed}."
             )
         return variable
 

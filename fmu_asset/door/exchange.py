@@ -11,7 +11,7 @@ from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
-from .binding import INPUT_ROLES, Binding, Input
+from .binding import INPUT_ROLES, Binding, Input, Vector
 from .layout import (
     BlockLayout,
     Place,
@@ -20,14 +20,14 @@ from .layout import (
     element_names,
     find,
     in_unit,
-    put,
     start_values,
     value_range,
 )
-from .reading import OutputTable, Selection
+from .reading import OutputTable
 from .units import IDENTITY, conversion
 
 _LARGEST = sys.float_info.max
+_NOWHERE = (0, 1.0, 0.0)
 
 Values = Mapping[str, float | Sequence[float]]
 """Values by the binding's names: a number, or as many as the bound array or port has."""
@@ -70,6 +70,8 @@ class Exchange:
         For the instance; its folder is still empty.
     outputs : OutputTable
         What is read of the reply block.
+    sent, read : tuple of VariableInfo
+        What stands in the request and in the reply block, in order.
 
     Raises
     ------
@@ -89,9 +91,10 @@ class Exchange:
         self.description = self._description = description
         self.binding = self._binding = binding.with_arrays(self._elements)
         self._whose = f"of the binding {binding.name}"
-        self._reads_ports = self._port_directions()
+        self._ports = self._port_vectors()
         self._make_outputs()
         self._make_inputs()
+        self.sent, self.read = self._inputs.variables, self._outputs.variables
         self.plan = Plan(
             folder="",
             fmi_version=description.major_version,
@@ -119,11 +122,11 @@ class Exchange:
     def _find(self, name: str, label: str, causality: str) -> Place:
         return find(self._description, name, f"{label} {self._whose}", causality)
 
-    def _port_directions(self) -> dict[str, bool]:
-        """Return for every quantity of a port whether it is read; force and motion go opposite ways."""
-        reads = {}
+    def _port_vectors(self) -> list[tuple[str, Vector, bool]]:
+        """Return what ports have: name, vector, and whether it is read, which is so of force or of motion."""
+        found = []
         for name, port in self._binding.port.items():
-            own = {}
+            reads: dict[str, bool] = {}
             for quantity, vector in port.quantities.items():
                 label = f"port.{name}.{quantity}"
                 if len(vector.variables) != len(port.force.variables):
@@ -134,28 +137,19 @@ class Exchange:
                 causalities = {self._causality(variable) == "input" for variable in vector.variables}
                 if len(causalities) > 1:
                     raise BindingError(f"{label} {self._whose} mixes inputs and outputs of the FMU.")
-                own[quantity] = not causalities.pop()
-                reads[f"{name}.{quantity}"] = own[quantity]
-            force = own.pop("force")
-            if force in own.values():
+                reads[quantity] = not causalities.pop()
+                found.append((f"{name}.{quantity}", vector, reads[quantity]))
+            force = reads.pop("force")
+            if force in reads.values():
                 raise BindingError(
                     f"In port.{name} {self._whose}, force and motion are both "
                     f"{'outputs' if force else 'inputs'} of the FMU; at a port one is given for the other."
                 )
-        return reads
+        return found
 
     def _causality(self, name: str) -> str:
         variable = self._description.variable(name) or self._description.variable(name.rpartition("[")[0])
         return "" if variable is None else variable.causality
-
-    def _port_vectors(self, *, read: bool) -> list[tuple[str, tuple[str, ...], str]]:
-        """Return name, variables and unit of the ports' quantities that are read, or that are sent."""
-        return [
-            (f"{name}.{quantity}", vector.variables, vector.units[0])
-            for name, port in self._binding.port.items()
-            for quantity, vector in port.quantities.items()
-            if self._reads_ports[f"{name}.{quantity}"] == read
-        ]
 
     def _make_inputs(self) -> None:
         """Lay out the request block: time, step size, all inputs."""
@@ -165,8 +159,9 @@ class Exchange:
             for name, item in self._binding.inputs(role).items()
         ]
         wanted += [
-            ("port", name, Input(variable=variables[0], unit=unit), variables)
-            for name, variables, unit in self._port_vectors(read=False)
+            ("port", name, Input(variable=vector.variables[0], unit=vector.units[0]), vector.variables)
+            for name, vector, read in self._ports
+            if not read
         ]
         places = [
             [self._find(variable, f"{role}.{name}", "input") for variable in variables]
@@ -197,8 +192,8 @@ class Exchange:
                     )
                 taken[position] = label
             self._slots[role][name] = self._slot(label, item, found[0].variable, positions)
-        # A float within these limits is sent as it is; NaN and infinities are not within them.
-        self._direct = {
+        # What is sent as it is: real numbers within these limits, which NaN and infinities are not.
+        self._plain = {
             role: {
                 name: (slot.positions[0], max(slot.low, -_LARGEST), min(slot.high, _LARGEST))
                 for name, slot in slots.items()
@@ -248,7 +243,7 @@ class Exchange:
         return self._parameter_slot(name, Input(variable=name, unit=variable.unit or "1"))
 
     def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
-        scale = conversion(item.unit, variable, self._description.units, where=label)
+        scale = conversion(item.unit, variable, self._description.units_of(variable), where=label)
         low, high = value_range(variable)
         least, most = sorted(scale.to_fmu(end) for end in item.ends)
         if least > high or most < low:
@@ -272,31 +267,30 @@ class Exchange:
             for name, scalar in binding.monitor.items()
         ]
         wanted += [(name, name, "", "record.variables") for name in binding.record.variables]
-        for label, variables, unit in self._port_vectors(read=True):
-            several = len(variables) > 1
+        for label, vector, read in self._ports:
+            several = len(vector.variables) > 1
             wanted += [
-                (f"{label}[{number}]" if several else label, name, unit, f"port.{label}")
-                for number, name in enumerate(variables, 1)
+                (f"{label}[{number}]" if several else label, name, vector.units[0], f"port.{label}")
+                for number, name in enumerate(vector.variables if read else (), 1)
             ]
         places = [self._find(name, where, "output") for _, name, _, where in wanted]
         self._outputs = BlockLayout(self._description, [place.variable for place in places], begin=0)
         self._output_names = self._outputs.names()
         conversions = [
             conversion(
-                unit or place.variable.unit or "1", place.variable, self._description.units, where=where
+                unit or place.variable.unit or "1",
+                place.variable,
+                self._description.units_of(place.variable),
+                where=where,
             )
             for (_, _, unit, where), place in zip(wanted, places, strict=True)
         ]
         positions = [self._outputs.positions(place)[0] for place in places]
         # A name that stands there twice is that of its last value.
         extra = {name: which for which, (name, *_) in enumerate(wanted[count:], count)}
+        chosen = [*range(count), *extra.values()]
         self.outputs = OutputTable(
-            observed=Selection(positions[:count], conversions[:count]),
-            extra_names=tuple(extra),
-            extra=Selection(
-                [positions[which] for which in extra.values()],
-                [conversions[which] for which in extra.values()],
-            ),
+            count, [*extra], [positions[which] for which in chosen], [conversions[which] for which in chosen]
         )
         self.recorded_units = {
             name: unit or place.variable.unit or "1"
@@ -362,7 +356,9 @@ class Exchange:
                 whole = len(slots[name].positions) == variable.size
                 start = start_values(self._description, variable, given=whole)
                 set_values[variable.name] = (kind, variable.reference, start)
-            put(set_values[variable.name][2], slots[name], value)
+            numbers = slots[name].numbers(value).tolist()
+            for position, number in zip(slots[name].positions, numbers, strict=True):
+                set_values[variable.name][2][position] = number
         return list(set_values.values())
 
     def place(self, target: Any, inputs: Mapping[str, Any]) -> bool:
@@ -386,15 +382,15 @@ class Exchange:
         for role, values in inputs.items():
             if not values:
                 continue
-            there, direct = True, self._direct.get(role, {})
+            there, plain = True, self._plain.get(role, {})
             for name, value in values.items():
-                limits = direct.get(name)
-                if limits is not None and isinstance(value, float):
-                    position, low, high = limits
-                    if low <= value <= high:
-                        target[position] = value
-                        continue
-                put(target, self.slot(role, name), value)
+                position, low, high = plain.get(name, _NOWHERE)
+                if isinstance(value, float) and low <= value <= high:
+                    target[position] = value
+                    continue
+                slot = self.slot(role, name)
+                for position, number in zip(slot.positions, slot.numbers(value).tolist(), strict=True):
+                    target[position] = number
         return there
 
     def slot(self, role: str, name: str) -> Slot:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -10,17 +10,17 @@ from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.errors import BindingError, FmuInputError
 from reporting.progress import Progress
 
-from .binding import INPUT_ROLES, Binding
-from .draft import trial_binding
+from .binding import Binding, Header, Input, Parameter, Vector
+from .draft import bindable, observable
 from .history_file import InputHistories
-from .reading import Observation
+from .reading import Observation, ObservationHistory
 from .session import FmiAsset
-from .simulation import ObservationHistory, SteppedAsset
 
 _STEPS = 500
 _MOST_STEPS = 10_000_000
 
 Value = float | list[float]
+Bound = TypeVar("Bound", Input, Parameter)
 
 
 class Experiment(NamedTuple):
@@ -73,32 +73,66 @@ def default_experiment(
     """
     end = description.stop_time if stop_time is None else stop_time
     size = step_size or description.fixed_step or description.step_size
-    _, steps, size = steps_to(description.start_time or 0.0, end, size)
-    binding = trial_binding(description, step_size=size)
-    places = {item.variable: ("parameter", name) for name, item in binding.parameter.items()}
-    for role in INPUT_ROLES:
-        places |= {item.variable: (role, name) for name, item in binding.inputs(role).items()}
-    for name, port in binding.port.items():
-        places |= {v.variables[0]: ("port", f"{name}.{key}") for key, v in port.quantities.items()}
+    steps, size = _steps_to(description.start_time or 0.0, end, size)
+    binding = whole_binding(description, step_size=size)
     structural = [v.name for v in description.variables if v.causality == "structuralParameter"]
-    places |= {name: ("structural", name) for name in structural}
-    given: dict[str, dict[str, Value]] = {}
-    for variable, value in (values or {}).items():
-        if variable not in places:
+    given: dict[str, dict[str, Value]] = {"parameter": {}, "load": {}, "structural": {}}
+    places = {
+        **dict.fromkeys(binding.parameter, "parameter"),
+        **dict.fromkeys(binding.load, "load"),
+        **dict.fromkeys(structural, "structural"),
+    }
+    for name, value in (values or {}).items():
+        if name not in places:
             some = ", ".join(list(places)[:20]) or "none"
             raise BindingError(
-                f"{description.path} has no parameter or input {variable!r} that takes numbers; it has {some}"
+                f"{description.path} has no parameter or input {name!r} that takes numbers; it has {some}"
                 f"{', ...' if len(places) > 20 else ''}."
             )
-        role, name = places[variable]
-        given.setdefault(role, {})[name] = value
-    header = {"structural_parameters": given.pop("structural", {})}
-    binding = binding.model_copy(update={"binding": binding.binding.model_copy(update=header)})
-    return Experiment(binding, steps, given.pop("parameter", {}), given)
+        given[places[name]][name] = value
+    header = binding.binding.model_copy(update={"structural_parameters": given["structural"]})
+    binding = binding.model_copy(update={"binding": header})
+    return Experiment(binding, steps, given["parameter"], {"load": given["load"]})
 
 
-def steps_to(start: float, end: float | None, size: float | None) -> tuple[float, int, float]:
-    """Return start, number and size of the steps to an end: a second, and 500 steps, where nothing says more.
+def whole_binding(description: FmuDescription, *, step_size: float | None = None) -> Binding:
+    """Return a binding of all numbers of an FMU, by their own names and in its units.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU, or a system of several.
+    step_size : float, optional
+        Communication step size [s]; that of the FMU's default experiment, or 1.
+
+    Raises
+    ------
+    BindingError
+        If the FMU has no number to observe.
+    """
+    usable = [v for v in description.variables if bindable(v)]
+
+    def of(causality: str, kind: type[Bound]) -> dict[str, Bound]:
+        found = [v for v in usable if v.causality == causality and v.variability != "constant"]
+        return {v.name: kind(variable=v.name, unit=v.unit or "1") for v in found}
+
+    return Binding(
+        binding=Header(
+            name=description.model_name or "fmu",
+            step_size=step_size or description.fixed_step or description.step_size or 1.0,
+            start_time=description.start_time or 0.0,
+            interface=description.interface,
+        ),
+        load=of("input", Input),
+        parameter=of("parameter", Parameter),
+        observation={
+            v.name: Vector(variables=(v.name,), unit=v.unit or "1") for v in observable(description, usable)
+        },
+    )
+
+
+def _steps_to(start: float, end: float | None, size: float | None) -> tuple[int, float]:
+    """Return number and size of the steps to an end: a second, and 500 steps, where nothing says more.
 
     Raises
     ------
@@ -117,7 +151,7 @@ def steps_to(start: float, end: float | None, size: float | None) -> tuple[float
             f"From {start:g} to {end:g} s there are {steps} steps of {size:g} s, more than {_MOST_STEPS}; "
             "give another step size or end."
         )
-    return start, steps, size
+    return steps, size
 
 
 def fly_histories(asset: FmiAsset, given: InputHistories, progress: Progress) -> ObservationHistory:
@@ -156,7 +190,7 @@ def _from_start(first: Observation, then: ObservationHistory) -> ObservationHist
     )
 
 
-def fly(asset: SteppedAsset, experiment: Experiment, progress: Progress) -> ObservationHistory:
+def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> ObservationHistory:
     """Start an asset, and return its start and what came out of the steps after it.
 
     Parameters

@@ -14,7 +14,8 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table
 
 from .binding import INPUT_ROLES, Binding
-from .simulation import ObservationHistory, SteppedAsset
+from .reading import ObservationHistory
+from .session import FmiAsset
 
 Roles = dict[str, dict[str, npt.NDArray[np.float64]]]
 
@@ -94,16 +95,14 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
     return InputHistories(len(time), roles)
 
 
-def write_history(
-    path: Path, asset: SteppedAsset, source: tuple[str, str], history: ObservationHistory
-) -> None:
+def write_history(path: Path, asset: FmiAsset, source: tuple[str, str], history: ObservationHistory) -> None:
     """Write what came out of a simulation, whole or not at all: NetCDF if the name ends with .nc, else CSV.
 
     Parameters
     ----------
     path : Path
         The file.
-    asset : SteppedAsset
+    asset : FmiAsset
         The asset that was simulated.
     source : (str, str)
         Name and SHA-256 of its file.
@@ -149,7 +148,7 @@ def _input_names(binding: Binding) -> dict[str, tuple[str, str]]:
     }
 
 
-def _netcdf(asset: SteppedAsset, source: tuple[str, str], history: ObservationHistory) -> bytes:
+def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistory) -> bytes:
     import xarray as xr
 
     binding, units = asset.binding, asset.recorded_units

@@ -5,10 +5,11 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import accumulate, groupby, product
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
@@ -122,18 +123,11 @@ class BlockLayout:
     description : FmuDescription
         The FMU.
     variables : sequence of VariableInfo
-        What is exchanged; one that is named twice stands there once.
+        What is exchanged; a variable that is there twice stands once in the block.
     begin : int
         Position of the first value.
     linear : bool
-        Whether continuous ones, which then come first, move in straight lines.
-
-    Attributes
-    ----------
-    variables : tuple of VariableInfo
-        In the order of the block.
-    groups : tuple of Group
-        The same by base type.
+        Whether continuous inputs move in straight lines; these come first.
     """
 
     def __init__(
@@ -144,30 +138,22 @@ class BlockLayout:
         *,
         linear: bool = False,
     ) -> None:
-        unique = list({variable.name: variable for variable in variables}.values())
-        kinds = [
-            (
-                linear and variable.continuous and variable.causality == "input",
-                description.exchange_kind(variable),
-            )
-            for variable in unique
-        ]
-        present = sorted({*kinds}, key=lambda kind: (not kind[0], (*_KIND_ORDER, kind[1]).index(kind[1])))
-        self._begin = begin
-        self._positions: dict[str, int] = {}
-        groups, ordered, position = [], [], begin
-        for kind in present:
-            members = [
-                variable for variable, own in zip(unique, kinds, strict=True) if own == kind and variable.size
-            ]
-            first = position
-            for variable in members:
-                self._positions[variable.name] = position
-                position += variable.size
-            ordered += members
-            moves, name = kind
-            groups.append(Group(name, tuple(m.reference for m in members), position - first, moves))
-        self.variables, self.groups = tuple(ordered), tuple(groups)
+        def kind(variable: VariableInfo) -> tuple[bool, int, str]:
+            """Return whether a variable is held, and its base type after the place of that in the order."""
+            name = description.exchange_kind(variable)
+            held = not (linear and variable.continuous and variable.causality == "input")
+            return held, (*_KIND_ORDER, name).index(name), name
+
+        unique = {variable.name: variable for variable in variables if variable.size}
+        self.variables = tuple(sorted(unique.values(), key=kind))
+        sizes = [variable.size for variable in self.variables]
+        begins = accumulate(sizes[:-1], initial=begin)
+        self._positions = dict(zip([v.name for v in self.variables], begins, strict=False))
+        groups = [(key, list(members)) for key, members in groupby(self.variables, kind)]
+        self.groups = tuple(
+            Group(name, tuple(v.reference for v in members), sum(v.size for v in members), not held)
+            for (held, _, name), members in groups
+        )
 
     def positions(self, place: Place) -> range:
         """Return where the values of a place stand."""
@@ -184,12 +170,19 @@ class BlockLayout:
 def start_values(description: FmuDescription, variable: VariableInfo, *, given: bool = False) -> list[float]:
     """Return the declared start values; one value stands for all elements of an array.
 
-    Where others are `given` for all elements, their number is all that counts, and they are zero.
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU, for the error.
+    variable : VariableInfo
+        The variable, with the shape that it has now.
+    given : bool
+        Whether all of its values are given: then zeros only keep their place.
 
     Raises
     ------
     FmuFileError
-        If one is no number, or their number does not fit.
+        If they are no numbers, or not as many as the array has elements.
     """
     words = ("" if given else variable.start or "0").lower().split() or ["0"]
     try:
@@ -223,62 +216,84 @@ class Slot(NamedTuple):
         """Whether it takes whole numbers only."""
         return self.variable.kind not in FLOAT_KINDS
 
+    def numbers(self, given: Any, *, history: bool = False) -> npt.NDArray[np.float64]:
+        """Return values in the FMU's unit, all of them checked.
 
-def checked(slot: Slot, value: float) -> float:
-    """Return the value in the FMU's unit, refused if it is not finite, not whole or out of range."""
-    try:
-        number = slot.conversion.to_fmu(float(value))
-    except (TypeError, ValueError) as error:
-        raise FmuInputError(f"{slot.label} must be a number, but is {value!r}.") from error
-    if slot.low <= number <= slot.high and not slot.whole and number - number == 0.0:
-        return number
-    if not math.isfinite(number):
-        raise FmuInputError(f"{slot.label} must be finite, but is {value!r}; nothing was sent to the FMU.")
-    if slot.whole and not number.is_integer():
-        raise FmuInputError(
-            f"{slot.label} must be a whole number, but is {value!r}; nothing was sent to the FMU."
+        Parameters
+        ----------
+        given : float or array_like
+            As many values as the slot takes; of a history either these for all steps, or for each.
+        history : bool
+            Whether it is a history.
+
+        Returns
+        -------
+        (n,) or (N, n) ndarray
+            The latter for a history that has values for each of N steps.
+
+        Raises
+        ------
+        FmuInputError
+            If there are others than n values, or one is no number, not finite, not whole or out of range.
+        """
+        count = len(self.positions)
+        try:
+            array = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            wanted = "numbers" if history else "a number"
+            raise FmuInputError(f"{self.label} must be {wanted}, but is {given!r}.") from error
+        cell = () if count == 1 else (count,)
+        per_step = history and array.shape != cell
+        if per_step and array.shape[1:] not in (cell, (count,)):
+            wanted = "a number, or one" if count == 1 else f"{count} values, or as many"
+            raise FmuInputError(
+                f"{self.label} must be {wanted} for each step, but has the shape {array.shape}."
+            )
+        if not history and array.size != count:
+            wrong = f"takes {count} values, but {array.size} came"
+            raise FmuInputError(
+                f"{self.label} {f'must be a number, but is {given!r}' if count == 1 else wrong}."
+            )
+        rows = array.reshape(-1, count)
+        with np.errstate(all="ignore"):
+            # The arithmetic of `Conversion.to_fmu`: the bits are those of a step.
+            scale = self.conversion
+            values = rows if scale == IDENTITY else scale.factor * rows + scale.offset
+            # A conversion of units may round a value at the edge of the range to just outside of it.
+            inside = np.clip(values, self.low, self.high)
+            near = np.abs(inside - values) <= 1e-12 * np.maximum(np.abs(inside), 1.0)
+            whole = np.floor(values) == values if self.whole else True
+            wrong_ones = np.argwhere(~(np.isfinite(values) & near & whole))
+        if len(wrong_ones):
+            step, element = wrong_ones[0].tolist()
+            where = f" It is the value of step {step} of the {len(rows)}." if per_step else ""
+            shown = given if isinstance(given, int | float) else rows[step, element].item()
+            raise FmuInputError(self._refusal(shown, values[step, element]) + where)
+        inside = np.where((self.low <= values) & (values <= self.high), values, inside)
+        return inside if per_step else inside[0]
+
+    def _refusal(self, given: float, number: float) -> str:
+        if not math.isfinite(number):
+            return f"{self.label} must be finite, but is {given!r}; nothing was sent to the FMU."
+        if self.whole and not float(number).is_integer():
+            return f"{self.label} must be a whole number, but is {given!r}; nothing was sent to the FMU."
+        return (
+            f"{self.label} = {given!r} lies outside the range of {self.variable.name!r}, {self.low:g} to "
+            f"{self.high:g}{in_unit(self.variable)}; nothing was sent to the FMU."
         )
-    # A conversion of units may round a value at the edge of the range to just outside of it.
-    inside = min(max(number, slot.low), slot.high)
-    if abs(inside - number) > 1e-12 * max(abs(inside), 1.0):
-        raise FmuInputError(
-            f"{slot.label} = {value!r} lies outside the range of {slot.variable.name!r}, {slot.low:g} to "
-            f"{slot.high:g}{in_unit(slot.variable)}; nothing was sent to the FMU."
-        )
-    return inside
-
-
-def put(target: Any, slot: Slot, given: float | Sequence[float]) -> None:
-    """Put one value, or as many as the slot takes, where they belong."""
-    if len(slot.positions) == 1:
-        if not isinstance(given, float | int | str) and np.size(given) == 1:
-            given = float(np.ravel(given)[0])
-        target[slot.positions[0]] = checked(slot, given)  # type: ignore[arg-type]
-        return
-    if np.ndim(given) == 0 or len(np.ravel(given)) != len(slot.positions):
-        count = 1 if np.ndim(given) == 0 else len(np.ravel(given))
-        raise FmuInputError(f"{slot.label} takes {len(slot.positions)} values, but {count} came.")
-    values = [checked(slot, value) for value in np.ravel(given).tolist()]
-    for position, value in zip(slot.positions, values, strict=True):
-        target[position] = value
 
 
 def value_range(variable: VariableInfo) -> tuple[float, float]:
     """Return the declared range, within that of the type: C would wrap what does not fit."""
-    low, high = -math.inf, math.inf
-    if variable.kind == "Boolean":
-        low, high = 0.0, 1.0
-    elif variable.kind in ("Integer", "Enumeration"):
-        low, high = -(2.0**31), 2.0**31 - 1.0
-    elif variable.kind.startswith("Int"):
-        low, high = -(2.0 ** (int(variable.kind[3:]) - 1)), 2.0 ** (int(variable.kind[3:]) - 1) - 1.0
-    elif variable.kind.startswith("UInt"):
-        low, high = 0.0, 2.0 ** int(variable.kind[4:]) - 1.0
-    if variable.minimum is not None:
-        low = max(low, variable.minimum)
-    if variable.maximum is not None:
-        high = min(high, variable.maximum)
-    return low, high
+    low, high = (0.0, 1.0) if variable.kind == "Boolean" else (-math.inf, math.inf)
+    if variable.base_type in ("Integer", "Enumeration"):
+        sized = variable.kind not in ("Integer", "Enumeration")
+        limits = np.iinfo(variable.kind.lower() if sized else "int32")
+        low, high = float(limits.min), float(limits.max)
+    return (
+        low if variable.minimum is None else max(low, variable.minimum),
+        high if variable.maximum is None else min(high, variable.maximum),
+    )
 
 
 def in_unit(variable: VariableInfo) -> str:
@@ -302,10 +317,9 @@ def configured(description: FmuDescription, binding: Binding) -> tuple[FmuDescri
         label = f"structural_parameters.{name}"
         where = f"{label} of the binding {binding.name}"
         variable = find(description, name, where, "structuralParameter").variable
-        number = [0.0]
-        put(number, Slot(label, (0,), *value_range(variable), IDENTITY, variable), value)
-        found.append((variable.kind, variable.reference, number))
-        lengths[name] = int(number[0])
+        numbers = Slot(label, (0,), *value_range(variable), IDENTITY, variable).numbers(value).tolist()
+        found.append((variable.kind, variable.reference, numbers))
+        lengths[name] = int(numbers[0])
     if not lengths:
         return description, found
     if description.interface == "model-exchange":

@@ -1,9 +1,11 @@
 """The life of an asset: what it is, how it is opened, started again and closed, and what its failures say."""
 
+import math
 import os
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, NoReturn, Self, Unpack
+from types import TracebackType
+from typing import Any, Literal, NoReturn, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -19,19 +21,19 @@ from fmu_asset.errors import (
     FmuWorkerError,
 )
 from fmu_asset.instances.base import STATUS_NAMES
+from fmu_asset.instances.series import Instance
 from fmu_asset.worker.client import WorkerInstance
 
 from .binding import Binding, load_binding
 from .exchange import Exchange, Inputs, Values, check_roles, plain_values
-from .placement import Housing, Instance, ResetTrial, Start, limits_of
-from .reading import Observation, Reader
+from .placement import Housing, ResetTrial, Start, limits_of
+from .reading import Observation
 from .saved_state import StateMethod
-from .simulation import SteppedAsset
 
 _LOG_LENGTH = 200
 
 
-class OpenedFmu(SteppedAsset):
+class OpenedFmu:
     """An FMU with a binding and the instance that stands for it; `FmiAsset` adds steps and states.
 
     Parameters and errors are those of `FmiAsset`.
@@ -50,12 +52,19 @@ class OpenedFmu(SteppedAsset):
     ) -> None:
         given = binding if isinstance(binding, Binding) else load_binding(binding)
         limits = limits_of(given, step_timeout, load_timeout, memory_limit)
-        self._exchange = Exchange(read_fmu(fmu_path, given.binding.interface), given)
-        self._description = self._exchange.description
-        self._housing = Housing(self._description, self._exchange.plan, limits, isolated=isolated)
-        super().__init__(self._exchange.binding)
-        self._settings = self._exchange.settings(parameters or {})
-        self._parameters = plain_values(parameters or {})
+        exchange = Exchange(read_fmu(fmu_path, given.binding.interface), given)
+        housing = Housing(exchange.description, exchange.plan, limits, isolated=isolated)
+        self._settle(exchange, housing, parameters or {})
+
+    def _settle(self, exchange: Exchange, housing: Housing, parameters: Values) -> None:
+        """Begin with what is exchanged, and with where the instance lives."""
+        self._exchange, self._housing = exchange, housing
+        self._description, self._binding = exchange.description, exchange.binding
+        self._start_time, self._interval = self._binding.binding.start_time, self._binding.interval
+        self._phase: Literal["new", "ready", "broken", "closed"] = "new"
+        self._index = 0
+        self._settings = self._exchange.settings(parameters)
+        self._parameters = plain_values(parameters)
         self._step_size = self._binding.step_size
         self._lines = self._exchange.plan.linear_count
         self._recording = self.state_method == "replay"
@@ -64,6 +73,21 @@ class OpenedFmu(SteppedAsset):
         self._log: deque[tuple[str, str]] = deque(maxlen=_LOG_LENGTH)
 
     # ------------------------------------------------------------------ what it is
+
+    @property
+    def binding(self) -> Binding:
+        """The binding, with arrays that are observed or recorded as their elements."""
+        return self._binding
+
+    @property
+    def time(self) -> float:
+        """Time of the asset [s]: start + i * interval, never accumulated."""
+        return self._start_time + self._index * self._interval
+
+    @property
+    def step_index(self) -> int:
+        """Number of steps since the last reset."""
+        return self._index
 
     @property
     def description(self) -> FmuDescription:
@@ -131,6 +155,16 @@ class OpenedFmu(SteppedAsset):
         self._exchange.settings(parameters)
 
     # ------------------------------------------------------------------ life
+
+    def __enter__(self) -> Self:
+        if self._phase != "ready":
+            self.reset()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def close(self) -> None:
         """End the worker and remove its files; the asset can be opened again by `reset`."""
@@ -236,7 +270,6 @@ class OpenedFmu(SteppedAsset):
     def _adopt(self, instance: Instance) -> None:
         self._request = memoryview(instance.request).cast("B").cast("d")
         self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
-        self._reader = Reader(self._exchange.outputs, self._reply)
 
     def _stand_in(self, request: bytes, reply: npt.NDArray[np.float64]) -> Instance | None:
         """Return what takes an instance's place if its first step shows that it was not at its start."""
@@ -266,13 +299,14 @@ class OpenedFmu(SteppedAsset):
         return instance
 
     def _observation(self) -> Observation:
-        if self._reader.suspicious():
-            self._refuse_not_finite()
-        return self._reader.read(self.time)
+        self._refuse_not_finite()
+        return self._exchange.outputs.observation(self._reply, self.time)
 
     def _refuse_not_finite(self, which: str = "") -> None:
-        bad = self._exchange.not_finite(self._reply)
-        if bad:
+        # The sum of squares is as fast as can be, and can be infinite for large values too.
+        if not math.isfinite(self._reply.dot(self._reply)) and (
+            bad := self._exchange.not_finite(self._reply)
+        ):
             more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
             raise FmuOutputError(
                 f"The FMU {self._description.path} gave values that are not finite at t = {self.time:g} s: "

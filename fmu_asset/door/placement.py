@@ -26,12 +26,11 @@ from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance, forget_modules
 from fmu_asset.instances.plan import Plan, Settings
+from fmu_asset.instances.series import Instance
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 
 from .binding import Binding
-
-Instance = FmuInstance | WorkerInstance
 
 
 @dataclass(frozen=True)

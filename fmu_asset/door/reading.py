@@ -1,8 +1,8 @@
-"""Values picked from blocks of outputs, in the units of a binding."""
+"""What comes out of steps: values picked from blocks of outputs, in the units of a binding."""
 
-import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, cast
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,105 +25,78 @@ class Observation(NamedTuple):
         Monitors, recorded variables and outputs of ports.
     """
 
-    values: npt.NDArray[np.float64]
+    values: Floats
     time: float
     extra: dict[str, float]
 
 
-class Selection:
-    """Some values of a block of outputs.
+@dataclass(frozen=True)
+class ObservationHistory:
+    """What came out of N steps.
+
+    Attributes
+    ----------
+    time : (N,) ndarray
+        Time at the end of each step [s].
+    values : (N, n_obs) ndarray
+        The observations of the binding in their order and units.
+    extra : dict of str to (N,) ndarray
+        Monitors, recorded variables and outputs of ports.
+    ended : str
+        What the FMU did if it ended the simulation by itself: fewer steps were made then than were asked
+        for, and the last time is where it ended, within a step perhaps.
+    """
+
+    time: Floats
+    values: Floats
+    extra: dict[str, Floats]
+    ended: str = ""
+
+
+class OutputTable:
+    """What is read of a block of outputs: first what is observed, then the extras.
 
     Parameters
     ----------
+    observed : int
+        How many are observed.
+    extra : sequence of str
+        Names of the extras.
     positions : sequence of int
-        Where they stand in the block.
+        Where all of them stand in the block.
     conversions : sequence of Conversion
         From the binding's units to the FMU's, one for each.
     """
 
-    def __init__(self, positions: Sequence[int], conversions: Sequence[Conversion]) -> None:
+    def __init__(
+        self, observed: int, extra: Sequence[str], positions: Sequence[int], conversions: Sequence[Conversion]
+    ) -> None:
+        self._observed, self._extra = observed, tuple(extra)
         index = np.array(positions, dtype=np.intp)
-        together = len(index) > 0 and np.array_equal(index, np.arange(index[0], index[0] + len(index)))
-        self._index = slice(int(index[0]), int(index[0]) + len(index)) if together else index
-        self._scale = (
-            None
-            if all(item == IDENTITY for item in conversions)
-            else (np.array([item.factor for item in conversions]), np.array([i.offset for i in conversions]))
-        )
+        first = int(index[0]) if len(index) else 0
+        together = np.array_equal(index, np.arange(first, first + len(index)))
+        self._index = slice(first, first + len(index)) if together else index
+        scales = np.array(conversions).reshape(-1, 2).T
+        self._scale = None if all(item == IDENTITY for item in conversions) else scales
 
-    def of(self, blocks: Floats) -> Floats:
-        """Return the values in the binding's units; never a view.
-
-        Parameters
-        ----------
-        blocks : (..., n_outputs) ndarray
-            One block, or one in each row.
-
-        Returns
-        -------
-        (..., n) ndarray
-            The values of each block.
-        """
-        values: Floats = blocks[..., self._index]
+    def _converted(self, values: Floats) -> Floats:
+        """Return values in the binding's units; never a view."""
         if self._scale is None:
-            return values.copy() if isinstance(self._index, slice) else values
+            return values.copy()
         factor, offset = self._scale
         converted: Floats = (values - offset) / factor
         return converted
 
-    def reader(self, block: Floats) -> Callable[[], Floats]:
-        """Return a function that returns what `of` returns for the block as it is then."""
-        if self._scale is None and isinstance(self._index, slice):
-            return block[self._index].copy
-        return lambda: self.of(block)
-
-    def list_reader(self, block: Floats) -> Callable[[], list[float]]:
-        """Return a function like that of `reader`, which returns a list."""
-        if self._scale is None and isinstance(self._index, slice):
-            return cast("Callable[[], list[float]]", block.data[self._index].tolist)
-        return lambda: self.of(block).tolist()
-
-
-class OutputTable(NamedTuple):
-    """What is read of a block of outputs.
-
-    Attributes
-    ----------
-    observed : Selection
-        The observations in the order of the binding.
-    extra_names : tuple of str
-        Names of monitors, records and outputs of ports.
-    extra : Selection
-        Their values.
-    """
-
-    observed: Selection
-    extra_names: tuple[str, ...]
-    extra: Selection
-
-
-class Reader:
-    """Observations out of one block of outputs, which every step fills anew.
-
-    Parameters
-    ----------
-    table : OutputTable
-        What is read.
-    block : (n_outputs,) ndarray
-        The block.
-    """
-
-    def __init__(self, table: OutputTable, block: Floats) -> None:
-        self._names = table.extra_names
-        self._values, self._extra = table.observed.reader(block), table.extra.list_reader(block)
-        self._dot, self._block = block.dot, block
-
-    def suspicious(self) -> bool:
-        """Return whether the block may hold a value that is not finite; a large one can raise it as well."""
-        return not math.isfinite(self._dot(self._block))
-
-    def read(self, time: float) -> Observation:
-        """Return the observation of this moment."""
+    def observation(self, block: Floats, time: float) -> Observation:
+        """Return what a block (n_outputs,) of a moment [s] holds."""
+        values = self._converted(block[self._index])
         # Both are of one table; to compare their lengths would take as long as the rest of the line.
-        extra = dict(zip(self._names, self._extra()))  # noqa: B905
-        return Observation(self._values(), time, extra)
+        extra = dict(zip(self._extra, values[self._observed :].tolist()))  # noqa: B905
+        return Observation(values[: self._observed], time, extra)
+
+    def history(self, time: Floats, blocks: Floats, ended: str = "") -> ObservationHistory:
+        """Return what the blocks (N, n_outputs) of moments (N,) [s] hold; `ended` as in the history."""
+        values = self._converted(blocks[:, self._index])
+        extra = np.ascontiguousarray(values[:, self._observed :].T)
+        observed = np.ascontiguousarray(values[:, : self._observed])
+        return ObservationHistory(time, observed, dict(zip(self._extra, extra, strict=True)), ended)

@@ -31,7 +31,6 @@ class PackedState(BaseModel):
     magic: ClassVar[bytes]
     what: ClassVar[str]
 
-    index: int = Field(ge=0)
     body: bytes = Field(b"", exclude=True)
 
     def to_bytes(self) -> bytes:
@@ -83,6 +82,7 @@ class SavedState(PackedState):
     magic = b"UAVASSET"
     what = "an FMI asset"
 
+    index: int = Field(ge=0)
     method: StateMethod
     fmu: str
     step_size: float

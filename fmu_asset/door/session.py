@@ -5,15 +5,14 @@ from typing import Self
 import numpy as np
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError
-from fmu_asset.instances.series import Series
+from fmu_asset.instances.series import Instance, Series
 from reporting.progress import Progress, SilentProgress, Stage
 
 from .exchange import Values, plain_values
 from .life import OpenedFmu
-from .placement import Instance
-from .reading import Observation
+from .reading import Observation, ObservationHistory
 from .saved_state import SavedState
-from .simulation import Histories, ObservationHistory, blocks, request_rows
+from .simulation import Histories, blocks, request_rows
 
 
 class FmiAsset(OpenedFmu):
@@ -186,7 +185,7 @@ class FmiAsset(OpenedFmu):
                     moments, replies = moments[: made + 1], replies[:made]
                     break
         sentence = "" if ended is None else ended.sentence
-        return ObservationHistory.of(self._exchange.outputs, moments[1:], replies, sentence)
+        return self._exchange.outputs.history(moments[1:], replies, sentence)
 
     def _run(self, series: Series, stage: Stage) -> FmuEndedError | None:
         """Make a block of steps; whatever happens, the asset is where the last complete one has left it.
@@ -227,8 +226,7 @@ class FmiAsset(OpenedFmu):
             self._fail(failure, f"step {self._index} from t = {self.time:g} s")
         end = series.done * series.reply_size
         self._reply[:] = np.frombuffer(series.replies[end - series.reply_size : end])
-        if self._reader.suspicious():
-            self._refuse_not_finite(f" It was step {begin + series.done - 1}.")
+        self._refuse_not_finite(f" It was step {begin + series.done - 1}.")
         report()
         return None
 

@@ -1,76 +1,20 @@
-"""What is stepped: one FMU or several, and many steps under histories that are checked as a whole."""
+"""Many steps under histories that are checked as a whole."""
 
 import operator
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from types import TracebackType
-from typing import Literal, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.errors import FmuInputError
 from fmu_asset.instances.series import Series
-from reporting.progress import Progress
 
-from .binding import Binding
-from .exchange import Exchange, Inputs, Values
-from .layout import Slot, checked
-from .reading import Observation, OutputTable
-from .units import IDENTITY
+from .exchange import Exchange
 
 Histories = Mapping[str, npt.ArrayLike]
 """Inputs by the binding's names: a number for all steps, or one for each; (n,) or (N, n) for an array."""
 
 _BLOCK_BYTES = 2**20
-
-
-@dataclass(frozen=True)
-class ObservationHistory:
-    """What came out of N steps.
-
-    Attributes
-    ----------
-    time : (N,) ndarray
-        Time at the end of each step [s].
-    values : (N, n_obs) ndarray
-        The observations of the binding in their order and units.
-    extra : dict of str to (N,) ndarray
-        Monitors, recorded variables and outputs of ports.
-    ended : str
-        What the FMU did if it ended the simulation by itself: fewer steps were made then than were asked
-        for, and the last time is where it ended, within a step perhaps.
-    """
-
-    time: npt.NDArray[np.float64]
-    values: npt.NDArray[np.float64]
-    extra: dict[str, npt.NDArray[np.float64]]
-    ended: str = ""
-
-    @classmethod
-    def of(
-        cls,
-        table: OutputTable,
-        time: npt.NDArray[np.float64],
-        replies: npt.NDArray[np.float64],
-        ended: str = "",
-    ) -> "ObservationHistory":
-        """Return what the reply blocks of N steps hold.
-
-        Parameters
-        ----------
-        table : OutputTable
-            What is read of a reply block.
-        time : (N,) ndarray
-            Time at the end of each step [s].
-        replies : (N, n_outputs) ndarray
-            The reply blocks.
-        ended : str
-            What the FMU did if it ended the simulation by itself.
-        """
-        extra = np.ascontiguousarray(table.extra.of(replies).T)
-        return cls(time, table.observed.of(replies), dict(zip(table.extra_names, extra, strict=True)), ended)
 
 
 def request_rows(
@@ -109,12 +53,12 @@ def request_rows(
         for role, histories in roles.items()
         for name, values in (histories or {}).items()
     ]
-    arrays = [(slot, _numbers(slot, values)) for slot, values in given]
+    arrays = [(slot, slot.numbers(values, history=True)) for slot, values in given]
     count, source = steps, "`steps`"
     if count is not None and (count := operator.index(count)) < 1:
         raise FmuInputError(f"steps must be at least 1, but is {count}.")
     for slot, array in arrays:
-        if array.ndim > (len(slot.positions) != 1):
+        if array.ndim == 2:
             if count is None:
                 count, source = len(array), slot.label
             elif len(array) != count:
@@ -125,45 +69,8 @@ def request_rows(
         raise FmuInputError("Nothing says how many steps to make: give `steps`, or a history of an input.")
     rows = np.tile(held, (count, 1))
     for slot, array in arrays:
-        _fill(rows, slot, array)
+        rows[:, list(slot.positions)] = array
     return rows
-
-
-def _numbers(slot: Slot, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise FmuInputError(f"{slot.label} must be numbers ({error}).") from error
-    count = len(slot.positions)
-    if count == 1 and array.ndim == 2 and array.shape[1] == 1:
-        array = array[:, 0]
-    if array.ndim > 1 + (count != 1) or (count != 1 and (array.ndim == 0 or array.shape[-1] != count)):
-        wanted = (
-            "a number, or one for each step" if count == 1 else f"{count} values, or as many for each step"
-        )
-        raise FmuInputError(f"{slot.label} must be {wanted}, but has the shape {array.shape}.")
-    return array
-
-
-def _fill(rows: npt.NDArray[np.float64], slot: Slot, array: npt.NDArray[np.float64]) -> None:
-    """Put a history into its columns; what is not plainly in range is looked at one by one, as in a step."""
-    per_step = array.ndim > (len(slot.positions) != 1)
-    values = array if per_step else array[np.newaxis]
-    values = values.reshape(len(values), len(slot.positions))
-    with np.errstate(all="ignore"):
-        # The arithmetic of `Conversion.to_fmu`: the bits are those of a step.
-        scale = slot.conversion
-        numbers = values.copy() if scale == IDENTITY else scale.factor * values + scale.offset
-        plain = (slot.low <= numbers) & (numbers <= slot.high) & np.isfinite(numbers)
-        if slot.whole:
-            plain &= numbers == np.floor(numbers)
-    for step, element in np.argwhere(~plain).tolist():
-        try:
-            numbers[step, element] = checked(slot, values.item(step, element))
-        except FmuInputError as error:
-            where = f" It is the value of step {step} of the {len(rows)}." if per_step else ""
-            raise FmuInputError(f"{error.sentence}{where}") from error
-    rows[:, list(slot.positions)] = numbers
 
 
 def blocks(requests: npt.NDArray[np.float64], replies: npt.NDArray[np.float64]) -> Sequence[Series]:
@@ -173,59 +80,3 @@ def blocks(requests: npt.NDArray[np.float64], replies: npt.NDArray[np.float64]) 
         Series(requests[begin : begin + length], replies[begin : begin + length])
         for begin in range(0, len(requests), length)
     ]
-
-
-class SteppedAsset(ABC):
-    """An asset that is stepped through a binding, and opened by `with` or `reset`."""
-
-    def __init__(self, binding: Binding) -> None:
-        self._binding = binding
-        self._start_time, self._interval = binding.binding.start_time, binding.interval
-        self._phase: Literal["new", "ready", "broken", "closed"] = "new"
-        self._index = 0
-
-    @property
-    def binding(self) -> Binding:
-        """The binding; of one FMU, with arrays that are observed or recorded as their elements."""
-        return self._binding
-
-    @property
-    def time(self) -> float:
-        """Time of the asset [s]: start + i * interval, never accumulated."""
-        return self._start_time + self._index * self._interval
-
-    @property
-    def step_index(self) -> int:
-        """Number of steps since the last reset."""
-        return self._index
-
-    @property
-    @abstractmethod
-    def recorded_units(self) -> dict[str, str]:
-        """Units of `Observation.extra` by name."""
-
-    @abstractmethod
-    def reset(self, parameters: Values | None = None, **inputs: Unpack[Inputs]) -> None:
-        """Go back to the start."""
-
-    @abstractmethod
-    def observe(self) -> Observation:
-        """Return the observation of this moment without a step."""
-
-    @abstractmethod
-    def simulate(self, *, steps: int | None = None, progress: Progress | None = None) -> ObservationHistory:
-        """Make many steps from where the asset is, its inputs held."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """End what runs; the asset can be opened again by `reset`."""
-
-    def __enter__(self) -> Self:
-        if self._phase != "ready":
-            self.reset()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

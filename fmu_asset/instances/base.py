@@ -18,8 +18,7 @@ from fmpy.fmi1 import FMICallException
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, FmuWorkerError
 
-from .block import Block, prepared
-from .lines import Lines
+from .block import Block, Lines, prepared
 from .messages import Mailbox, callbacks
 from .plan import Group, Plan, Settings
 from .series import Series, run

@@ -11,8 +11,7 @@ from fmpy.fmi3 import FMU3Slave
 from fmu_asset.errors import FmuCallError
 
 from .base import ACCEPTED, DISCARD, OK, Calls, FmuInstance
-from .block import prepared
-from .lines import Lines
+from .block import Lines, prepared
 from .messages import Mailbox
 from .plan import Plan, Settings
 

@@ -12,7 +12,7 @@ from fmpy.fmi3 import FMU3Model
 from fmu_asset.errors import FmuCallError
 
 from .base import Calls, FmuInstance
-from .lines import Lines
+from .block import Lines
 from .plan import Settings
 from .solver import Solver
 

@@ -1,8 +1,7 @@
-"""What an instance exchanges with its FMU: plain values, sent to a worker as JSON."""
+"""What an instance exchanges with its FMU: plain values, sent to a worker."""
 
-import json
-from dataclasses import asdict, dataclass, field
-from typing import Literal, Self
+from dataclasses import dataclass, field
+from typing import Literal
 
 Interface = Literal["co-simulation", "model-exchange"]
 
@@ -95,17 +94,3 @@ class Plan:
     def output_count(self) -> int:
         """Number of output values."""
         return sum(group.count for group in self.outputs)
-
-    def to_json(self) -> str:
-        """Return the plan as JSON."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str | bytes) -> Self:
-        """Return the plan that `to_json` wrote."""
-        record = json.loads(text)
-        for side in ("inputs", "outputs"):
-            record[side] = tuple(
-                Group(**(group | {"references": tuple(group["references"])})) for group in record[side]
-            )
-        return cls(**record)

@@ -8,18 +8,58 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from .plan import Settings
+
 REPORT_PERIOD = 0.02
 """Seconds after which a running series reports what is done, at the end of the step that is being made."""
 
 
-class Stepped(Protocol):
-    """What makes a step from a request block to a reply block, as an instance does."""
+class Instance(Protocol):
+    """What an asset asks of an FMU in this process, in a worker, or of several; see `FmuInstance`.
+
+    Attributes
+    ----------
+    request, reply : ctypes array of double
+        The blocks; see `instances`.
+    """
 
     request: Any
     reply: Any
 
+    @property
+    def has_log(self) -> bool:
+        """Whether there are messages."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether it cannot be used any more."""
+
+    def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        """Set parameters, and inputs if wanted, and go to the first communication point."""
+
     def step(self) -> None:
         """Make the step that the request block describes."""
+
+    def run(self, series: "Series", report: Callable[[], object]) -> None:
+        """Make many steps."""
+
+    def read(self) -> None:
+        """Read the outputs of this moment into the reply block."""
+
+    def save(self) -> bytes:
+        """Return the state."""
+
+    def restore(self, content: bytes) -> None:
+        """Go back to a state."""
+
+    def reset(self) -> None:
+        """Go back to the moment after the instantiation."""
+
+    def take_log(self) -> list[tuple[int, str]]:
+        """Return and forget the messages: status and text."""
+
+    def close(self) -> None:
+        """Free it."""
 
 
 class Series:
@@ -45,7 +85,7 @@ class Series:
         self.reply_size = replies.itemsize * replies.shape[1]
 
 
-def run(instance: Stepped, series: Series, report: Callable[[], object]) -> None:
+def run(instance: Instance, series: Series, report: Callable[[], object]) -> None:
     """Make the steps of a series; end after one whose outputs are not all finite.
 
     Parameters

@@ -8,13 +8,13 @@ import hashlib
 import io
 import os
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.resources import files
 from pathlib import Path
 
-from fmu_asset.description import PLACEHOLDER
+from fmu_asset.description import PLACEHOLDER, Declaration, documentation_page, model_description, rendered
 from fmu_asset.errors import FmuBuildError, FmuError
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
@@ -187,6 +187,46 @@ def _licence(package: str) -> bytes:
     return Path(str(found[0].locate())).read_bytes()
 
 
+def python_members(
+    declared: Declaration,
+    class_name: str,
+    *,
+    imports: str,
+    resources: Mapping[str, bytes],
+    host: str = "It runs in a Python host that has NumPy.",
+) -> dict[str, bytes]:
+    """Return the files of the archive, with the placeholder wherever the content hash will stand.
+
+    Parameters
+    ----------
+    declared : Declaration
+        The model.
+    class_name : str
+        Of the class in the FMU's script, to which the tag is added.
+    imports : str
+        Lines that import `load_contents` into the runtime's package.
+    resources : mapping of str to bytes
+        What `load_contents` reads, by its names.
+    host : str
+        What the FMU runs in, for its documentation.
+    """
+    module = declared.identifier
+    runtime = f"resources/{module}_runtime"
+    names = {"module": module, "class_name": f"{class_name}{PLACEHOLDER}", "tag": PLACEHOLDER}
+    tool = f"uav-twin with PythonFMU {pythonfmu_version()}"
+    return {
+        "modelDescription.xml": model_description(declared, generation_tool=tool),
+        "documentation/index.html": documentation_page(declared, host),
+        **{f"resources/{file}": content for file, content in resources.items()},
+        f"resources/{module}.py": rendered("slave.py", **names),
+        f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
+        f"{runtime}/entry.py": rendered("entry.py", imports=imports),
+        f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
+        **room_members("fmu_asset.slaves", f"{runtime}/slaves"),
+        **pythonfmu_members(module, f"{runtime}/pythonfmu", BASE_CLASS_FILES),
+    }
+
+
 # ---------------------------------------------------------------- content hash
 
 
@@ -210,36 +250,37 @@ def guid_of(content_hash: str) -> str:
     return f"{{{h[:8]}-{h[8:12]}-{h[12:16]}-{h[16:20]}-{h[20:32]}}}"
 
 
-def filled(template: Mapping[str, bytes], content_hash: str) -> dict[str, bytes]:
-    """Return the files with tag and GUID in the place of the placeholder, in names and texts."""
-    tag, guid = tag_of(content_hash), guid_of(content_hash)
-    return {
-        name.replace(PLACEHOLDER, tag): _exchanged(name, data, (PLACEHOLDER, guid), (PLACEHOLDER, tag))
-        for name, data in template.items()
-    }
+def sealed(
+    template: Mapping[str, bytes],
+    binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
+) -> tuple[bytes, str]:
+    """Return the archive of the files, tag and GUID in the place of the placeholder, and their content hash.
 
-
-def sealed(template: Mapping[str, bytes]) -> tuple[bytes, str]:
-    """Return the archive of the files, filled, and their content hash."""
+    Parameters
+    ----------
+    template : mapping of str to bytes
+        The files, by name.
+    binaries : callable, optional
+        Makes further files of these and of the tag; they are not part of the hash.
+    """
     content_hash = content_hash_of(template)
-    return archive_bytes(filled(template, content_hash)), content_hash
+    tag = tag_of(content_hash)
+    members = exchanged(template, (PLACEHOLDER, PLACEHOLDER), (tag, guid_of(content_hash)))
+    further = {} if binaries is None else binaries(members, tag)
+    return archive_bytes(members | further), content_hash
 
 
-def emptied(members: Mapping[str, bytes], tag: str, guid: str) -> dict[str, bytes]:
-    """Return the files with the placeholder in the place of a tag and a GUID: undoes `filled`."""
-    return {
-        name.replace(tag, PLACEHOLDER): _exchanged(name, data, (guid, PLACEHOLDER), (tag, PLACEHOLDER))
-        for name, data in members.items()
-    }
+def exchanged(members: Mapping[str, bytes], old: tuple[str, str], new: tuple[str, str]) -> dict[str, bytes]:
+    """Return files with the new tag and GUID in the place of the old ones, in names and texts."""
 
+    def text(name: str, data: bytes) -> bytes:
+        if not name.endswith(_TEXT_SUFFIXES):
+            return data
+        for place in _GUID_PLACES.get(name, ()):
+            data = data.replace(place.format(old[1]).encode(), place.format(new[1]).encode())
+        return data.replace(old[0].encode(), new[0].encode())
 
-def _exchanged(name: str, data: bytes, guids: tuple[str, str], tags: tuple[str, str]) -> bytes:
-    """Return a text with the first GUID and tag replaced by the second ones; binaries as they are."""
-    if not name.endswith(_TEXT_SUFFIXES):
-        return data
-    for place in _GUID_PLACES.get(name, ()):
-        data = data.replace(place.format(guids[0]).encode(), place.format(guids[1]).encode())
-    return data.replace(tags[0].encode(), tags[1].encode())
+    return {name.replace(old[0], new[0]): text(name, data) for name, data in members.items()}
 
 
 def archive_bytes(members: Mapping[str, bytes], first: str = "modelDescription.xml") -> bytes:

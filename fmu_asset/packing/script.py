@@ -18,10 +18,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from fmu_asset.archive.declared import BASE_UNITS
-from fmu_asset.description import PLACEHOLDER, number, xml_bytes
+from fmu_asset.description import PLACEHOLDER, rendered
 from fmu_asset.errors import FmuBuildError
 
 from .contents import (
@@ -33,30 +33,6 @@ from .contents import (
     sealed,
     write_fmu,
 )
-
-_MODULE = '''"""Loaded by the FMI wrapper; the model is in the package beside it."""
-from pythonfmu import Fmi2Slave
-from {module}_runtime.model import {name} as Model
-
-# The wrapper runs this file once for each instance and drops one reference to its globals too many.
-from {module}_runtime import keep_alive
-
-keep_alive(globals())
-
-
-class {name}_{tag}(Model, Fmi2Slave):
-    """The model."""
-'''
-
-_RUNTIME = '''"""The model of the FMU."""
-
-_kept = []
-
-
-def keep_alive(thing):
-    """Hold one more reference for ever."""
-    _kept.append(thing)
-'''
 
 
 def build_script_fmu(
@@ -107,8 +83,8 @@ def _members(file: Path, source: bytes) -> dict[str, bytes]:
     runtime = f"resources/{module}_runtime"
     members = {
         "modelDescription.xml": _description(file, model, module),
-        f"resources/{module}.py": _MODULE.format(module=module, name=name, tag=PLACEHOLDER).encode(),
-        f"{runtime}/__init__.py": _RUNTIME.encode(),
+        f"resources/{module}.py": rendered("script.py", module=module, name=name, tag=PLACEHOLDER),
+        f"{runtime}/__init__.py": rendered("script_runtime.py"),
         f"{runtime}/model.py": source,
     }
     return members | pythonfmu_members(
@@ -173,7 +149,8 @@ def _description(file: Path, model: type[Any], identifier: str) -> bytes:
     for index, variable in enumerate(variables, 1):
         if variable.get("causality") == "output":
             SubElement(unknowns, "Unknown", index=str(index))
-    return xml_bytes(root)
+    indent(root)
+    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
 
 
 def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Element:
@@ -187,10 +164,10 @@ def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Ele
             )
         unit = SubElement(definitions, "Unit", name=name)
         base = {symbol: str(int(entry[symbol])) for symbol in BASE_UNITS if symbol in entry}
-        base |= {key: number(entry[key]) for key in ("factor", "offset") if key in entry}
+        base |= {key: repr(float(entry[key])) for key in ("factor", "offset") if key in entry}
         SubElement(unit, "BaseUnit", base)
         for display, factor in entry.get("displays", {}).items():
-            SubElement(unit, "DisplayUnit", name=display, factor=number(factor))
+            SubElement(unit, "DisplayUnit", name=display, factor=repr(float(factor)))
     return definitions
 
 
@@ -209,7 +186,7 @@ def _add_ranges(
         inner = variable[0]
         for key, value in (("unit", unit), ("min", low), ("max", high)):
             if value is not None:
-                inner.set(key, value if isinstance(value, str) else number(value))
+                inner.set(key, value if isinstance(value, str) else repr(float(value)))
     if remaining:
         raise FmuBuildError(
             f"The variable_table of {file} has {', '.join(remaining)}, which the model does not register."

@@ -27,20 +27,18 @@ from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .contents import (
     FmuInfo,
-    archive_bytes,
     check_start,
     checked_target,
     content_hash_of,
-    emptied,
-    filled,
+    exchanged,
     guid_of,
+    python_members,
     room_members,
-    tag_of,
+    sealed,
     write_fmu,
 )
 from .patch_file import PatchFile
 from .patched_runtime import output_channels, patched_members, plain_effects
-from .python_fmu import python_members
 
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""
@@ -166,11 +164,9 @@ def fmu_bytes(
         if f"resources/{file}" in template or "/" in file or not file:
             raise FmuBuildError(f"A resource of an FMU cannot have the name {file!r}; choose another one.")
         template[f"resources/{file}"] = content
-    content_hash = content_hash_of(template)
-    members = filled(template, content_hash)
-    if kind == "compiled":
-        members |= binaries_of(members, f"{name}_{tag_of(content_hash)}", fmi, platforms)
-    return archive_bytes(members), content_hash
+    if kind != "compiled":
+        return sealed(template)
+    return sealed(template, lambda members, tag: binaries_of(members, f"{name}_{tag}", fmi, platforms))
 
 
 def _python_members(
@@ -256,4 +252,4 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         tag = members["resources/slavemodule.txt"].decode("ascii").strip()[-len(PLACEHOLDER) :]
     found = re.search(r'(?:guid|instantiationToken)="([^"]*)"', root)
     declared = "" if found is None else found[1]
-    return declared, guid_of(content_hash_of(emptied(members, tag, declared)))
+    return declared, guid_of(content_hash_of(exchanged(members, (tag, declared), (PLACEHOLDER, PLACEHOLDER))))

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.experiment import every_output
 from fmu_asset.coupling.schedule import loop_sentence
 from fmu_asset.coupling.structure import listed
+from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.door.binding import Binding, Header, Vector
+from fmu_asset.door.experiment import whole_binding
 from fmu_asset.door.units import IDENTITY, between
 from fmu_asset.errors import FmuError, SspError
 from fmu_asset.folders import scratch_folder
@@ -154,12 +154,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
 
 def _trial(wiring: Wiring) -> list[str]:
     """Make one step with the start values, and read what can be read."""
-    binding = Binding(
-        binding=Header(name="check", step_size=1.0),
-        observation={
-            name: Vector(variables=(name,), unit=unit) for name, unit in every_output(wiring).items()
-        },
-    )
+    binding = whole_binding(system_description(wiring), step_size=1.0)
     try:  # with an algebraic loop, too: whether it may be simulated is the user's choice
         with CoupledAsset(
             wiring, binding, algorithm="jacobi" if wiring.schedule.loops else "gauss_seidel"

@@ -31,7 +31,6 @@ INTERFACES: dict[str, Interface | None] = {
     "CoSimulation": "co-simulation",
     "ModelExchange": "model-exchange",
 }
-OWN_ANNOTATION = "org.uav-twin.coupling"
 
 _NUMBERS_OF_2 = {
     "Float32": "Real",

@@ -20,15 +20,8 @@ def read_units(root: Any, kind: str) -> tuple[UnitInfo, ...]:
     for unit in root.findall(f"{kind}:Units/ssc:Unit", NAMESPACES):
         base = unit.find("ssc:BaseUnit", NAMESPACES)
         exponents = tuple(int(base.get(symbol, "0")) for symbol in BASE_UNITS)
-        found.append(
-            UnitInfo(
-                unit.get("name"),
-                exponents,
-                float(base.get("factor", "1")),
-                float(base.get("offset", "0")),
-                (),
-            )
-        )
+        factor, offset = float(base.get("factor", "1")), float(base.get("offset", "0"))
+        found.append(UnitInfo(unit.get("name"), exponents, factor, offset))
     return tuple(found)
 
 
@@ -122,13 +115,12 @@ def read_transformation(element: Any, where: str) -> tuple[float, float]:
     SspError
         If it has a transformation of another kind.
     """
-    for kind in (
-        "BooleanMappingTransformation",
-        "IntegerMappingTransformation",
-        "EnumerationMappingTransformation",
-    ):
-        if element.find(f"ssc:{kind}", NAMESPACES) is not None:
-            raise SspError(f"{where} has a {kind}, which is not supported; only linear transformations are.")
+    for kind in ("Boolean", "Integer", "Enumeration"):
+        if element.find(f"ssc:{kind}MappingTransformation", NAMESPACES) is not None:
+            raise SspError(
+                f"{where} has a {kind}MappingTransformation, which is not supported; only linear "
+                "transformations are."
+            )
     linear = element.find("ssc:LinearTransformation", NAMESPACES)
     if linear is None:
         return 1.0, 0.0

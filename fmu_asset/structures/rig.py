@@ -1,11 +1,10 @@
 """The file by which a structure's FMU is a model of the search for a missing effect: `docs/fmu_models.md`."""
 
-import json
-
 import numpy as np
 
 from fe.structure.design import Load, MeshDesign, PointOutput
 from fe.structure.matrix_design import MatrixDesign, MatrixLoad, NodeOutput
+from fmu_asset.description import rendered
 from fmu_asset.errors import FmuBuildError
 
 
@@ -35,44 +34,20 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
             'load that is recorded: give a [[control]] with unit = "N" and a [[load]] of 1 N tied to it, or '
             "a [[control]] load_factor."
         )
-    several = ", ".join(f'{name} = "{name}"' for name in forces)
-    place = json.dumps(forces[0]) if len(forces) == 1 else f"{{ {several} }}"
-    tables = [
-        f'format = 1\nkind = "fmu"\nname = {json.dumps(design.name)}\nfmu = {json.dumps(fmu)}\n',
-        "[inputs]\n" + (f"force = {place}\n" if forces else ""),
-        "[static]\nparameters = { response = 1.0 }\n",
-        "[motion]\nparameters = { response = 2.0 }\n",
-    ]
-    if flies:
-        tables[1] += 'load_factor = "load_factor"\n'
     ports = [
         (load.control, output.name)
         for load in design.load
         for output in design.displacement
         if load.control in forces and _meet(load, output)
     ]
-    if ports:
-        force, output = ports[0]
-        tables.append(f'[release]\nhold = "{force}"\noutput = "displacement.{output}"\n')
-    for key, quantity in (("gauge", "strain"), ("displacement",) * 2, ("acceleration",) * 2):
-        for part in getattr(design, key):
-            tables.append(
-                f'[[output]]\nname = "{part.name}"\nvariable = "{quantity}.{part.name}"\n'
-                f'quantity = "{quantity}"\n'
-            )
-    for force, output in ports:
-        tables.append(
-            f'[[port]]\nname = "{output}"\nforce = "{force}"\ndisplacement = "displacement.{output}"\n'
-        )
-    masses = [(part, f"mass.{part.name}", "kg") for part in design.mass if part.free]
-    for part, variable, unit in [*((part, part.name, "1") for part in design.parameter), *masses]:
-        low, high = part.range
-        tables.append(
-            f'[[parameter]]\nname = "{part.name}"\nvariable = "{variable}"\nmean = {part.middle!r}\n'
-            f"deviation = {0.25 * (high - low):.6g} # a quarter of the range: say better what is known\n"
-            f'low = {low!r}\nhigh = {high!r}\nunit = "{unit}"\n'
-        )
-    return "\n".join(tables)
+    parameters = [
+        *((part, part.name, "1") for part in design.parameter),
+        *((part, f"mass.{part.name}", "kg") for part in design.mass if part.free),
+    ]
+    text = rendered(
+        "rig.toml", design=design, fmu=fmu, forces=forces, flies=flies, ports=ports, parameters=parameters
+    )
+    return text.decode().rstrip() + "\n"
 
 
 def _meet(load: Load | MatrixLoad, output: PointOutput | NodeOutput) -> bool:

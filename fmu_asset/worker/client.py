@@ -2,8 +2,8 @@
 
 import contextlib
 import ctypes
-import json
 import os
+import pickle
 import select
 import time
 from collections.abc import Callable, Mapping
@@ -25,7 +25,6 @@ from .protocol import (
     HEADER,
     LARGEST_MESSAGE,
     PART,
-    QUICK,
     RESULT,
     Operation,
     look,
@@ -132,7 +131,7 @@ class WorkerInstance:
         self._poll = select.poll()
         self._poll.register(self._in, select.POLLIN | select.POLLHUP)
         try:
-            self._call(Operation.OPEN, plan.to_json().encode(), _OPENING)
+            self._call("open", _OPENING, plan)
         except BaseException:
             self.close()
             raise
@@ -141,12 +140,8 @@ class WorkerInstance:
 
     def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         """Set parameters and inputs and initialise."""
-        setting = {
-            "start_time": start_time,
-            "parameters": parameters,
-            "inputs": bytes(self._request[16:]).hex() if with_inputs else "",
-        }
-        self._call(Operation.INITIALISE, json.dumps(setting).encode(), _INITIALISING)
+        inputs = bytes(self._request[16:]) if with_inputs else b""
+        self._call("initialise", _INITIALISING, start_time, parameters, inputs)
 
     def step(self) -> None:
         """Make the step that the request block describes."""
@@ -178,15 +173,15 @@ class WorkerInstance:
     def save(self) -> bytes:
         """Return the serialised FMU state."""
         largest = int(self._limits.memory * _MEBIBYTE)
-        return self._call(Operation.SAVE, b"", "saving the state", largest)
+        return self._call("save", "saving the state", largest=largest)
 
     def restore(self, content: bytes) -> None:
         """Restore a serialised FMU state."""
-        self._call(Operation.RESTORE, content, "restoring the state")
+        self._call("restore", "restoring the state", content)
 
     def reset(self) -> None:
         """Bring the instance back to the moment after its instantiation."""
-        self._call(Operation.RESET, b"", _RESETTING)
+        self._call("reset", _RESETTING)
 
     def take_log(self) -> list[tuple[int, str]]:
         """Return and forget the messages that the FMU has logged: status and text."""
@@ -194,7 +189,7 @@ class WorkerInstance:
             return []
         self._logged = False
         what = "reading the log"
-        content = self._call(Operation.LOG, b"", what)
+        content = self._call("take_log", what)
         texts = separated(content) if content else []
         try:
             return [(int(status), text) for status, _, text in (entry.partition(" ") for entry in texts)]
@@ -203,7 +198,7 @@ class WorkerInstance:
 
     def renew(self) -> None:
         """Free the instance and make a new one in the same process."""
-        self._call(Operation.RENEW, b"", _RENEWING)
+        self._call("renew", _RENEWING)
 
     @property
     def has_log(self) -> bool:
@@ -261,10 +256,10 @@ class WorkerInstance:
         if time.monotonic() > self._next_glance:
             self._check_memory(what)
 
-    def _call(self, operation: Operation, content: bytes, what: str, largest: int = LARGEST_MESSAGE) -> bytes:
-        self._ask(operation, content, what)
-        if operation in QUICK:
-            look(self._poll)
+    def _call(self, name: str, what: str, *arguments: object, largest: int = LARGEST_MESSAGE) -> bytes:
+        """Call a method of the instance; only what the twin says is pickled, and never what comes back."""
+        self._ask(Operation.CALL, pickle.dumps((name, arguments)), what)
+        look(self._poll)
         _, length = self._await(what, largest)
         answer = bytearray(length)
         self._fill(memoryview(answer), what)

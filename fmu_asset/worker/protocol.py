@@ -23,23 +23,14 @@ LARGEST_MESSAGE = 2**23
 
 
 class Operation(IntEnum):
-    """What the twin asks."""
+    """What the twin asks: a step, several, the outputs, another method of the instance, or to end."""
 
     STEP = 1
-    OPEN = 2
-    INITIALISE = 3
-    READ = 4
-    SAVE = 5
-    RESTORE = 6
-    RESET = 7
-    LOG = 8
-    RENEW = 9
-    CLOSE = 10
-    RUN = 11
+    RUN = 2
+    READ = 3
+    CALL = 4
+    CLOSE = 5
 
-
-QUICK = frozenset({Operation.STEP, Operation.RUN, Operation.READ, Operation.SAVE, Operation.RESTORE})
-"""What is asked often and answered at once: both sides look again for a moment before they sleep."""
 
 RESULT, FAILURE, PART = 1, 2, 3
 OWN_FAILURE, PIPES_GONE, DESERTED = 70, 71, 72

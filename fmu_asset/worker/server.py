@@ -4,12 +4,12 @@ import ctypes
 import errno
 import faulthandler
 import os
+import pickle
 import select
 import signal
 import sys
 import traceback
-from json import loads
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from .protocol import (
     OWN_FAILURE,
     PART,
     PIPES_GONE,
-    QUICK,
     RESULT,
     Operation,
     joined,
@@ -135,19 +134,26 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
                 _last_reach.clear()
                 if not receive(incoming, memoryview(content)) or asked:
                     break
-                if operation == Operation.OPEN:
-                    plan = Plan.from_json(bytes(content))
-                if operation in (Operation.OPEN, Operation.RENEW) and plan is not None:
+                name, arguments = _called(operation, content)
+                if name == "open":
+                    plan = arguments[0]
+                if name in ("open", "renew") and plan is not None:
                     if instance is not None:
                         instance.close()
                     instance = open_instance(plan)
                     request = memoryview(instance.request).cast("B")
                     reply = memoryview(instance.reply).cast("B")
-                if operation == Operation.RUN and instance is not None:
+                    payload = b""
+                elif instance is None:
+                    raise FmuWorkerError("The worker was asked before it had an FMU.")
+                elif operation == Operation.RUN:
                     payload = _run(instance, content, outgoing, number)
+                elif operation == Operation.READ:
+                    instance.read()
+                    payload = reply
                 else:
-                    payload = _answer(operation, bytes(content), instance, reply)
-            logged = instance is not None and instance.has_log and operation != Operation.LOG
+                    payload = _answer(instance, name, arguments)
+            logged = instance is not None and instance.has_log
             HEADER.pack_into(reply_header, 0, RESULT, logged, number, len(payload))
         except FmuError as error:
             refused = system_error.value == errno.EACCES or "ermission denied" in str(error)
@@ -159,9 +165,14 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
         if os.getpid() != own_number:
             os._exit(0)  # a copy that the FMU has made of this process
         send(outgoing, reply_header, payload)
-        if operation in QUICK:
-            look(poll)
+        look(poll)
     return asked, instance
+
+
+def _called(operation: int, content: bytearray) -> tuple[str, tuple[Any, ...]]:
+    """Return the method that is called, and its arguments; an empty name for another operation."""
+    call: tuple[str, tuple[Any, ...]] = pickle.loads(content) if operation == Operation.CALL else ("", ())
+    return call
 
 
 def _run(instance: FmuInstance, content: bytearray, outgoing: int, number: int) -> memoryview:
@@ -189,26 +200,14 @@ def _run(instance: FmuInstance, content: bytearray, outgoing: int, number: int) 
     return rest()
 
 
-def _answer(
-    operation: int, content: bytes, instance: FmuInstance | None, reply: memoryview
-) -> bytes | memoryview:
-    if instance is None:
-        raise FmuWorkerError("The worker was asked before it had an FMU.")
-    if operation == Operation.INITIALISE:
-        setting = loads(content)
-        inputs = bytes.fromhex(setting["inputs"])
+def _answer(instance: FmuInstance, name: str, arguments: tuple[Any, ...]) -> bytes:
+    """Call a method of the instance and return its answer as bytes."""
+    if name == "take_log":
+        return joined(*(f"{status} {text}" for status, text in instance.take_log()))
+    if name == "initialise":
+        start_time, parameters, inputs = arguments
         if inputs:
             memoryview(instance.request).cast("B")[16:] = inputs
-        instance.initialise(setting["start_time"], setting["parameters"], with_inputs=bool(inputs))
-    elif operation == Operation.READ:
-        instance.read()
-        return reply
-    elif operation == Operation.SAVE:
-        return instance.save()
-    elif operation == Operation.RESTORE:
-        instance.restore(content)
-    elif operation == Operation.RESET:
-        instance.reset()
-    elif operation == Operation.LOG:
-        return joined(*(f"{status} {text}" for status, text in instance.take_log()))
-    return b""
+        instance.initialise(start_time, parameters, with_inputs=bool(inputs))
+        return b""
+    return getattr(instance, name)(*arguments) or b""

@@ -150,7 +150,7 @@ def test_structural_parameters_size_the_arrays(
         (("n=1,2",), "structural_parameters.n must be a number, but is [1.0, 2.0]"),
         (("m=3",), "has no parameter or input 'm' that takes numbers; it has w, u, n"),
         (("n=3",), "'u' of {} has 3 elements but 2 start values; give all of its values."),
-        (("n=3", "u=1,2"), "control.u takes 3 values, but 2 came"),
+        (("n=3", "u=1,2"), "load.u takes 3 values, but 2 came"),
     ):
         error = refused(
             "fmu", "simulate", fmu, *wanted[:4], *where, *(w for v in wrong for w in ("--set", v)), code=None
@@ -241,7 +241,7 @@ def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu: Any) -> None:
     with FmiAsset(fmu, planned.binding, isolated=False) as asset:
         history = fly(asset, planned, SilentProgress())
     assert history.time.tolist() == [2.0, 2.25, 2.5, 2.75, 3.0]
-    assert history.values[0].tolist() == [1.0, 0.0]
+    assert history.values[0].tolist() == [1.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,7 @@ def test_a_system_is_simulated_as_it_lies_there(system: Path, tmp_path: Path) ->
             outlet = float(data["observation"].sel(observation_name="outlet")[-1])
             assert data.attrs["fmu"] == "x.ssp"
         assert outlet == pytest.approx(20.0 + 60.0 * -np.expm1(-5000.0 / (4186.0 * 0.5)), rel=1e-14)
-    assert "declared as output" in refused(*simulate, "--set", "heat_exchanger.outlet=1")
+    assert "no parameter or input" in refused(*simulate, "--set", "heat_exchanger.outlet=1")
     assert "asks for linear interpolation of inputs, but no component" in refused(
         *simulate, "--interpolation", "linear"
     )

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.coupling.roles import parameter_values, resolve_roles
 from fmu_asset.coupling.structure import (
     Component,
     Connection,
@@ -16,8 +15,10 @@ from fmu_asset.coupling.structure import (
     Setting,
     SystemStructure,
 )
+from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import INPUT_ROLES, Binding, Parameter, load_binding
+from fmu_asset.door.exchange import Exchange
 from fmu_asset.folders import scratch_folder
 from fmu_asset.packing.wing_packing import pack_wing
 from fmu_asset.ssp.writer import write_ssp
@@ -124,12 +125,13 @@ def _with_values(
     wiring: Wiring, binding: Binding, parameters: Mapping[str, float], load: Mapping[str, float]
 ) -> tuple[Wiring, dict[Endpoint, str]]:
     """Return the system with the values of a scenario, and the binding's names for its parameters."""
-    roles = resolve_roles(wiring, binding)
-    values = parameter_values(binding, roles, parameters)
+    system = system_description(wiring)
+    exchange = Exchange(system, binding)
+    settings = exchange.settings(parameters)
     for name, value in load.items():
-        for port in roles.inputs["load"][name]:
-            own = values.setdefault(port.end.component, {})
-            own[port.end.variable] = port.conversion.to_fmu(value)
+        slot = exchange.slot("load", name)
+        settings.append((slot.variable.kind, slot.variable.reference, slot.numbers(value).tolist()))
+    values = system.of_components(settings)
     components = tuple(
         replace(
             component,
@@ -141,9 +143,9 @@ def _with_values(
         for component in wiring.structure.components
     )
     names = {
-        ports[0].end: name
-        for table in (roles.parameters, roles.inputs["load"])
-        for name, ports in table.items()
-        if len(ports) == 1
+        system.ends[item.variable][0].end: name
+        for table in (binding.parameter, binding.load)
+        for name, item in table.items()
+        if len(system.ends[item.variable]) == 1
     }
     return Wiring(replace(wiring.structure, components=components)), names

@@ -119,7 +119,7 @@ def test_what_is_no_number_of_steps_or_no_role_is_refused(state_fmu: Path, linea
         for steps in (0, -1):
             with pytest.raises(FmuInputError, match=f"steps must be at least 1, but is {steps}"):
                 asset.simulate(steps=steps)
-        assert len(asset.simulate().time) == 1
+        assert len(asset.simulate(steps=1).time) == 1
         with pytest.raises(TypeError, match="Inputs are control, health, load, port, and 'contrl' came"):
             asset.reset(contrl={})  # type: ignore[call-arg]
         assert asset.step_index == 1
@@ -294,7 +294,7 @@ def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(
     with CoupledAsset(structure, ranged, isolated=False) as asset:
         asset.step({"push": 2.0})
         before = asset.observe()
-        with pytest.raises(FmuInputError, match=r"control.push = 2.5 lies outside -1 to 2, .* watch"):
+        with pytest.raises(FmuInputError, match=r"push = 2\.5 lies outside .* 'push', -1 to 2"):
             asset.step({"push": 2.5})
         assert asset.step_index == 1
         np.testing.assert_array_equal(asset.observe().values, before.values)

@@ -202,17 +202,27 @@ def test_bindings_that_do_not_fit(base: SystemStructure) -> None:
         return table
 
     for role, variable, unit, words in (
-        ("control", "pull", "1", "no connector 'pull' and no component"),
-        ("control", "percent", "1", "control.x names 'percent', which is an output"),
-        ("control", "wing.health.z1", "1", "which is fed by a connection already"),
+        ("control", "pull", "1", "'pull', which is not a variable of the system base"),
+        ("control", "percent", "1", "of causality input, but 'percent' is declared as output"),
+        ("control", "wing.health.z1", "1", "is declared as an input that is fed by a connection already"),
         ("control", "wing.strain[1]", "1", "declared as output"),
-        ("control", "push", "m", "control.x is in 'm', but the system has 'push' in '1'"),
-        ("observation", "seen", "1", "no output of the system that something is connected to"),
+        ("control", "push", "m", "control.x is in 'm', but the FMU has 'push' in '1'"),
+        ("observation", "seen", "1", "'seen' is declared as connected to nothing"),
         ("observation", "wing.load_factor", "1", "declared as input"),
         ("observation", "percent", "s", "and there is no conversion"),
-        ("parameter", "push", "1", "parameters are needed|is needed"),
-        ("parameter", "wing.load_factor", "1", "a numeric parameter is needed"),
-        ("monitor", "wing.load", "1", "no variable 'load'"),
+        ("parameter", "push", "1", "of causality parameter, but 'push' is declared as input"),
+        (
+            "parameter",
+            "wing.load_factor",
+            "1",
+            "parameter, but 'wing.load_factor' is declared as input",
+        ),
+        (
+            "monitor",
+            "wing.load",
+            "1",
+            "which is not a variable of the system base; did you mean",
+        ),
     ):
         with pytest.raises(ValueError, match=words):
             CoupledAsset(wiring, parse_binding(bound(role, variable, unit)))

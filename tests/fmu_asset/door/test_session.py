@@ -291,7 +291,7 @@ def test_the_fmu_itself_refuses_and_says_why(
     fmu: Path, binding: Binding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the door's own check out of the way, the FMU's is seen: Discard, a sentence, nothing changed."""
-    monkeypatch.setattr("fmu_asset.door.layout.checked", lambda slot, value: value)
+    monkeypatch.setattr("fmu_asset.door.layout.Slot.numbers", lambda slot, value: np.array([value]))
     with FmiAsset(fmu, binding) as asset:
         before = asset.step({"load_factor": 3.0})
         for value, sentence in ((99, "lies outside its range"), (float("nan"), "not finite")):

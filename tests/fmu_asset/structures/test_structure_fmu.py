@@ -14,7 +14,7 @@ from fe.runtime.state import WING
 from fe.runtime.transient import ModalIntegrator
 from fe.structure.operators import Structure
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.check.file import check_file
+from fmu_asset.check import check_file
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.structure_fmu import build_fmu, fmu_bytes

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from fmu_asset.door.binding import load_binding
-from fmu_asset.errors import AlgebraicLoopError, CouplingError, FmuError, SspError
+from fmu_asset.errors import AlgebraicLoopError, BindingError, CouplingError, FmuError, SspError
 from reporting.progress import SilentProgress
 from scenarios import binding_files, scenario_files
 from twin_master import workflow
@@ -177,7 +177,8 @@ def test_what_does_not_fit_is_said_before_a_folder_is_made(folder: Path, tmp_pat
          "no variable 'conductance"),
         ("loop", ('source = "flow"', 'source = "exchanger.heat"'), AlgebraicLoopError,
          "close an algebraic loop"),
-        ("binding", ('target = "outlet"', 'target = "exit"'), CouplingError, "no connector 'outlet'"),
+        ("binding", ('target = "outlet"', 'target = "exit"'), BindingError,
+         "names 'outlet', which is not a variable of the system fouling"),
         ("truth", ('kind = "scripted"', 'kind = "asset"\nstate = { fouling = "heat" }'), ScenarioError,
          "leaves damage, noise and faults to the asset"),
         ("both", ('binding = "coupled.toml"', 'binding = "coupled.toml"\nfile = "x.ssp"'), ScenarioError,

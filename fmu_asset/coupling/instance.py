@@ -1,0 +1,337 @@
+"""Several FMUs with the face of one instance: what is exchanged among them in a step, and their state."""
+
+import ctypes
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from fmu_asset.archive.declared import VariableInfo
+from fmu_asset.door.placement import Housing, ResetTrial, Start
+from fmu_asset.door.saved_state import PackedState
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.door.units import IDENTITY
+from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, IterationError
+from fmu_asset.instances.plan import Settings
+from fmu_asset.instances.series import Instance, Series, run
+
+from .schedule import Schedule
+from .structure import Endpoint, listed
+from .system import Part, SystemDescription
+from .wiring import ConnectedVariable
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class CoupledState(PackedState):
+    """A saved state of coupled FMUs; its body holds the states of the components, one behind the other."""
+
+    magic = b"UAVSYSTM"
+    what = "coupled FMUs"
+
+    held: dict[str, dict[str, float]]
+    outputs: list[float]
+    before: list[float]
+    sizes: list[int]
+
+    @property
+    def components(self) -> list[bytes]:
+        """States of the components; raises `FmuStateError` if the body is damaged."""
+        ends = list(accumulate(self.sizes, initial=0))
+        if ends[-1] != len(self.body):
+            raise FmuStateError(f"What was given is not a state of {self.what}, or it is damaged.")
+        return [self.body[begin:end] for begin, end in pairwise(ends)]
+
+
+class Taps:
+    """Outputs that are wanted together, in the units of who wants them.
+
+    Parameters
+    ----------
+    ports : iterable of ConnectedVariable
+        The outputs, in order.
+    place : mapping of Endpoint to int
+        Where each output stands among all that are read.
+    """
+
+    def __init__(self, ports: Iterable[ConnectedVariable], place: Mapping[Endpoint, int]) -> None:
+        wanted = list(ports)
+        self._index = np.array([place[port.end] for port in wanted], dtype=np.intp)
+        self._delayed = np.flatnonzero([port.delayed for port in wanted])
+        scales = np.array([port.conversion for port in wanted]).reshape(-1, 2)
+        self._scale = None if (scales == IDENTITY).all() else (scales[:, 0], scales[:, 1])
+
+    def of(self, now: FloatArray, before: FloatArray) -> FloatArray:
+        """Return the values, from all outputs of this moment and of the beginning of the step."""
+        values = now[self._index]
+        if self._delayed.size:
+            values[self._delayed] = before[self._index[self._delayed]]
+        if self._scale is not None:
+            values = self._scale[0] * values + self._scale[1]
+        return values
+
+
+class naming:  # noqa: N801 - cheaper than one made of a generator
+    """A block in which an error of an FMU gets the name of its component."""
+
+    def __init__(self, component: str) -> None:
+        self._component = component
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, FmuError):
+            # Where one of them ended is no moment of the system.
+            time = None if isinstance(error, FmuEndedError) else error.time
+            sentence = f"component {self._component}: {error.sentence}"
+            raise type(error)(sentence, error.messages, time) from error
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """How FMUs are coupled.
+
+    Attributes
+    ----------
+    system : SystemDescription
+        The system as one FMU.
+    sent, read : sequence of VariableInfo
+        What a request and a reply hold of it, in their order.
+    schedule : Schedule
+        The order of the components.
+    parts : dict of str to Part
+        The components, by name.
+    jacobi : bool
+        Whether all components take the outputs of the beginning of the step.
+    iterations : int
+        How often a step of a circle of components may be made.
+    tolerance : float
+        When the values in a circle have settled.
+    """
+
+    system: SystemDescription
+    sent: Sequence[VariableInfo]
+    read: Sequence[VariableInfo]
+    schedule: Schedule
+    parts: dict[str, Part]
+    jacobi: bool
+    iterations: int
+    tolerance: float
+
+
+class CoupledFmus(Housing):
+    """Several FMUs as one instance, and where it lives: what `FmiAsset` asks of an instance and its housing.
+
+    Parameters
+    ----------
+    coupling : Coupling
+        How they are coupled.
+    assets : dict of str to FmiAsset
+        The FMUs, by the names of the components.
+    """
+
+    has_log = lost = False
+
+    def __init__(self, coupling: Coupling, assets: dict[str, FmiAsset]) -> None:
+        self._coupling, self.assets = coupling, assets
+        self._schedule, self._parts, ends = coupling.schedule, coupling.parts, coupling.system.ends
+        self.instance: Instance | None = self
+        self.reset_trial = ResetTrial(comparable=False)
+        self.request = (ctypes.c_double * (2 + len(coupling.sent)))()
+        self.reply = (ctypes.c_double * len(coupling.read))()
+        self._answer = np.frombuffer(memoryview(self.reply).cast("B"))
+        self._inputs = [(n, port) for n, sent in enumerate(coupling.sent, 2) for port in ends[sent.name]]
+        self._ends = [end for part in self._parts.values() for end in part.ends]
+        place = {end: index for index, end in enumerate(self._ends)}
+        self._spans = {
+            name: slice(place[part.ends[0]], place[part.ends[-1]] + 1) for name, part in self._parts.items()
+        }
+        self._taps = {name: Taps(part.fed.values(), place) for name, part in self._parts.items()}
+        self._shown = Taps((ends[read.name][0] for read in coupling.read), place)
+        self._held: dict[str, dict[str, float]] = {}
+        self._now = np.zeros(len(self._ends))
+        self._before = self._earlier = self._now.copy()
+        self._stepped: set[str] = set()
+        self._broken = False
+
+    # ------------------------------------------------------------------ life
+
+    def start(self, start: Start, *, renewed: bool = False) -> Self:
+        """Bring the components to their start."""
+        start.make(self)
+        return self
+
+    def contradicted(self, request: bytes, reply: FloatArray) -> None:
+        """Leave it to the components whether they began where they should."""
+
+    def renew(self) -> Instance:
+        """End the workers; the next start has new ones."""
+        self.close()
+        return self
+
+    def reset(self) -> None:
+        """Leave it to `initialise`, which resets the components."""
+
+    def sibling(self) -> "CoupledFmus":
+        """Return the same system with FMUs of its own."""
+        return CoupledFmus(self._coupling, {name: asset.sibling() for name, asset in self.assets.items()})
+
+    def close(self) -> None:
+        """End all workers; the next start has new ones."""
+        for asset in self.assets.values():
+            asset.close()
+
+    # ------------------------------------------------------------------ what an asset asks
+
+    def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        """Initialise the components in their order; each takes the initial outputs of those before it.
+
+        An input whose source comes later starts at the FMU's own start value.
+        """
+        tuned = self._coupling.system.of_components(parameters)
+        self._held = {name: dict(part.constants) for name, part in self._parts.items()}
+        if with_inputs:
+            self._take()
+        self._broken = True
+        known: set[str] = set()
+        for name in self._schedule.order:
+            part, asset = self._parts[name], self.assets[name]
+            values = self._fed(part, self._now, self._now)
+            fed = {key: values[key] for key, port in part.fed.items() if port.end.component in known}
+            with naming(name):
+                asset.reset(part.settings | tuned.get(name, {}), load=(self._held[name] | fed) or None)
+                self._now[self._spans[name]] = asset.observe().values
+            known.add(name)
+        self._before = self._now.copy()
+        self._broken = False
+
+    def step(self) -> None:
+        """Make the step that the request block describes."""
+        if self._broken:
+            raise FmuStateError(
+                "A step or a restoration failed, and the FMUs no longer stand at the same time; reset the "
+                "asset or restore a state."
+            )
+        self._take()
+        self._earlier, self._before = self._before, self._now.copy()
+        self._stepped.clear()
+        self._broken = True
+        for group, circular in zip(self._schedule.groups, self._schedule.circular, strict=True):
+            if circular and self._coupling.iterations > 1:
+                self._iterate(group)
+            else:
+                self._pass(group, self._before if self._coupling.jacobi else self._now)
+        self._broken = False
+        self.read()
+
+    def run(self, series: Series, report: Callable[[], object]) -> None:
+        """Make many steps; see `series.run`."""
+        run(self, series, report)
+
+    def read(self) -> None:
+        """Put the outputs of this moment into the reply block."""
+        self._answer[:] = self._shown.of(self._now, self._before)
+
+    def save(self) -> bytes:
+        """Return the states of the components and what they had exchanged."""
+        states = [asset.save_state() for asset in self.assets.values()]
+        return CoupledState(
+            held={name: dict(sorted(held.items())) for name, held in self._held.items()},
+            outputs=self._now.tolist(),
+            before=self._before.tolist(),
+            sizes=[len(state) for state in states],
+            body=b"".join(states),
+        ).to_bytes()
+
+    def restore(self, content: bytes) -> None:
+        """Bring the components to a state that `save` returned."""
+        saved = CoupledState.from_bytes(content)
+        components = saved.components
+        self._broken = True
+        for (name, asset), state in zip(self.assets.items(), components, strict=True):
+            with naming(name):
+                asset.restore_state(state)
+        self._held = saved.held
+        self._now, self._before = np.array(saved.outputs), np.array(saved.before)
+        self._broken = False
+
+    def take_log(self) -> list[tuple[int, str]]:
+        """Return nothing: each component keeps its own log."""
+        return []
+
+    # ------------------------------------------------------------------ stepping
+
+    def _take(self) -> None:
+        """Hand on the inputs of the request; one that nobody has given is not a number."""
+        for place, port in self._inputs:
+            value = self.request[place]
+            if not math.isnan(value):
+                self._held[port.end.component][port.end.variable] = port.conversion.to_fmu(value)
+
+    def _pass(self, group: Sequence[str], source: FloatArray) -> None:
+        for name in group:
+            part, asset, held = self._parts[name], self.assets[name], self._held[name]
+            fed = self._fed(part, source, self._before)
+            with naming(name):
+                if part.linear:
+                    asset.hold(load=self._draw(part, fed, source))
+                held.update(fed)
+                seen = asset.step(load=held)
+                for _ in range(part.substeps - 1):
+                    seen = asset.step()
+            self._now[self._spans[name]] = seen.values
+            if source is self._now:
+                self._stepped.add(name)
+        self._stepped.update(group)
+
+    def _fed(self, part: Part, now: FloatArray, before: FloatArray) -> dict[str, float]:
+        """Return what the inputs of a component are fed, by their names."""
+        if not part.fed:
+            return {}
+        return dict(zip(part.fed, self._taps[part.name].of(now, before).tolist(), strict=True))
+
+    def _draw(self, part: Part, fed: dict[str, float], source: FloatArray) -> dict[str, float]:
+        """Return where the lines of the inputs that others feed begin; `fed` becomes where they end.
+
+        Where the source is not there yet, its last line goes on, within the range of the input.
+        """
+        begins = self._fed(part, self._before, self._before)
+        earlier = self._fed(part, self._earlier, self._earlier)
+        for variable, port in part.fed.items():
+            if variable not in part.moving:
+                begins[variable] = fed[variable]
+            elif port.delayed or source is self._before or port.end.component not in self._stepped:
+                low, high = self.assets[part.name].input_range("load", variable)
+                end = 2.0 * begins[variable] - earlier[variable]
+                fed[variable] = min(max(end, low), high)
+        return begins
+
+    def _iterate(self, group: Sequence[str]) -> None:
+        """Repeat the step of a circle of components until what they exchange has settled."""
+        states = {name: self.assets[name].save_state() for name in group}
+        exchanged = {port.end for name in group for port in self._parts[name].fed.values()}
+        watched = [i for i, end in enumerate(self._ends) if end in exchanged and end.component in group]
+        for iteration in range(self._coupling.iterations):
+            last = self._now.copy()
+            if iteration:
+                for name, state in states.items():
+                    with naming(name):
+                        self.assets[name].restore_state(state)
+            self._pass(group, last if self._coupling.jacobi else self._now)
+            change = np.abs(self._now - last)[watched]
+            if (
+                iteration
+                and (change <= self._coupling.tolerance * np.maximum(1.0, np.abs(last[watched]))).all()
+            ):
+                return
+        worst = int(np.argmax(change))
+        raise IterationError(
+            f"The components {listed(group)} did not settle in {self._coupling.iterations} iterations of the "
+            f"step from t = {self.request[0]:g} s ({self._ends[watched[worst]]} still changes by "
+            f"{change[worst]:.3g}); allow more iterations or a larger tolerance, make the step smaller, or "
+            "delay one of their connections."
+        )
