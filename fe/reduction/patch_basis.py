@@ -14,10 +14,10 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, eigh
 
-from fe.full.operators import AffineOperators
-from fe.full.patch_operators import PatchOperators, assemble_patch_operators
 from fe.full.subspace import Norm
 from fe.runtime.patch_arrays import PatchArrays
+from fe.wing.operators import AffineOperators, point_masses
+from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from reporting.progress import Progress, SilentProgress
 
 from .settings import ReductionSettings
@@ -91,7 +91,7 @@ def reduce_patches(
     with progress.stage("Solving the wing for changes"):
         full = assemble_patch_operators(operators, settings.strip_count)
         healthy = Norm(operators.stiffness())
-        damaged = Norm(operators.stiffness(1.0, (DAMAGED_ANCHOR,) * len(operators.regions)))
+        damaged = Norm(operators.stiffness(None, (DAMAGED_ANCHOR,) * len(operators.regions)))
         snapshots = np.concatenate(
             [_responses(full, healthy, settings, main=True), _responses(full, damaged, settings, main=False)],
             axis=1,
@@ -128,7 +128,7 @@ def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings, *, mai
         [
             operators.load_tip,
             operators.load_lift,
-            operators.tip_displacement_output,
+            operators.tip_row,
             (full.lift_rows.T @ moments).T,
             full.weight,
             flap,
@@ -141,7 +141,7 @@ def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings, *, mai
     gauges = solutions[:, -operators.gauge_output.shape[0] :]
     solutions = _unit_energy(solutions, stiffness)
     mean = settings.ranges
-    mass = operators.mass(*(float(np.mean(span)) for span in (mean.servo_mass, mean.pitot_mass)))
+    mass = operators.mass(point_masses(*map(float, map(np.mean, (mean.servo_mass, mean.pitot_mass)))))
     vectors = np.random.default_rng(settings.seed).normal(size=(operators.unknowns, MODES + 6))
     for _ in range(SUBSPACE_ITERATIONS):
         vectors = np.linalg.qr(norm.riesz(np.asarray(mass @ vectors)))[0]
@@ -191,7 +191,7 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
     size = basis.shape[1]
     lower = np.tril_indices(size)
     along = full.operators.gauge_output
-    stiffness = np.stack([_inner(term, basis) for term in operators.stiffness_terms])
+    stiffness = np.stack([_inner(term.matrix, basis) for term in operators.stiffness_terms])
     tip = operators.load_tip @ basis
     compliance = float(tip @ np.linalg.solve(stiffness.sum(axis=0), tip))
     design = operators.wing_mesh.design
@@ -229,7 +229,7 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
         strain_rows=np.stack([np.asarray(rows @ basis) for rows in (along, *full.strain_rows)]),
         gauge_stations=np.array([place for place, _ in design.gauges.positions]),
         gauge_length=design.gauges.averaging_spanwise,
-        tip_row=operators.tip_displacement_output @ basis,
+        tip_row=operators.tip_row @ basis,
         start_shapes=np.eye(size)[:, :START_SHAPES],
     )
 

@@ -41,7 +41,7 @@ class LoadTerm:
     mass: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class AffineStructure:
     """Affine model of a structure on its n free unknowns.
 

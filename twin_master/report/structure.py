@@ -8,7 +8,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from fe.structure.elements import KINDS, meshio_with_wedges
+from fe.elements.kinds import KINDS, meshio_with_wedges
 from reporting import figures as style
 
 FloatArray = NDArray[np.float64]

@@ -14,54 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.wing.design import WingDesign
-
-from .assembly import Discretisation, point_jacobians
+from .design import WingDesign
 from .operators import (
     AffineOperators,
     all_point_mass_weights,
     cell_density,
-    cell_elasticity,
     gauge_output,
-    modulus_variation,
-    point_mass_weights,
     section_displacement,
+    stiffness_parts,
+    turn_load,
+    upward,
 )
-from .turn_load import STANDARD_GRAVITY, inertia_relief, lift_load
+from .turn_load import nodal_weight
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LEAST_LINE_DISTANCE = 0.1
 """Least distance between lines of a section, as a fraction of the chord."""
-
-
-class TurnedStrain(Discretisation):
-    """A discretisation that takes strains along a direction turned in the skin by `angle` [rad].
-
-    From the spanwise direction towards the tip's rear: with angle pi/2, `gauge_output` gives
-    the strain across the gauges, at the same points and with the same weights.
-    """
-
-    angle: float
-
-    @classmethod
-    def of(cls, discretisation: Discretisation, angle: float) -> "TurnedStrain":
-        """Return the same degrees of freedom, strains turned."""
-        turned = cls(discretisation.mesh)
-        turned.__dict__.update(discretisation.__dict__)  # its caches too
-        turned.__dict__["angle"] = angle
-        return turned
-
-    def strain_along(
-        self, cells: IntArray, local: FloatArray, direction: FloatArray
-    ) -> tuple[IntArray, FloatArray]:
-        """Unknowns (p, 60) and weights (p, 60) [1/m] of the strain along the turned directions."""
-        jacobian = point_jacobians(self.mesh.p.T[self.mesh.t.T][cells], local)
-        normal = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        aft = np.cross(direction, normal)
-        return super().strain_along(cells, local, np.cos(self.angle) * direction + np.sin(self.angle) * aft)
 
 
 @dataclass(frozen=True)
@@ -142,51 +112,39 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
     strip_count : int
         Largest number of strips of the skin.
     """
-    mesh, discretisation = operators.wing_mesh, operators.discretisation
-    design, expansion = mesh.design, operators.expansion
+    mesh, design, expansion = operators.wing_mesh, operators.wing_mesh.design, operators.expansion
     restriction = expansion.T.tocsr()
     lines = mesh.span_lines
     stations = np.sort(np.concatenate([lines, 0.5 * (lines[1:] + lines[:-1])]))
     chords = section_lines(design)
 
     def rows(chord: float, component: int) -> sparse.csr_array:
-        weights = [section_displacement(mesh, discretisation, place, chord) for place in stations]
+        weights = [section_displacement(mesh, place, chord) for place in stations]
         nodal = sparse.csr_array(np.array(weights))
         spread = sparse.kron(nodal, sparse.csr_array(np.eye(3)[component : component + 1]))
         return sparse.csr_array(spread @ expansion)
 
-    density = cell_density(mesh)
-    nodal_mass = discretisation.nodal_mass(density)
-    for place in design.point_masses:
-        nodal_mass += getattr(design.masses, place.kind) * point_mass_weights(mesh, discretisation, place)
-    full_weight = np.zeros(discretisation.unknowns)
-    full_weight[2::3] = -STANDARD_GRAVITY * nodal_mass
-    weight = np.asarray(restriction @ full_weight)
-    lift = _full_lift(operators, full_weight)
-    node_station = np.abs(discretisation.node_points[:, 1:2] - stations).argmin(axis=1)
-    unknown = np.arange(discretisation.unknowns)
+    weight = -upward(nodal_weight(mesh, cell_density(mesh), all_point_mass_weights(mesh)))
+    lift = turn_load(mesh)
+    if design.lift.inertia_relief:  # the load holds the weight
+        lift = lift - weight
+    node_station = np.abs(mesh.points[:, 1:2] - stations).argmin(axis=1)
     by_station = sparse.coo_array(
-        (lift, (np.repeat(node_station, 3), unknown)), shape=(len(stations), len(lift))
+        (lift, (np.repeat(node_station, 3), np.arange(mesh.unknowns))), shape=(len(stations), len(lift))
     ).tocsr()
 
     along = operators.gauge_output
     across, diagonal = (
-        sparse.csr_array(gauge_output(mesh, TurnedStrain.of(discretisation, angle)) @ expansion)
-        for angle in (0.5 * np.pi, 0.25 * np.pi)
+        sparse.csr_array(gauge_output(mesh, angle) @ expansion) for angle in (0.5 * np.pi, 0.25 * np.pi)
     )
 
     edges = strip_edges(lines, strip_count)
     strips = np.searchsorted(edges, mesh.centres[:, 1]) - 1
-    elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
-    parts, strip_of, term_of = [], [], []
-    for strip in range(len(edges) - 1):
-        for term in range(len(design.regions) + 1):
-            cells = np.flatnonzero((strips == strip) & (mesh.stiffness_term == term))
-            if cells.size:
-                matrix = discretisation.stiffness(cells, elasticity[cells], variation[cells])
-                parts.append(sparse.csr_array(restriction @ (matrix @ expansion)))
-                strip_of.append(strip)
-                term_of.append(term)
+    skin = np.flatnonzero(mesh.stiffness_term <= len(design.regions))
+    found, part_of = np.unique(
+        np.stack((strips, mesh.stiffness_term), axis=1)[skin], axis=0, return_inverse=True
+    )
+    parts = (skin[part_of == number] for number in range(len(found)))
     return PatchOperators(
         operators=operators,
         stations=stations,
@@ -196,22 +154,14 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
             *(rows(chord, 2) for chord in chords[1:]),
         ),
         lift_rows=sparse.csr_array(by_station @ expansion),
-        weight=weight,
+        weight=np.asarray(restriction @ weight),
         strain_rows=(across, sparse.csr_array(2.0 * diagonal - along - across)),
         strip_lines=edges,
-        strip_stiffness=tuple(parts),
-        strip_of=np.array(strip_of),
-        term_of=np.array(term_of),
+        strip_stiffness=tuple(
+            sparse.csr_array(restriction @ (matrix @ expansion)) for matrix in stiffness_parts(mesh, parts)
+        ),
+        strip_of=found[:, 0],
+        term_of=found[:, 1],
         flap=operators.unknowns - 2,
         flap_spring=design.root.flap_spring,
     )
-
-
-def _full_lift(operators: AffineOperators, weight: FloatArray) -> FloatArray:
-    """Return the load (full,) [N] of load factor 1 without the weight that the design's load holds."""
-    mesh, discretisation = operators.wing_mesh, operators.discretisation
-    lift = lift_load(mesh, discretisation)
-    if not mesh.design.lift.inertia_relief:
-        return lift
-    places = all_point_mass_weights(mesh, discretisation)
-    return lift + inertia_relief(mesh.design, discretisation, cell_density(mesh), places, lift) - weight
