@@ -98,6 +98,9 @@ class AffineStructure:
     damping_beta: float
     design_hash: str
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.design_hash[:12]}, unknowns={self.unknowns})"
+
     @property
     def unknowns(self) -> int:
         """Number n of free unknowns."""
@@ -180,7 +183,7 @@ class AffineStructure:
         return np.asarray(self.expansion @ free).reshape(-1, 3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class DesignedStructure(AffineStructure):
     """Affine model of a structure file.
 

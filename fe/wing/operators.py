@@ -199,6 +199,7 @@ class AffineOperators(AffineWing):
     """
 
     wing_mesh: WingMesh
+    __repr__ = AffineStructure.__repr__
 
 
 def cell_elasticity(mesh: WingMesh) -> FloatArray:

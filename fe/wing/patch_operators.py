@@ -8,7 +8,7 @@ between two webs therefore does not dent the thin skin; nor would one in a test,
 around the section takes it.
 """
 
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,52 +34,36 @@ LEAST_LINE_DISTANCE = 0.1
 """Least distance between lines of a section, as a fraction of the chord."""
 
 
-@dataclass(frozen=True)
-class PatchOperators:
-    """Operators of the primitives on the n free unknowns of the wing, P stations, G gauges.
+class PatchOperators(NamedTuple):
+    """What `fe.runtime.patch_arrays.PatchArrays` hold of a wing, on its n free unknowns, by the same names.
 
     Attributes
     ----------
     operators : AffineOperators
         The wing that they belong to.
-    stations : (P,) m
-        Distances of the sections from the root, ascending.
-    line_chord : (L,)
-        Chord fractions of the elastic line and of the other lines, ascending.
-    line_rows : tuple of L + 2 csr (P, n)
-        Displacement of the elastic line along x, y and z, and of the other lines along z, at the stations.
-    lift_rows : csr (P, n) N
-        Load of load factor 1 without the weight, by stations of its nodes.
-    weight : (n,) N
-        Weight of structure and nominal point masses, downwards.
-    strain_rows : tuple of csr (G, n) 1/m
-        Strain across the gauges, and engineering shear strain between span and chord, with the sign and at
-        the points of `AffineOperators.gauge_output`.
-    strip_lines : (S + 1,) m
-        Edges of the strips, which are mesh lines.
-    strip_stiffness : tuple of csr (n, n) N/m
+    rows : dict of str to csr (..., n), (n,), or a tuple of csr
+        What is multiplied with a basis; of `strain_rows` the first are `AffineOperators.gauge_output`.
+    plain : dict of str to array or float
+        What has no unknowns.
+    strips : tuple of csr (n, n) N/m
         Parts of the stiffness terms of the skin that lie in the strips.
-    strip_of, term_of : (T,)
-        Strip, and stiffness term (skin, damage regions), of each of these parts.
-    flap : int
-        Unknown that is the flapping rotation of the root.
-    flap_spring : float
-        Its spring [N m/rad].
     """
 
     operators: AffineOperators
-    stations: FloatArray
-    line_chord: FloatArray
-    line_rows: tuple[sparse.csr_array, ...]
-    lift_rows: sparse.csr_array
-    weight: FloatArray
-    strain_rows: tuple[sparse.csr_array, sparse.csr_array]
-    strip_lines: FloatArray
-    strip_stiffness: tuple[sparse.csr_array, ...]
-    strip_of: IntArray
-    term_of: IntArray
-    flap: int
-    flap_spring: float
+    rows: dict[str, Any]
+    plain: dict[str, Any]
+    strips: tuple[sparse.csr_array, ...]
+
+
+def area_shares(stations: FloatArray, root_chord: float, tip_chord: float) -> FloatArray:
+    """Weights (P,) of the mean over the planform of what is quadratic between every other station."""
+    chord = root_chord + (tip_chord - root_chord) * stations / stations[-1]
+    weights = np.zeros(len(stations))
+    length = stations[2::2] - stations[:-2:2]
+    for offset, share in ((0, 1.0), (1, 4.0), (2, 1.0)):
+        np.add.at(weights, np.arange(offset, len(stations) - 2 + offset, 2), share / 6.0 * length)
+    weights *= chord
+    return np.asarray(weights / weights.sum())
 
 
 def section_lines(design: WingDesign) -> tuple[float, ...]:
@@ -145,23 +129,48 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
         np.stack((strips, mesh.stiffness_term), axis=1)[skin], axis=0, return_inverse=True
     )
     parts = (skin[part_of == number] for number in range(len(found)))
+    flap = np.zeros(operators.unknowns)
+    flap[-2] = 1.0
     return PatchOperators(
-        operators=operators,
-        stations=stations,
-        line_chord=np.array(chords),
-        line_rows=(
-            *(rows(chords[0], component) for component in range(3)),
-            *(rows(chord, 2) for chord in chords[1:]),
-        ),
-        lift_rows=sparse.csr_array(by_station @ expansion),
-        weight=np.asarray(restriction @ weight),
-        strain_rows=(across, sparse.csr_array(2.0 * diagonal - along - across)),
-        strip_lines=edges,
-        strip_stiffness=tuple(
+        operators,
+        rows={
+            "flap_row": flap,
+            "line_rows": (
+                *(rows(chords[0], component) for component in range(3)),
+                *(rows(chord, 2) for chord in chords[1:]),
+            ),
+            "load_tip": operators.load_tip,
+            "load_lift": operators.load_lift,
+            "lift_rows": sparse.csr_array(by_station @ expansion),
+            "weight": np.asarray(restriction @ weight),
+            "strain_rows": (along, across, sparse.csr_array(2.0 * diagonal - along - across)),
+            "tip_row": operators.tip_row,
+        },
+        plain={
+            "strip_lines": edges,
+            "strip_of": found[:, 0],
+            "term_of": found[:, 1],
+            **_plain(design, stations, chords),
+        },
+        strips=tuple(
             sparse.csr_array(restriction @ (matrix @ expansion)) for matrix in stiffness_parts(mesh, parts)
         ),
-        strip_of=found[:, 0],
-        term_of=found[:, 1],
-        flap=operators.unknowns - 2,
-        flap_spring=design.root.flap_spring,
     )
+
+
+def _plain(design: WingDesign, stations: FloatArray, chords: tuple[float, ...]) -> dict[str, Any]:
+    """Return what is the same in every basis, but for the strips."""
+    plan = design.planform
+    return {
+        "flap_spring": design.root.flap_spring,
+        "semi_span": plan.semi_span,
+        "root_chord": plan.root_chord,
+        "tip_chord": plan.tip_chord,
+        "straight_chord_line": plan.straight_chord_line,
+        "load_place": plan.semi_span - design.tip_load.distance_from_tip,
+        "stations": stations,
+        "line_chord": np.array(chords),
+        "station_weights": area_shares(stations, plan.root_chord, plan.tip_chord),
+        "gauge_stations": np.array([place for place, _ in design.gauges.positions]),
+        "gauge_length": design.gauges.averaging_spanwise,
+    }

@@ -219,7 +219,8 @@ def test_point_mass_is_a_pitot_tube_that_was_moved(
         places = [place.model_dump() for place in coarse_design.point_masses if place.kind == "servo"]
         moved = {"kind": "pitot", "station": station, "chord": coarse_design.tip_load.chord}
         operators = assemble(coarse_design.changed(point_masses=[*places, moved]))
-        wanted = frequencies(operators.stiffness(FACTOR, STATE[1]), operators.mass(MASSES[0], added))
+        mass = operators.mass(point_masses(MASSES[0], added))
+        wanted = frequencies(operators.stiffness(FACTOR, STATE[1]), mass)
         patch = patched(PointMass(added, station * wing.span))
         frequency = wing.structure(*STATE, MASSES[0], 0.0, patch).modes(3)[0]
         assert frequency == pytest.approx(wanted, rel=FREQUENCY)
@@ -231,7 +232,8 @@ def test_temperature_is_a_change_of_the_modulus_factor(
     wing, operators = coarse_patched_wing, coarse_operators
     patch = patched(ModulusTemperature(2e-3))
     u = wing.structure(*STATE, *MASSES, patch, 25.0).static(wing.load(1.0))
-    full = solved(operators, operators.load_lift, operators.stiffness(STATE[0] * 0.95, STATE[1]))
+    warm = operators.stiffness({"young_modulus_factor": STATE[0] * 0.95}, STATE[1])
+    full = solved(operators, operators.load_lift, warm)
     compare(wing, u, operators, full)
     cold = wing.structure(*STATE, *MASSES, patch, 0.0).stiffness
     assert np.array_equal(cold, wing.structure(*STATE, *MASSES).stiffness)
