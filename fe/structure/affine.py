@@ -41,7 +41,7 @@ class LoadTerm:
     mass: str | None = None
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class AffineStructure:
     """Affine model of a structure on its n free unknowns.
 
@@ -97,9 +97,6 @@ class AffineStructure:
     damping_alpha: float
     damping_beta: float
     design_hash: str
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.design_hash[:12]}, unknowns={self.unknowns})"
 
     @property
     def unknowns(self) -> int:
@@ -183,7 +180,7 @@ class AffineStructure:
         return np.asarray(self.expansion @ free).reshape(-1, 3)
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class DesignedStructure(AffineStructure):
     """Affine model of a structure file.
 

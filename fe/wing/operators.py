@@ -104,7 +104,7 @@ def _in_skin(mesh: WingMesh, cells: IntArray, local: FloatArray) -> tuple[FloatA
 ROOT_UNKNOWNS = 3
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class AffineWing(AffineStructure):
     """A wing as a structure: a factor on its skin, two point masses, a turn and a force near its tip."""
 
@@ -188,7 +188,7 @@ def point_masses(servo: float, pitot: float) -> dict[str, float]:
     return {"servo_mass": servo, "pitot_mass": pitot}
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class AffineOperators(AffineWing):
     """Affine finite element model of the wing on its n free unknowns (held motions are eliminated).
 
@@ -199,7 +199,6 @@ class AffineOperators(AffineWing):
     """
 
     wing_mesh: WingMesh
-    __repr__ = AffineStructure.__repr__
 
 
 def cell_elasticity(mesh: WingMesh) -> FloatArray:
