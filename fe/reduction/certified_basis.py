@@ -171,7 +171,7 @@ def greedy(
     tolerance: float,
     most_snapshots: int,
 ) -> list[float]:
-    """Run pyMOR's weak greedy search with the certified bound as its surrogate.
+    """Run the weak greedy search with the certified bound as its surrogate.
 
     Parameters
     ----------
