@@ -66,13 +66,12 @@ def run() -> list[Measurement]:
 
 
 def _against_the_full_model() -> list[Measurement]:
-    from fe.full.modes import eigenmodes
-    from fe.full.operators import assemble
-    from fe.full.statics import solve_static
     from fe.reduction.model_cache import reduced_model
     from fe.runtime.state import TIP_FORCE
     from fe.runtime.transient import ModalIntegrator
     from fe.wing.design import load_design
+    from fe.wing.operators import assemble
+    from fe.wing.responses import eigenmodes, solve_static
 
     model = reduced_model()
     begin = time.perf_counter()

@@ -25,8 +25,9 @@ import numpy as np
 from scipy.sparse.linalg import splu
 from fe.full import cholesky
 from fe.wing.design import load_design
-from fe.full.operators import assemble
-from fe.full.statics import Factorisation, solve_static
+from fe.wing.operators import assemble
+from fe.full.statics import Factorisation
+from fe.wing.responses import solve_static
 
 def least(function, repeats):
     times = []
@@ -74,7 +75,7 @@ from pathlib import Path
 from fe.runtime.state import DigitalState
 from fe.verification.calculix_models import wing_deck
 from fe.wing.design import load_design
-from fe.full.operators import assemble
+from fe.wing.operators import assemble
 operators = assemble(load_design().changed(mesh={"refinement": float(sys.argv[1])}))
 deck = wing_deck(operators, DigitalState())
 text = deck.static_steps([deck.force_lines(operators.load_tip)])

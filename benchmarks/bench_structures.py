@@ -72,7 +72,7 @@ from skfem import MeshTet
 
 from fe.full.statics import Factorisation
 from fe.reduction.reduced_basis import reduce_structure
-from fe.structure.elements import KINDS
+from fe.elements.kinds import KINDS
 from fe.structure.operators import load_and_assemble
 from fe.verification.calculix_models import structure_deck, structure_loads
 

@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from fe.full.operators import AffineOperators, assemble
-from fe.full.statics import solve_static
 from fe.reduction.reduced_basis import reduce_model, reduce_structure
 from fe.reduction.structure_errors import MeasuredErrors, measured_errors
 from fe.runtime.reduced import ReducedModel
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import WingDesign, load_design
+from fe.wing.operators import AffineOperators, assemble
+from fe.wing.responses import solve_static
 from fmu_asset.packing.structure_fmu import build_fmu
 from scenarios import structure_files
 from scenarios.structures.make_meshes import hexahedra

@@ -12,10 +12,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.full.operators import assemble
-from fe.full.statics import solve_static
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
+from fe.wing.operators import assemble
+from fe.wing.responses import solve_static
 from reporting.files import atomic_write_text
 from scenarios import RECORDING_FOLDER
 from twin_master.assets.interface import AssetReading, StatelessAsset

@@ -18,7 +18,7 @@ from typing import Any
 from reporting.record_json import plain
 
 STACK = (
-    "uav-twin", "numpy", "scipy", "scikit-fem", "pymor", "numba", "fmpy", "pythonfmu", "xarray", "h5netcdf",
+    "uav-twin", "numpy", "scipy", "scikit-fem", "numba", "fmpy", "pythonfmu", "xarray", "h5netcdf",
     "h5py", "pydantic", "matplotlib",
 )  # fmt: skip
 """Distributions whose version can change a figure of a result."""

@@ -348,7 +348,7 @@ def write_beam() -> Callable[..., Path]:
     """
     import meshio
 
-    from fe.structure.elements import KINDS
+    from fe.elements.kinds import KINDS
 
     kind = KINDS["hexahedron20"]
     corners = np.array(

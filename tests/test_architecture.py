@@ -37,7 +37,10 @@ BESIDE = {"benchmarks", "evidence", "tests"}
 
 # The rooms of each package from the ground up; a file at the root of its package is a room of its own.
 ROOMS = {
-    "fe": ("designs", "runtime", "wing", "full", "structure", "reduction", "compilation", "verification"),
+    "fe": (
+        "designs", "runtime", "elements", "full", "structure", "wing", "reduction", "compilation",
+        "verification",
+    ),
     "fmu_asset": (
         "errors", "folders", "slaves", "description", "instances", "worker", "archive", "compiled", "door",
         "packing", "companions", "structures", "coupling", "check", "ssp",
@@ -53,7 +56,8 @@ ROOMS = {
     ),
     "discrepancy": (
         "errors", "sentences", "campaign", "models", "lumped_models", "location", "catalogue",
-        "document_types", "verdict", "files", "search_settings", "fits", "missing_force", "search", "judgement", "force_told", "checks",
+        "document_types", "verdict", "files", "search_settings", "fits", "missing_force", "search",
+        "judgement", "force_told", "checks",
         "sources", "model_choice", "workflow", "parameters", "application", "self_calibration", "report",
         "verdict_folder",
     ),

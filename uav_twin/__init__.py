@@ -16,13 +16,12 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from discrepancy.files.verdict import read_verdict_folder as read_verdict
     from discrepancy.model_choice import load_model
     from discrepancy.workflow import investigate
-    from fe.full.modes import eigenmodes
-    from fe.full.operators import assemble
-    from fe.full.statics import solve_static
     from fe.reduction.model_cache import reduced_model, reduced_structure
     from fe.structure.field import natural_frequencies, static_responses
     from fe.structure.operators import load_any as assemble_structure
     from fe.wing.design import load_design
+    from fe.wing.operators import assemble
+    from fe.wing.responses import eigenmodes, solve_static
     from fmu_asset.door.session import FmiAsset
     from fmu_asset.packing.structure_fmu import build_fmu
     from scenarios import structure_files
@@ -99,11 +98,11 @@ _HOMES = {
     "Twin": "twin_master.network.twin",
     "WatchfulEstimator": "twin_master.learning.monitor",
     "apply_verdict": "discrepancy.application",
-    "assemble": "fe.full.operators",
+    "assemble": "fe.wing.operators",
     "assemble_structure": "fe.structure.operators:load_any",
     "build_fmu": "fmu_asset.packing.structure_fmu",
     "calibrate": "calibration.wing.calibrate:calibrate_wing",
-    "eigenmodes": "fe.full.modes",
+    "eigenmodes": "fe.wing.responses",
     "filter_sequence": "twin_master.network.inference",
     "fly": "twin_master.workflow:new_run",
     "fly_fleet": "twin_master.fleet.flight",
@@ -124,7 +123,7 @@ _HOMES = {
     "reduced_structure": "fe.reduction.model_cache",
     "report_figures": "twin_master.report.page",
     "resume": "twin_master.workflow:resume_run",
-    "solve_static": "fe.full.statics",
+    "solve_static": "fe.wing.responses",
     "static_responses": "fe.structure.field",
     "structure_files": "scenarios",
     "value_iteration": "twin_master.network.planner",

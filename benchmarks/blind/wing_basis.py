@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from fe.full.assembly import Discretisation, point_jacobians
 from fe.full.modes import lowest_eigenpairs
-from fe.full.operators import (
+from fe.full.statics import Factorisation
+from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
+from fe.wing.operators import (
     ROOT_UNKNOWNS,
     AffineOperators,
     assemble,
@@ -29,11 +30,10 @@ from fe.full.operators import (
     gauge_output,
     modulus_variation,
     point_mass_weights,
+    point_masses,
     section_displacement,
 )
-from fe.full.statics import Factorisation
-from fe.full.turn_load import STANDARD_GRAVITY
-from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
+from fe.wing.turn_load import STANDARD_GRAVITY
 
 FloatArray = NDArray[np.float64]
 
@@ -54,19 +54,6 @@ REGION_LINES = ((4, 7), (7, 9), (12, 14), (13, 15), (15, 17), (17, 19), (24, 26)
 """Regions that may be damaged: first and last mesh line along the span."""
 REGION_LOSSES = (0.25, 0.6)
 """Losses at which the solutions in a damaged region's basis are taken."""
-
-
-class _Turned(Discretisation):
-    """Strains along directions turned in the skin from the span towards the rear by `angle` [rad]."""
-
-    def strain_along(
-        self, cells: NDArray[np.int64], local: FloatArray, direction: FloatArray
-    ) -> tuple[NDArray[np.int64], FloatArray]:
-        jacobian = point_jacobians(self.corners[cells], local)
-        aft = jacobian[:, :, 0] - np.sum(jacobian[:, :, 0] * direction, axis=1, keepdims=True) * direction
-        aft /= np.linalg.norm(aft, axis=1, keepdims=True)
-        angle = self.__dict__["angle"]
-        return super().strain_along(cells, local, np.cos(angle) * direction + np.sin(angle) * aft)
 
 
 @dataclass(frozen=True)
@@ -201,13 +188,13 @@ class _Functionals:
 
 
 def _functionals(operators: AffineOperators) -> _Functionals:
-    mesh, grid = operators.wing_mesh, operators.discretisation
+    mesh = operators.wing_mesh
     design, expansion = mesh.design, operators.expansion
 
     def rows(places: list[tuple[float, float]], component: int = 2) -> FloatArray:
-        full = np.zeros((len(places), grid.unknowns))
+        full = np.zeros((len(places), mesh.unknowns))
         for row, (y, chord) in enumerate(places):
-            full[row, component::3] = section_displacement(mesh, grid, y, chord)
+            full[row, component::3] = section_displacement(mesh, y, chord)
         return np.asarray((expansion.T @ full.T).T)
 
     lines = mesh.span_lines
@@ -215,16 +202,16 @@ def _functionals(operators: AffineOperators) -> _Functionals:
     tip, middle = (lines[(lines > low) & (lines < high)] for low, high in HOLDER_SPAN.values())
     corner = design.planform.semi_span - design.tip_load.distance_from_tip
 
-    nodal = grid.nodal_mass(cell_density(mesh))
+    nodal = np.asarray(mesh.mass(np.arange(len(mesh.cells)), cell_density(mesh)).sum(axis=1))
     for place in design.point_masses:
-        nodal = nodal + getattr(design.masses, place.kind) * point_mass_weights(mesh, grid, place)
-    weight = np.zeros(grid.unknowns)
+        nodal = nodal + getattr(design.masses, place.kind) * point_mass_weights(mesh, place)
+    weight = np.zeros(mesh.unknowns)
     weight[2::3] = -STANDARD_GRAVITY * nodal
     weight = np.asarray(expansion.T @ weight)
 
     # Lift without weight, by the station of its unknowns; the root's unknowns lie at station 0.
-    free = np.asarray(expansion.T @ np.repeat(grid.node_points[:, 1], 3))
-    count = np.asarray(expansion.T @ np.ones(grid.unknowns))
+    free = np.asarray(expansion.T @ np.repeat(mesh.points[:, 1], 3))
+    count = np.asarray(expansion.T @ np.ones(mesh.unknowns))
     station = np.where(np.abs(count) > 0.0, free / np.where(count == 0.0, 1.0, count), 0.0)
     station[-ROOT_UNKNOWNS:] = 0.0
     places, owner = np.unique(np.round(station, 9), return_inverse=True)
@@ -233,9 +220,7 @@ def _functionals(operators: AffineOperators) -> _Functionals:
     root = np.zeros(operators.unknowns)
     root[-2] = 1.0
     return _Functionals(
-        displacement=np.vstack(
-            [operators.displacement_output, operators.tip_displacement_output, rows([MIDDLE])]
-        ),
+        displacement=np.vstack([operators.load_tip, operators.tip_row, rows([MIDDLE])]),
         line_stations=line,
         line=tuple(rows([(y, 0.3) for y in line], c) for c in range(3)),  # type: ignore[arg-type]
         tip_stations=tip,
@@ -274,15 +259,16 @@ def _snapshots(operators: AffineOperators) -> FloatArray:
     loads = _loads(_functionals(operators), operators.wing_mesh.design)
     found = []
     for factor in FACTORS:
-        stiffness = operators.stiffness(factor)
+        stiffness = operators.stiffness({"young_modulus_factor": factor})
         found.append(Factorisation(stiffness).solve(loads))
         for servo, pitot in MASSES if factor != FACTORS[1] else ():
-            found.append(lowest_eigenpairs(stiffness, operators.mass(servo, pitot), MODE_COUNT)[1])
+            mass = operators.mass(point_masses(servo, pitot))
+            found.append(lowest_eigenpairs(stiffness, mass, MODE_COUNT)[1])
     return np.hstack(found)
 
 
 def _region_stiffness(operators: AffineOperators, region: int) -> tuple[list[sparse.csr_array], FloatArray]:
-    mesh, grid = operators.wing_mesh, operators.discretisation
+    mesh = operators.wing_mesh
     start, end = (float(mesh.span_lines[k]) for k in REGION_LINES[region])
     inside = (mesh.centres[:, 1] > start) & (mesh.centres[:, 1] < end)
     elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
@@ -290,9 +276,9 @@ def _region_stiffness(operators: AffineOperators, region: int) -> tuple[list[spa
     for term in range(3):
         cells = np.flatnonzero(inside & (mesh.region == term))
         if cells.size:
-            matrix = grid.stiffness(cells, elasticity[cells], variation[cells])
+            matrix = mesh.stiffness(cells, elasticity[cells], variation[cells])
         else:
-            matrix = sparse.csr_array((grid.unknowns, grid.unknowns))
+            matrix = sparse.csr_array((mesh.unknowns, mesh.unknowns))
         parts.append((operators.expansion.T @ (matrix @ operators.expansion)).tocsr())
     return parts, np.array([start, end])
 
@@ -300,7 +286,7 @@ def _region_stiffness(operators: AffineOperators, region: int) -> tuple[list[spa
 def _build(operators: AffineOperators, snapshots: FloatArray, region: int) -> WingBasis:
     design = operators.wing_mesh.design
     f = _functionals(operators)
-    nominal = operators.stiffness(1.0073)
+    nominal = operators.stiffness({"young_modulus_factor": 1.0073})
     parts: list[sparse.csr_array] = []
     place = np.full(2, np.nan)
     if region >= 0:
@@ -310,7 +296,8 @@ def _build(operators: AffineOperators, snapshots: FloatArray, region: int) -> Wi
         for loss in REGION_LOSSES:
             stiffness = (nominal - loss * (1.0073 * parts[0] + parts[1] + parts[2])).tocsr()
             found.append(Factorisation(stiffness).solve(loads))
-            found.append(lowest_eigenpairs(stiffness, operators.mass(*MASSES[0]), MODE_COUNT)[1])
+            mass = operators.mass(point_masses(*MASSES[0]))
+            found.append(lowest_eigenpairs(stiffness, mass, MODE_COUNT)[1])
         snapshots = np.hstack(found)
     basis = _orthonormal(snapshots)
 
@@ -319,15 +306,11 @@ def _build(operators: AffineOperators, snapshots: FloatArray, region: int) -> Wi
         return np.asarray(0.5 * (small + small.T))
 
     r = basis.shape[1]
-    grid = operators.discretisation
     strain = [operators.gauge_output @ basis]
     for angle in (0.5 * np.pi, 0.25 * np.pi):
-        turned = _Turned(grid.mesh)
-        turned.__dict__.update(grid.__dict__)
-        turned.__dict__["angle"] = angle
-        strain.append(gauge_output(operators.wing_mesh, turned) @ operators.expansion @ basis)
+        strain.append(gauge_output(operators.wing_mesh, angle) @ operators.expansion @ basis)
     return WingBasis(
-        stiffness=np.array([projected(term) for term in operators.stiffness_terms]),
+        stiffness=np.array([projected(term.matrix) for term in operators.stiffness_terms]),
         mass=np.array([projected(term) for term in operators.mass_terms]),
         damaged=np.array([projected(part) for part in parts]) if parts else np.zeros((3, r, r)),
         strain=np.array(strain),

@@ -177,7 +177,7 @@ def _provenance(lab: LabData, drawn: WingDesign, seed: int) -> Mapping[str, Any]
         seed,
         input_hashes={**lab.input_hashes, "design": drawn.hash},
         packages=("calibration", "fe"),
-        distributions=("uav-twin", "numpy", "scipy", "scikit-fem", "pymor"),
+        distributions=("uav-twin", "numpy", "scipy", "scikit-fem"),
     ).as_dict()
 
 

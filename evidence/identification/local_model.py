@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.full.modes import flapwise_bending_modes, lowest_eigenpairs
-from fe.full.operators import AffineOperators, assemble
+from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
 from fe.runtime.errors import FiniteElementError
 from fe.wing.design import WingDesign
+from fe.wing.operators import AffineOperators, assemble, point_masses
+from fe.wing.responses import flapwise_bending_modes
 from reporting.progress import Progress, SilentProgress
 
 from .errors import IdentificationError
@@ -144,22 +145,20 @@ def _bases(
     operators: AffineOperators,
 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[int, int], FloatArray]:
     """Return static (n, N) and modal (n, m) basis, bending shapes (m, 2), their places, frequencies."""
-    skin = operators.stiffness_terms[0]
+    skin, factor = operators.stiffness_terms[0].matrix, {"young_modulus_factor": LIBRARY_FACTOR}
     columns = []
     outputs = operators.gauge_output.toarray().T
     for i, j in np.argwhere(fitted_states()):
-        factors = Factorisation(operators.stiffness(LIBRARY_FACTOR, (LEVELS[i], LEVELS[j])))
+        factors = Factorisation(operators.stiffness(factor, (LEVELS[i], LEVELS[j])))
         columns.append(factors.raw_solve(np.column_stack([operators.load_lift, outputs])))
-    healthy = Factorisation(operators.stiffness(LIBRARY_FACTOR))
+    healthy = Factorisation(operators.stiffness(factor))
     first = healthy.raw_solve(np.column_stack([operators.load_tip, operators.load_lift, outputs]))
     second = healthy.raw_solve(skin @ first)
     third = healthy.raw_solve(skin @ second[:, :2])
-    static = _orthonormal(
-        np.hstack([*columns, first, second, third]), operators.stiffness(LIBRARY_FACTOR), DEPENDENT
-    )
+    static = _orthonormal(np.hstack([*columns, first, second, third]), operators.stiffness(factor), DEPENDENT)
 
     servo = 0.5 * (MASS_TOTAL - REFERENCE_PITOT)
-    stiffness, mass = operators.stiffness(), operators.mass(servo, REFERENCE_PITOT)
+    stiffness, mass = operators.stiffness(), operators.mass(point_masses(servo, REFERENCE_PITOT))
     eigenvalues, shapes = lowest_eigenpairs(stiffness.tocsc(), mass.tocsc(), MODE_COUNT)
     places = flapwise_bending_modes(operators, shapes, mass)
     order = int(places[0]), int(places[1])

@@ -11,20 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.full.assembly import Discretisation
-from fe.full.operators import (
+from fe.elements.cells import mass_blocks, stiffness_blocks
+from fe.wing.design import WingDesign
+from fe.wing.mesh import WingMesh, build_mesh
+from fe.wing.operators import (
     ROOT_UNKNOWNS,
     all_point_mass_weights,
     cell_density,
     cell_elasticity,
     gauge_output,
     modulus_variation,
-    root_expansion,
+    root_support,
     section_displacement,
+    turn_load,
+    upward,
 )
-from fe.full.turn_load import inertia_relief, lift_load
-from fe.wing.design import WingDesign
-from fe.wing.mesh import WingMesh, build_mesh
 
 from .errors import IdentificationError
 
@@ -75,7 +76,6 @@ class WingPieces:
     Attributes
     ----------
     mesh : WingMesh
-    body : Discretisation
     elasticity, variation, density : (nc, 6, 6), (nc, 27), (nc,)
         Of the cells.
     term : (nc,)
@@ -92,7 +92,6 @@ class WingPieces:
     """
 
     mesh: WingMesh
-    body: Discretisation
     elasticity: FloatArray
     variation: FloatArray
     density: FloatArray
@@ -120,19 +119,17 @@ def wing_pieces(design: WingDesign, base: WingPieces | None = None) -> WingPiece
     """
     same_mesh = base is not None and _same_mesh(design, base.design)
     if base is not None and same_mesh:
-        mesh, body, expansion = replace(base.mesh, design=design), base.body, base.expansion
+        mesh, expansion = replace(base.mesh, design=design), base.expansion
     else:
         mesh = build_mesh(design)
-        if base is None:
-            body = Discretisation(mesh.skfem_mesh)
-        else:
-            if mesh.cells.shape != base.mesh.cells.shape or np.any(mesh.cells != base.mesh.cells):
-                raise IdentificationError(
-                    "a small change of the design changes the number of cells; change mesh.span_size or "
-                    "mesh.chord_size a little."
-                )
-            body = base.body.moved(mesh.skfem_mesh)
-        expansion = root_expansion(design, body)
+        if base is not None and (
+            mesh.cells.shape != base.mesh.cells.shape or np.any(mesh.cells != base.mesh.cells)
+        ):
+            raise IdentificationError(
+                "a small change of the design changes the number of cells; change mesh.span_size or "
+                "mesh.chord_size a little."
+            )
+        expansion = root_support(mesh).expansion
     density = cell_density(mesh)
     same_gauges = base is not None and same_mesh and design.gauges == base.design.gauges
     places = design.point_masses
@@ -143,22 +140,14 @@ def wing_pieces(design: WingDesign, base: WingPieces | None = None) -> WingPiece
         and design.lift == base.design.lift
         and not (relieved and (np.any(density != base.density) or places != base.design.point_masses))
     )
-    weights = all_point_mass_weights(mesh, body)
+    weights = all_point_mass_weights(mesh)
     plan = design.planform
-    tip = np.zeros(body.unknowns)
-    tip[2::3] = section_displacement(
-        mesh, body, plan.semi_span - design.tip_load.distance_from_tip, design.tip_load.chord
-    )
-    if base is not None and same_lift:
-        lift = base.lift
-    else:
-        lift = lift_load(mesh, body)
-        if design.lift.inertia_relief:
-            lift = lift + inertia_relief(design, body, density, weights, lift)
+    load = design.tip_load
+    tip = upward(section_displacement(mesh, plan.semi_span - load.distance_from_tip, load.chord))
+    lift = base.lift if base is not None and same_lift else turn_load(mesh)
     root = design.root
     return WingPieces(
         mesh=mesh,
-        body=body,
         elasticity=cell_elasticity(mesh),
         variation=modulus_variation(mesh),
         density=density,
@@ -167,7 +156,7 @@ def wing_pieces(design: WingDesign, base: WingPieces | None = None) -> WingPiece
         springs=np.array([root.transverse_spring, root.flap_spring, root.yaw_spring]),
         lift=lift,
         tip=tip,
-        gauges=base.gauges if base is not None and same_gauges else gauge_output(mesh, body),
+        gauges=base.gauges if base is not None and same_gauges else gauge_output(mesh),
         point_masses=weights,
     )
 
@@ -207,7 +196,7 @@ def reduced_difference(
     own = [one.expansion @ basis for basis in bases]
     its = own if one.expansion is other.expansion else [other.expansion @ basis for basis in bases]
     # The section's least-squares edges move a little everywhere when one mesh line moves.
-    move = np.abs(one.body.corners - other.body.corners).max(axis=(1, 2))
+    move = np.abs(one.mesh.corners - other.mesh.corners).max(axis=(1, 2))
     differ = (
         (move > STILL * move.max())
         | np.any(one.elasticity != other.elasticity, axis=(1, 2))
@@ -216,7 +205,7 @@ def reduced_difference(
     )
     if own is not its:
         moved = np.any(own[0] != its[0], axis=1) | np.any(own[1] != its[1], axis=1)
-        differ |= np.any(moved[one.body.cell_dofs], axis=1)
+        differ |= np.any(moved[one.mesh.unknowns_of(np.arange(len(one.mesh.cells)))], axis=1)
     cells = np.flatnonzero(differ)
     difference = _cell_terms(one, cells, own[0], own[1]).combined(
         _cell_terms(other, cells, its[0], its[1]), -1.0
@@ -227,7 +216,8 @@ def reduced_difference(
 
 def _cell_terms(pieces: WingPieces, cells: IntArray, static: FloatArray, modal: FloatArray) -> ReducedTerms:
     """Stiffness of the cells and mass of the structure on the expanded bases (full, N) and (full, m)."""
-    terms, N, m = len(pieces.design.regions) + 2, static.shape[1], modal.shape[1]
+    mesh, terms = pieces.mesh, len(pieces.design.regions) + 2
+    N, m = static.shape[1], modal.shape[1]
     both = np.hstack([static, modal])
     stiffness = np.zeros((terms, N, N))
     modal_stiffness = np.zeros((terms, m, m))
@@ -236,17 +226,16 @@ def _cell_terms(pieces: WingPieces, cells: IntArray, static: FloatArray, modal: 
         chosen = cells[pieces.term[cells] == term]
         for start in range(0, len(chosen), _BATCH):
             part = chosen[start : start + _BATCH]
-            dofs = pieces.body.cell_dofs[part]
-            local = both[dofs]
-            strained = local - _rigid_part(pieces.body.nodes_of(part), local)
-            blocks = pieces.body.stiffness_blocks(part, pieces.elasticity[part], pieces.variation[part])
+            local, nodes = both[mesh.unknowns_of(part)], mesh.nodes[part]
+            strained = local - _rigid_part(nodes, local)
+            blocks = stiffness_blocks(mesh.kind, nodes, pieces.elasticity[part], pieces.variation[part])
             forces = (blocks @ strained).reshape(-1, N + m)
             flat = strained.reshape(-1, N + m)
             stiffness[term] += flat[:, :N].T @ forces[:, :N]
             modal_stiffness[term] += flat[:, N:].T @ forces[:, N:]
-            blocks = pieces.body.mass_blocks(part, pieces.density[part])
-            flat = local.reshape(-1, N + m)
-            mass[0] += flat[:, N:].T @ (blocks @ local[:, :, N:]).reshape(-1, m)
+            blocks = mass_blocks(mesh.kind, nodes, pieces.density[part], mesh.kind.mass_rule)
+            shapes = local[:, :, N:].reshape(len(part), len(blocks[0]), -1)
+            mass[0] += shapes.reshape(-1, m).T @ (blocks @ shapes).reshape(-1, m)
     return ReducedTerms(
         stiffness, np.zeros(N), np.zeros(N), np.zeros((pieces.gauges.shape[0], N)), modal_stiffness, mass
     )

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
 
-from fe.full.operators import AffineOperators
 from fe.runtime.state import Losses
 
 from .errors import IdentificationError
@@ -151,7 +150,7 @@ class ReducedWing:
         parameters = self._parameter_count
         value, gradient = np.empty((len(factor), MODES)), np.empty((len(factor), MODES, parameters))
         for row, (e, servo, pitot) in enumerate(zip(factor, servo_mass, pitot_mass, strict=True)):
-            theta, mass_theta = self._theta(e), AffineOperators.mass_theta(servo, pitot)
+            theta, mass_theta = self._theta(e), np.array([1.0, servo, pitot])
             stiffness = np.tensordot(theta, own.modal_stiffness, axes=1)
             mass = np.tensordot(mass_theta, own.modal_mass, axes=1)
             values, shapes = eigh(stiffness, mass)

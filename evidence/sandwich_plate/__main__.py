@@ -17,8 +17,8 @@ from evidence.sandwich_plate.plate_known_answers import (
     square_plate_deflection,
     square_plate_frequency,
 )
-from fe.full.operators import AffineOperators, assemble
 from fe.wing.design import load_design
+from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
 from twin_master.command import guarded
 from uav_twin.verify import QUICK_REFINEMENTS, Check, end_with, print_checks

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.full.affine import AffineSystem
-from fe.full.modes import cantilever_bending, cantilever_bending_shapes, lowest_eigenpairs, track
-from fe.full.operators import AffineOperators, assemble
+from fe.full.modes import lowest_eigenpairs, track
 from fe.full.statics import Factorisation
 from fe.runtime.state import Losses
 from fe.wing.design import WingDesign
+from fe.wing.operators import AffineOperators, AffineWing, assemble, point_masses
+from fe.wing.responses import cantilever_bending, cantilever_bending_shapes
 
 from .plate import FIELDS, B, W
 from .sandwich_plate import PlateOperators, assemble_plate
@@ -175,12 +175,12 @@ def gauges_at_edges(design: WingDesign) -> BoolArray:
     return found
 
 
-def wing_results(model: AffineSystem, design: WingDesign, bending_shapes: FloatArray) -> WingResults:
+def wing_results(model: AffineWing, design: WingDesign, bending_shapes: FloatArray) -> WingResults:
     """Evaluate a model.
 
     Parameters
     ----------
-    model : AffineSystem
+    model : AffineWing
         Box or plate.
     design : WingDesign
         The wing, for its load factor and masses.
@@ -193,14 +193,14 @@ def wing_results(model: AffineSystem, design: WingDesign, bending_shapes: FloatA
         return np.asarray(model.gauge_output @ found[:, 1])
 
     def damaged(loss: Losses) -> FloatArray:
-        return strain(Factorisation(model.stiffness(1.0, loss)).solve(loads))
+        return strain(Factorisation(model.stiffness(None, loss)).solve(loads))
 
     factors = Factorisation(model.stiffness())
     found = factors.solve(loads)
     # K = e K_skin + ...: the derivative of the solution with respect to e, at e = 1
-    slope = -factors.solve(model.stiffness_terms[0] @ found)
+    slope = -factors.solve(model.stiffness_terms[0].matrix @ found)
     tip, healthy = float(model.load_tip @ found[:, 0]), strain(found)
-    mass = model.mass(design.masses.servo, design.masses.pitot)
+    mass = model.mass(point_masses(design.masses.servo, design.masses.pitot))
     values, shapes = lowest_eigenpairs(model.stiffness(), mass, MODES)
     frequency = np.sqrt(values) / (2.0 * np.pi)
     first, second = frequency[track(bending_shapes, shapes, mass)]

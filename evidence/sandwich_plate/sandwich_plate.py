@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.full.affine import AffineSystem
-from fe.full.operators import ROOT_UNKNOWNS, patch_pieces
-from fe.full.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY
 from fe.wing.design import WingDesign
+from fe.wing.operators import ROOT_UNKNOWNS, AffineWing, patch_pieces
+from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY
 
 from .plate import FIELDS, A, B, Plate, Surface, U, V, W, plane_stress, surface_strain
 from .plate_frame import frame_stiffness
@@ -27,7 +26,7 @@ BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class PlateOperators(AffineSystem):
+class PlateOperators(AffineWing):
     """Affine plate model of the wing on its n free unknowns; `expansion` gives the five fields of all nodes.
 
     Attributes
@@ -86,14 +85,14 @@ def assemble_plate(design: WingDesign, *, straight_section: bool = False) -> Pla
         restriction @ _deflection(layout, distance, design.tip_load.chord)
         for distance in (load_place, plan.semi_span)
     )
-    return PlateOperators(
+    return PlateOperators.of(
         regions=design.regions,
-        stiffness_terms=(*skins, (base + sparse.diags_array(springs)).tocsr()),
+        stiffness=(*skins, (base + sparse.diags_array(springs)).tocsr()),
         mass_terms=tuple(reduced(term) for term in _mass_terms(layout)),
         load_lift=np.asarray(restriction @ _lift(layout)),
         load_tip=np.asarray(load_tip),
         gauge_output=(_gauge_output(layout) @ expansion).tocsr(),
-        tip_displacement_output=np.asarray(tip),
+        tip=np.asarray(tip),
         expansion=expansion,
         design_hash=design.hash,
         kept=kept,

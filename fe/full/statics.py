@@ -1,6 +1,4 @@
-"""Static response of the full model: Kapteyn et al. 2021, eqs. (13) and (15)."""
-
-from dataclasses import dataclass
+"""Factorised stiffness, and solutions whose accuracy is checked."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,10 +6,8 @@ from scipy import sparse
 from scipy.sparse.linalg import norm
 
 from fe.runtime.errors import SolutionError
-from fe.runtime.state import Losses
 
 from .cholesky import Cholesky
-from .operators import AffineOperators
 
 FloatArray = NDArray[np.float64]
 
@@ -84,73 +80,3 @@ class Factorisation:
         scale = self._norm * float(np.abs(solution).max()) + float(np.abs(right_hand_side).max())
         residual = float(np.abs(right_hand_side - self._matrix @ solution).max())
         return residual / scale if scale > 0.0 else residual
-
-
-@dataclass(frozen=True)
-class StaticSolution:
-    """Static response of the full model.
-
-    Attributes
-    ----------
-    displacement : (n,)
-        Free unknowns [m, rad].
-    strain : (gauges,) dimensionless
-        Strain at the gauges, positive in compression.
-    load_point_displacement, tip_displacement : float
-        Upward displacement at the place of the static test and at the tip [m].
-    """
-
-    displacement: FloatArray
-    strain: FloatArray
-    load_point_displacement: float
-    tip_displacement: float
-
-
-def solve_static(
-    operators: AffineOperators,
-    young_modulus_factor: float = 1.0,
-    stiffness_loss: Losses = (),
-    load_factor: float = 1.0,
-    tip_force: float = 0.0,
-) -> StaticSolution:
-    """Solve K(e, z) u = f, Kapteyn et al. 2021, eq. (13), and evaluate the gauge strains, eq. (15).
-
-    Parameters
-    ----------
-    operators : AffineOperators
-        The model.
-    young_modulus_factor, stiffness_loss
-        As of `fe.runtime.state.DigitalState`.
-    load_factor : float
-        Load factor of the turn [1].
-    tip_force : float
-        Upward force at the place of the static test [N].
-
-    Raises
-    ------
-    SolutionError
-        If the solution is not accurate.
-    """
-    factors = Factorisation(operators.stiffness(young_modulus_factor, stiffness_loss))
-    displacement = factors.solve(operators.load(load_factor, tip_force))
-    return static_outputs(operators, displacement)
-
-
-def static_outputs(operators: AffineOperators, displacement: FloatArray) -> StaticSolution:
-    """Evaluate the outputs of a displacement (n,) of the free unknowns."""
-    return StaticSolution(
-        displacement=displacement,
-        strain=np.asarray(operators.gauge_output @ displacement),
-        load_point_displacement=float(operators.displacement_output @ displacement),
-        tip_displacement=float(operators.tip_displacement_output @ displacement),
-    )
-
-
-def tip_stiffness(
-    operators: AffineOperators,
-    young_modulus_factor: float = 1.0,
-    stiffness_loss: Losses = (),
-) -> float:
-    """Stiffness [N/m] of the static test: force near the tip over the displacement there."""
-    solution = solve_static(operators, young_modulus_factor, stiffness_loss, load_factor=0.0, tip_force=1.0)
-    return 1.0 / solution.load_point_displacement

@@ -10,9 +10,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pymor.algorithms.greedy import WeakGreedySurrogate, weak_greedy
-from pymor.core.exceptions import ExtensionError
-from pymor.core.logger import set_log_levels
 
 from fe.full.affine import AffineSum
 from fe.full.subspace import (
@@ -71,7 +68,7 @@ class StaticReduction:
         self.correction = np.swapaxes(self.dual.products, 1, 2) @ self.residual_basis.vectors
         self.snapshots: list[State] = []
 
-    def add_snapshots(self, states: list[State]) -> None:
+    def add_snapshots(self, states: list[State]) -> bool:
         """Solve the full model for all loads at several states and extend the bases."""
         thetas, loads = [self.terms.theta(state) for state in states], self.terms.loads
         # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
@@ -87,11 +84,12 @@ class StaticReduction:
         self.basis.extend(solution, self.norm.product(solution))
         new = self.basis.vectors[:, before:]
         if not new.shape[1]:
-            raise ExtensionError  # rounding is reached; what the search reached is judged after it
+            return False  # rounding is reached; what the search reached is judged after it
         self._take_images([np.asarray(term @ new) for term in self.terms.stiffness_terms])
         if not self.snapshots:
             self.rounding = self._rounding(thetas[0], self.terms.outputs.T @ solution)
         self.snapshots.extend(states)
+        return True
 
     def _take_images(self, images: list[FloatArray]) -> None:
         """Take the stiffness terms times the last basis vectors, (n, k) each, into what is kept of all."""
@@ -173,7 +171,7 @@ def greedy(
     tolerance: float,
     most_snapshots: int,
 ) -> list[float]:
-    """Run pyMOR's weak greedy search with the certified bound as its surrogate.
+    """Run the weak greedy search with the certified bound as its surrogate.
 
     Parameters
     ----------
@@ -193,55 +191,41 @@ def greedy(
     list of float
         Largest bound before each full solution and at the end.
     """
-    set_log_levels({"pymor.algorithms.greedy": "WARN"})
+    wanted, places = SEARCH_MARGIN * tolerance, np.array(states)
+    known, history = np.full(len(states), np.inf), []
+    # nothing to bound yet: begin in the middle
+    chosen = [states[int(((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin())]]
+    for number in range(1 + ceil((most_snapshots - 1) / TOGETHER)):
+        if number:
+            few = len(states) // LOOKED_AT if number > 1 and static.dual.output.size else 0
+            bounds = _bounds(static, model(), states, known, few, wanted)
+            history.append(float(bounds.max()))
+            if history[-1] <= wanted:
+                return history
+            chosen = _spread(places, bounds, min(TOGETHER, most_snapshots - len(static.snapshots)), wanted)
+        if not static.add_snapshots(chosen):
+            break
+        static.advance(len(chosen), f"full solution {len(static.snapshots)}")
+    present = model()
+    return [*history, max(static.bound(present, state) for state in states)]
 
-    class Surrogate(WeakGreedySurrogate):  # type: ignore[misc]
-        """The reduced model's own bound, as pyMOR's search wants it."""
 
-        bounds, known, asked, rounds = np.empty(0), np.empty(0), np.empty((0, 0)), 0
-
-        def evaluate(self, mus: list[Any], return_all_values: bool = False) -> Any:
-            """Return the largest bound and where it is, or all bounds."""
-            if not static.basis.size:  # nothing to bound yet: begin in the middle
-                bounds = np.array([-sum((np.array(mu) - np.mean(mus, axis=0)) ** 2) for mu in mus]) + 1e3
-            else:
-                bounds = self._bounds(model(), mus)
-            if return_all_values:
-                return bounds
-            self.bounds, self.asked = bounds, np.array(mus)
-            worst = int(bounds.argmax())
-            return float(bounds[worst]), mus[worst]
-
-        def _bounds(self, present: ReducedModel, mus: list[Any]) -> FloatArray:
-            """Return the bounds; of many states, where they were largest, and zeros, until they are small."""
-            bounds, first = np.zeros(len(mus)), 0
-            if self.rounds == 1:
-                self.known = np.full(len(mus), np.inf)
-            order = np.argsort(-self.known, kind="stable")
-            few = len(mus) // LOOKED_AT if self.rounds > 1 and static.dual.output.size else 0
-            for count in (few, len(mus)):
-                for number in order[first:count]:
-                    bounds[number] = self.known[number] = static.bound(present, mus[number])
-                first = count
-                if bounds.max() > SEARCH_MARGIN * tolerance:
-                    break
-            return bounds
-
-        def extend(self, mu: State) -> None:
-            """Add the full solutions at the worst state, and at others of large bounds away from it."""
-            count = min(TOGETHER, most_snapshots - len(static.snapshots))
-            first = not static.basis.size
-            chosen = [mu] if first else _spread(self.asked, self.bounds, count, SEARCH_MARGIN * tolerance)
-            static.add_snapshots(chosen)
-            self.rounds += 1
-            static.advance(len(chosen), f"full solution {len(static.snapshots)}")
-
-    surrogate, most_rounds = Surrogate(), 1 + ceil((most_snapshots - 1) / TOGETHER)
-    result = weak_greedy(surrogate, states, atol=SEARCH_MARGIN * tolerance, max_extensions=most_rounds)
-    bounds = [float(value) for value in result["max_errs"][1:]]
-    if len(bounds) < surrogate.rounds or bounds[-1] > SEARCH_MARGIN * tolerance:  # not all were looked at
-        present = model()
-        bounds.append(max(static.bound(present, mu) for mu in states))
+def _bounds(
+    static: StaticReduction,
+    present: ReducedModel,
+    states: list[State],
+    known: FloatArray,
+    few: int,
+    wanted: float,
+) -> FloatArray:
+    """Bounds of the `few` states that were worst when last looked at; of all where these are good enough."""
+    bounds, order, first = np.zeros(len(states)), np.argsort(-known, kind="stable"), 0
+    for count in (few, len(states)):
+        for number in order[first:count]:
+            bounds[number] = known[number] = static.bound(present, states[number])
+        first = count
+        if bounds.max() > wanted:
+            break
     return bounds
 
 

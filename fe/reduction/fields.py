@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import numpy.typing as npt
 
+from fe.elements.kinds import HEXAHEDRA_20
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays
 from fe.runtime.reduced import ReducedModel
-from fe.structure.elements import HEXAHEDRA_20
 from fe.structure.field import centre_strains, write_vtu
 
 if TYPE_CHECKING:
-    from fe.full.operators import AffineOperators
+    from fe.wing.operators import AffineOperators
 
     from .reduced_basis import Reduction
 
@@ -26,15 +26,6 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 _CELLS = HEXAHEDRA_20.file_type
-
-
-def _order(wanted: FloatArray, given: FloatArray) -> list[int]:
-    """Return where each of the `wanted` places (20, 3) is among the `given` ones."""
-    return [int(np.flatnonzero(np.all(np.equal(given, place), axis=1))[0]) for place in wanted]
-
-
-# Node k of a cell seen in a mirror is node _MIRRORED[k] of the cell.
-_MIRRORED = _order(HEXAHEDRA_20.places * [1.0, 1.0, -1.0] + [0.0, 0.0, 1.0], HEXAHEDRA_20.places)
 
 
 @dataclass(frozen=True, repr=False)
@@ -106,14 +97,7 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
     reduction : Reduction
         What was made of it.
     """
-    from skfem import ElementHexS2
-
-    from fe.full.assembly import global_gradients
-
-    discretisation = operators.discretisation
-    cells = discretisation.cell_nodes[:, _order(HEXAHEDRA_20.places, ElementHexS2().doflocs)]
-    _, determinant = global_gradients(discretisation.corners, np.full((1, 3), 0.5))
-    cells = np.where(determinant < 0.0, cells[:, _MIRRORED], cells)
+    mesh = operators.wing_mesh
 
     def spread(vectors: FloatArray) -> FloatArray:
         return np.asarray(operators.expansion @ vectors)
@@ -122,9 +106,9 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
     modal = spread(reduction.modal_basis)
     return FieldBasis(
         design_hash=operators.design_hash,
-        points=discretisation.node_points,
-        cells=cells.astype(np.int64),
-        region=operators.wing_mesh.region.astype(np.int64),
+        points=mesh.points,
+        cells=mesh.cells,
+        region=mesh.region,
         static_displacement=static.reshape(-1, 3, static.shape[1]),
         modal_displacement=modal.reshape(-1, 3, modal.shape[1]),
     )

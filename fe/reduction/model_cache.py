@@ -20,15 +20,15 @@ from .built_once import built_once, cache_folder, kept
 from .fields import FieldBasis, WingFields, field_basis
 
 if TYPE_CHECKING:
-    from fe.full.operators import AffineOperators
     from fe.structure.affine import DesignedStructure
     from fe.wing.design import WingDesign
+    from fe.wing.operators import AffineOperators
     from reporting.progress import Progress
 
     from .patch_basis import PatchSettings
     from .settings import ReductionSettings, StructureSettings
 
-MODELLING_ROOMS = ("runtime", "wing", "full", "structure", "reduction")
+MODELLING_ROOMS = ("runtime", "elements", "full", "structure", "wing", "reduction")
 """The rooms that decide what a reduced model holds; a change in any of their files makes a new entry."""
 
 _Kept = TypeVar("_Kept", bound=KeptArrays)
@@ -148,7 +148,7 @@ def assembled(design: "WingDesign", progress: "Progress | None") -> "Iterator[Af
     """Give the full model of a design, and hold the process to one thread meanwhile."""
     from threadpoolctl import threadpool_limits
 
-    from fe.full.operators import assemble
+    from fe.wing.operators import assemble
 
     with threadpool_limits(1):
         with (progress or SilentProgress()).stage("Meshing and assembling the wing"):

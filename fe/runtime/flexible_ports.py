@@ -10,7 +10,7 @@ into the FMU.
 """
 
 from .laws import advance, dry, pull
-from .motion_arrays import FIRST_PARTS, Acting, Course, IntArray, Ports, State
+from .motion_arrays import FIRST_PARTS, Acting, Course, IntArray, Ports, State, add, at_port
 
 
 def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -> None:
@@ -21,8 +21,7 @@ def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -
         if acting.leader[port] != port:  # one law for each flexible port
             continue
         y = ports.feed[0, port] * course.load[0] + ports.feed[1, port] + state.memory[port, 3]
-        for m in range(len(state.q)):
-            y += ports.rows[port, m] * state.q[m]
+        y += at_port(ports.rows, port, state.q)
         springs = -1
         for j in range(count):
             acting.springs[j] = -1
@@ -65,8 +64,7 @@ def carry_flexible(ports: Ports, acting: Acting, state: State, load: float, h: f
         if acting.leader[port] != port:
             continue
         y = ports.feed[0, port] * load + ports.feed[1, port] + keep * state.memory[port, 3]
-        for m in range(len(state.q)):
-            y += ports.rows[port, m] * state.q[m]
+        y += at_port(ports.rows, port, state.q)
         for j in range(count):
             if acting.leader[j] == port:
                 y -= ports.flexibility[port] * keep * state.memory[j, 2]
@@ -81,8 +79,7 @@ def carry_flexible(ports: Ports, acting: Acting, state: State, load: float, h: f
                 arrive(ports, state, j, x, 1)
             state.memory[j, 2] = keep * state.memory[j, 2] + ease * state.current[j]
             state.memory[j, 3] *= keep
-            for m in range(len(state.q)):
-                state.v[m] -= ports.rows[j, m] * state.current[j] * (0.5 * h)
+            add(state.v, ports.rows[j], -state.current[j], 0.5 * h)
 
 
 def pull_of(ports: Ports, state: State, j: int, x: float, h: float, least: int) -> tuple[float, float]:

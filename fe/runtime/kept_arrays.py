@@ -11,6 +11,7 @@ import tempfile
 import zipfile
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
+from math import isfinite
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_args
 
@@ -133,7 +134,8 @@ class KeptArrays:
     """Arrays and plain numbers that were made of one design; a kind of record is a subclass with its fields.
 
     An array is declared with its axes, `Annotated[FloatArray, "loads", 2]`: a number is the length, and a
-    name means one length in all arrays, which `_lengths` or else the first array with that axis tells.
+    name means one length in all arrays, which `_lengths` or else the first array with that axis tells. A
+    number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`.
 
     Class attributes
     ----------------
@@ -159,7 +161,16 @@ class KeptArrays:
             axes: tuple[str | int, ...] = getattr(item.type, "__metadata__", ())
             if not axes:
                 continue
-            array, (kind,) = getattr(self, item.name), get_args(get_args(get_args(item.type)[0])[1])
+            array, number = getattr(self, item.name), get_args(item.type)[0]
+            if number is float:
+                low, high = map(float, axes)
+                if not (isfinite(array) and low <= array <= high):
+                    raise ReducedModelFileError(
+                        f"The {item.name} of {self.what} must lie between {low:.2g} and {high:g}, but is "
+                        f"{array!r}; build it anew."
+                    )
+                continue
+            (kind,) = get_args(get_args(number)[1])
             lengths = {**dict(zip(axes, array.shape, strict=False)), **lengths}
             expected = tuple(axis if isinstance(axis, int) else lengths.get(axis, 0) for axis in axes)
             if array.shape != expected or array.dtype != kind or not np.isfinite(array).all():
@@ -210,10 +221,9 @@ class KeptArrays:
         require_arrays(arrays, where, (item.name for item in kept))
         try:
             values: dict[str, Any] = {
-                item.name: item.type(arrays[item.name])
-                if item.type in (str, int, float)
-                else arrays[item.name]
+                item.name: kind(arrays[item.name]) if kind in (str, int, float) else arrays[item.name]
                 for item in kept
+                for kind in (getattr(item.type, "__origin__", item.type),)
             }
             return cls(**values)
         except (TypeError, ValueError, IndexError) as cause:

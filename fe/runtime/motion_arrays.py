@@ -191,3 +191,9 @@ def at_port(rows: FloatArray, j: int, q: FloatArray) -> float:
     for m in range(len(q)):
         x += rows[j, m] * q[m]
     return x
+
+
+def add(target: FloatArray, along: FloatArray, size: float, duration: float) -> None:
+    """Add to modal coordinates or speeds what a force or an impulse along a port gives them."""
+    for m in range(len(target)):
+        target[m] += along[m] * size * duration

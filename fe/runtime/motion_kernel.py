@@ -42,6 +42,7 @@ from .motion_arrays import (
     Samples,
     State,
     Unnamed,
+    add,
     at_port,
 )
 
@@ -94,10 +95,10 @@ def find_routes(ports: Ports, acting: Acting) -> None:
     modes = ports.rows.shape[1]
     for j in range(len(ports.numbers)):
         acting.leader[j] = -1
+        acting.weight[j] = at_port(ports.rows, j, ports.acts[j])
         moves = False
         for m in range(modes):
             moves = moves or ports.rows[j, m] != 0.0
-            acting.weight[j] += ports.rows[j, m] * ports.acts[j, m]
         if acting.weight[j] == 0.0:
             acting.route[j] = STILL
             continue
@@ -122,9 +123,7 @@ def find_answer(linear: Linear, ports: Ports, acting: Acting, j: int) -> None:
         acting.answer[j, m] = 0.0
         for k in range(modes):
             acting.answer[j, m] += linear.transition[m, modes + k] * ports.acts[j, k]
-    acting.give[j] = 0.0
-    for m in range(modes):
-        acting.give[j] += ports.rows[j, m] * acting.answer[j, m]
+    acting.give[j] = at_port(ports.rows, j, acting.answer[j, :modes])
 
 
 def begin_on_modes(linear: Linear, ports: Ports, acting: Acting, state: State, known: bool) -> None:
@@ -173,12 +172,10 @@ def first_half(
         now = acting.strength[j] * share(ports.numbers[j], ports.values[j], x)
         # dry friction is not stopped at zero: the turn is looked for after the step
         before.lost[j] = speed - kick(ports.numbers[j], ports.values[j], speed, now, half, True)
-        for m in range(modes):
-            state.v[m] -= acting.pull[j, m] * before.lost[j]
+        add(state.v, acting.pull[j], -before.lost[j], 1.0)
     for j in range(count):
         if state.current[j] != 0.0:
-            for m in range(modes):
-                state.v[m] -= ports.acts[j, m] * state.current[j] * half
+            add(state.v, ports.acts[j], -state.current[j], half)
     if linear.rate != 0.0:
         for m in range(modes):
             state.v[m] -= half * linear.rate * time * linear.stiffness[m] * state.q[m]
@@ -229,9 +226,8 @@ def hold(ports: Ports, acting: Acting, state: State, before: Before, h: float) -
             state.memory[j, 0] = 0.0
             before.freed[j] = 1.0
             impulse = (limit if impulse > 0.0 else -limit) / acting.weight[j]
-        for m in range(modes):
-            state.q[m] += acting.answer[j, m] * impulse
-            state.v[m] += acting.answer[j, modes + m] * impulse
+        add(state.q, acting.answer[j], impulse, 1.0)
+        add(state.v, acting.answer[j, modes:], impulse, 1.0)
 
 
 def second_half(
@@ -247,8 +243,7 @@ def second_half(
         x = at_port(ports.rows, j, state.q)
         advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, 1)
         state.current[j], _ = pull_of(ports, state, j, x, 1.0, 1)
-        for m in range(modes):
-            state.v[m] -= ports.acts[j, m] * state.current[j] * half
+        add(state.v, ports.acts[j], -state.current[j], half)
     if linear.rate != 0.0:
         for m in range(modes):
             state.v[m] -= half * linear.rate * (time + h) * linear.stiffness[m] * state.q[m]
@@ -263,8 +258,7 @@ def second_half(
             if abs(speed) > limit:
                 taken = limit if speed > 0.0 else -limit
                 state.memory[j, 0] = 0.0
-            for m in range(modes):
-                state.v[m] -= acting.pull[j, m] * taken
+            add(state.v, acting.pull[j], -taken, 1.0)
             continue
         now = acting.strength[j] * share(ports.numbers[j], ports.values[j], x)
         end = speed - before.lost[j]
@@ -277,8 +271,7 @@ def second_half(
             if after == 0.0 and can_hold and now > 0.0:
                 state.memory[j, 0] = 1.0
                 state.memory[j, 1] = x
-            for m in range(modes):
-                state.v[m] -= acting.pull[j, m] * (speed - after)
+            add(state.v, acting.pull[j], after - speed, 1.0)
 
 
 def slopes_at_port(
@@ -318,14 +311,11 @@ def turn_over(
     if held == 1.0:
         change = -speed
         x = at_port(ports.rows, j, state.q)
-        way -= x
-        for m in range(len(state.q)):
-            way += ports.rows[j, m] * before.q[m]
+        way += at_port(ports.rows, j, before.q) - x
         state.memory[j, 0] = 1.0
         state.memory[j, 1] = x + way
-    for m in range(len(state.q)):
-        state.q[m] += acting.pull[j, m] * way
-        state.v[m] += acting.pull[j, m] * change
+    add(state.q, acting.pull[j], way, 1.0)
+    add(state.v, acting.pull[j], change, 1.0)
 
 
 def record(

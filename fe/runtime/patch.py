@@ -8,7 +8,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from .errors import InvalidPatchError
 from .expression import Expression
@@ -43,43 +43,38 @@ def course_of(text: str, kind: str) -> Expression:
 class PointMass(Primitive):
     """A mass [kg] on the elastic line at `station` [m] from the root (lumped model: at a named place)."""
 
-    units: ClassVar[dict[str, str]] = {"mass": "kg", "station": "m"}
-    mass: float
-    station: float
+    mass: Annotated[float, "kg"]
+    station: Annotated[float, "m"]
 
 
 @dataclass(frozen=True, slots=True)
 class RootCompliance(Primitive):
     """A rotational spring in series with the root: `compliance` [rad/(N m)] about the flapping axis."""
 
-    units: ClassVar[dict[str, str]] = {"compliance": "rad/(N m)"}
-    compliance: float
+    compliance: Annotated[float, "rad/(N m)"]
 
 
 @dataclass(frozen=True, slots=True)
 class LocalStiffnessLoss(Primitive):
     """The skin between `start` and `start + length` [m] from the root keeps 1 - `loss` of its stiffness."""
 
-    units: ClassVar[dict[str, str]] = {"loss": "1", "start": "m", "length": "m"}
-    loss: float
-    start: float
-    length: float
+    loss: Annotated[float, "1"]
+    start: Annotated[float, "m"]
+    length: Annotated[float, "m"]
 
 
 @dataclass(frozen=True, slots=True)
 class ModulusTemperature(Primitive):
     """Young's modulus falls with temperature: E (1 - `coefficient` (T - T_ref)), `coefficient` [1/K]."""
 
-    units: ClassVar[dict[str, str]] = {"coefficient": "1/K"}
-    coefficient: float
+    coefficient: Annotated[float, "1/K"]
 
 
 @dataclass(frozen=True, slots=True)
 class StiffnessDrift(Primitive):
     """The whole stiffness changes with time within a record: K (1 + `rate` t), `rate` [1/s]."""
 
-    units: ClassVar[dict[str, str]] = {"rate": "1/s"}
-    rate: float
+    rate: Annotated[float, "1/s"]
 
 
 # ---------------------------------------------------------------- internal forces
@@ -98,35 +93,31 @@ class StiffnessDrift(Primitive):
 class LoadPlace(Primitive):
     """Applied forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
 
-    units: ClassVar[dict[str, str]] = {"along_span": "m", "along_chord": "m"}
-    along_span: float
-    along_chord: float
+    along_span: Annotated[float, "m"]
+    along_chord: Annotated[float, "m"]
 
 
 @dataclass(frozen=True, slots=True)
 class LoadGain(Primitive):
     """The force that acts is (1 + `gain`) times the recorded one plus `tare` [N], while one is applied."""
 
-    units: ClassVar[dict[str, str]] = {"gain": "1", "tare": "N"}
-    gain: float
-    tare: float
+    gain: Annotated[float, "1"]
+    tare: Annotated[float, "N"]
 
 
 @dataclass(frozen=True, slots=True)
 class Washout(Primitive):
     """Lift in flight is l (1 - `coefficient` n eta^`exponent`), eta = y / semi-span, n the load factor."""
 
-    units: ClassVar[dict[str, str]] = {"coefficient": "1", "exponent": "1"}
-    coefficient: float
-    exponent: float
+    coefficient: Annotated[float, "1"]
+    exponent: Annotated[float, "1"]
 
 
 @dataclass(frozen=True, slots=True)
 class InertiaRelief(Primitive):
     """In flight the structure's weight times n relieves the lift by this `fraction` more than modelled."""
 
-    units: ClassVar[dict[str, str]] = {"fraction": "1"}
-    fraction: float
+    fraction: Annotated[float, "1"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,9 +144,8 @@ class SensorGain(Primitive):
     """A channel shows (1 + `gain`) times what it should."""
 
     in_windows: ClassVar[bool] = True
-    units: ClassVar[dict[str, str]] = {"gain": "1"}
     channel: str
-    gain: float
+    gain: Annotated[float, "1"]
     quantity: str = ""
 
 
@@ -164,11 +154,10 @@ class SensorDrift(Primitive):
     """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
 
     in_windows: ClassVar[bool] = True
-    units: ClassVar[dict[str, str]] = {"amplitude": CHANNEL_UNIT, "time": "s", "exponent": "1"}
     channel: str
-    amplitude: float
-    time: float
-    exponent: float = 1.0
+    amplitude: Annotated[float, CHANNEL_UNIT]
+    time: Annotated[float, "s"]
+    exponent: Annotated[float, "1"] = 1.0
     quantity: str = ""
 
 
@@ -191,9 +180,8 @@ class ChannelOffset(Primitive):
 class SensorRotation(Primitive):
     """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
 
-    units: ClassVar[dict[str, str]] = {"angle": "rad"}
     channel: str
-    angle: float
+    angle: Annotated[float, "rad"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,9 +189,8 @@ class ThermalStrain(Primitive):
     """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
 
     in_windows: ClassVar[bool] = True
-    units: ClassVar[dict[str, str]] = {"coefficient": "1/K"}
     channel: str
-    coefficient: float
+    coefficient: Annotated[float, "1/K"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,10 +200,9 @@ class HighPass(Primitive):
     They had settled at the value before the record's first sample.
     """
 
-    units: ClassVar[dict[str, str]] = {"time_constant": "s", "order": "1"}
     channel: str
-    time_constant: float
-    order: float = 1.0
+    time_constant: Annotated[float, "s"]
+    order: Annotated[float, "1"] = 1.0
     quantity: str = ""
 
 
@@ -224,9 +210,8 @@ class HighPass(Primitive):
 class Clock(Primitive):
     """A sample that is stamped t was taken at (1 + `rate`) t + `zero` [s]."""
 
-    units: ClassVar[dict[str, str]] = {"rate": "1", "zero": "s"}
-    rate: float
-    zero: float
+    rate: Annotated[float, "1"]
+    zero: Annotated[float, "s"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,9 +221,8 @@ class LoggerClock(Primitive):
     `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records everything.
     """
 
-    units: ClassVar[dict[str, str]] = {"rate": "1"}
     logger: str
-    rate: float
+    rate: Annotated[float, "1"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,11 +233,10 @@ class Line(Primitive):
     """
 
     in_windows: ClassVar[bool] = True
-    units: ClassVar[dict[str, str]] = {"frequency": "Hz", "cosine": CHANNEL_UNIT, "sine": CHANNEL_UNIT}
     channel: str
-    frequency: float
-    cosine: float
-    sine: float
+    frequency: Annotated[float, "Hz"]
+    cosine: Annotated[float, CHANNEL_UNIT]
+    sine: Annotated[float, CHANNEL_UNIT]
     quantity: str = ""
 
 
@@ -264,14 +247,11 @@ class DecayingLine(Primitive):
     t since the trial's start; amplitudes in the channel's unit per unit of the trial's release amplitude.
     """
 
-    units: ClassVar[dict[str, str]] = {
-        "frequency": "Hz", "damping_ratio": "1", "cosine": PER_RELEASE, "sine": PER_RELEASE
-    }  # fmt: skip
     channel: str
-    frequency: float
-    damping_ratio: float
-    cosine: float
-    sine: float
+    frequency: Annotated[float, "Hz"]
+    damping_ratio: Annotated[float, "1"]
+    cosine: Annotated[float, PER_RELEASE]
+    sine: Annotated[float, PER_RELEASE]
     quantity: str = ""
 
 
@@ -279,9 +259,8 @@ class DecayingLine(Primitive):
 class RunOffset(Primitive):
     """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
 
-    units: ClassVar[dict[str, str]] = {"offset": CHANNEL_UNIT}
     run: str
-    offset: float
+    offset: Annotated[float, CHANNEL_UNIT]
     channel: str = EVERY_CHANNEL
     quantity: str = "displacement"
 

@@ -4,7 +4,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 """
 
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf
 from sys import float_info
 from typing import Annotated
 
@@ -17,16 +17,7 @@ from .state import wing_names
 
 FloatArray = npt.NDArray[np.float64]
 
-SCALARS = (
-    "flap_spring",
-    "semi_span",
-    "root_chord",
-    "tip_chord",
-    "load_place",
-    "largest_loss",
-    "largest_compliance",
-    "largest_mass",
-)
+Positive = Annotated[float, float_info.min, inf]
 
 
 @dataclass(frozen=True, repr=False)
@@ -92,9 +83,9 @@ class PatchArrays(RegionArrays):
     layout = ("patch_format", 2)
 
     validity_box: Annotated[FloatArray, "chosen", 2]
-    largest_loss: float
-    largest_compliance: float
-    largest_mass: float
+    largest_loss: Positive
+    largest_compliance: Positive
+    largest_mass: Positive
     stiffness: Annotated[FloatArray, "terms", "basis", "basis"]
     mass: Annotated[FloatArray, 3, "basis", "basis"]
     strip_lines: Annotated[FloatArray, "lines"]
@@ -102,12 +93,12 @@ class PatchArrays(RegionArrays):
     strip_of: Annotated[npt.NDArray[np.int64], "parts"]
     term_of: Annotated[npt.NDArray[np.int64], "parts"]
     flap_row: Annotated[FloatArray, "basis"]
-    flap_spring: float
-    semi_span: float
-    root_chord: float
-    tip_chord: float
-    straight_chord_line: float
-    load_place: float
+    flap_spring: Positive
+    semi_span: Positive
+    root_chord: Positive
+    tip_chord: Positive
+    straight_chord_line: Annotated[float, 0.0, 1.0]
+    load_place: Positive
     stations: Annotated[FloatArray, "stations"]
     line_chord: Annotated[FloatArray, "chords"]
     line_rows: Annotated[FloatArray, "directions", "stations", "basis"]
@@ -118,23 +109,12 @@ class PatchArrays(RegionArrays):
     weight: Annotated[FloatArray, "basis"]
     strain_rows: Annotated[FloatArray, 3, "gauges", "basis"]
     gauge_stations: Annotated[FloatArray, "gauges"]
-    gauge_length: float
+    gauge_length: Annotated[float, 0.0, inf]
     tip_row: Annotated[FloatArray, "basis"]
     start_shapes: Annotated[FloatArray, "basis", "started"]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, low, high in (
-            *((name, float_info.min, inf) for name in SCALARS),
-            ("gauge_length", 0.0, inf),
-            ("straight_chord_line", 0.0, 1.0),
-        ):
-            value = getattr(self, name)
-            if not (isfinite(value) and low <= value <= high):
-                raise ReducedModelFileError(
-                    f"The {name} of a wing for patches must lie between {low:.2g} and {high:g}, but is "
-                    f"{value!r}; build it anew."
-                )
         strips = len(self.strip_lines) - 1
         if len(self.strip_of) and not (
             self.strip_of.min() >= 0

@@ -5,6 +5,7 @@ Standard library and relative imports only: this file is copied into the FMU.
 
 import re
 from dataclasses import asdict, dataclass, field, fields
+from inspect import get_annotations
 from math import inf, isfinite
 from typing import Any, ClassVar, NamedTuple
 
@@ -34,7 +35,8 @@ class Primitive:
     kind: ClassVar[str]
     """Name of the class in a file: its own name in lower case, words apart by underscores."""
     units: ClassVar[dict[str, str]] = {}
-    """Unit of each real number; at a port, "of one that is displaced or one that turns"."""
+    """Unit of each real number, which its type is annotated with; at a port, "of one that is displaced or one
+    that turns"."""
     in_windows: ClassVar[bool] = False
     """Whether it can act in windows only."""
     courses: ClassVar[tuple[str, ...]] = ()
@@ -45,6 +47,8 @@ class Primitive:
     def __init_subclass__(cls) -> None:
         if "kind" not in cls.__dict__:
             cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+        hints = get_annotations(cls).items()
+        cls.units = {name: hint.__metadata__[0] for name, hint in hints if hasattr(hint, "__metadata__")}
 
     def __post_init__(self) -> None:
         if self.windows and not self.in_windows:
@@ -73,4 +77,8 @@ class Primitive:
     @classmethod
     def values(cls) -> dict[str, Any]:
         """Return the types of its values by name, all but `windows`."""
-        return {item.name: item.type for item in fields(cls) if item.name != "windows"}
+        return {
+            item.name: getattr(item.type, "__origin__", item.type)
+            for item in fields(cls)
+            if item.name != "windows"
+        }

@@ -6,7 +6,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from math import isfinite
+from math import inf
 from typing import Annotated
 
 import numpy as np
@@ -165,8 +165,8 @@ class ReducedArrays(RegionArrays):
     bound_reference: Annotated[FloatArray, "varied terms"]
     residual_load: Annotated[FloatArray, "residual", "loads"]
     residual_stiffness: Annotated[FloatArray, "residual", "terms", "static"]
-    residual_allowance: float
-    rounding_allowance: float
+    residual_allowance: Annotated[float, 0.0, inf]
+    rounding_allowance: Annotated[float, 0.0, inf]
     dual_counts: Annotated[npt.NDArray[np.int64], "regions"]
     dual_split: Annotated[FloatArray, "splits"]
     dual_correction: Annotated[FloatArray, "duals", "outputs", "residual"]
@@ -196,12 +196,6 @@ class ReducedArrays(RegionArrays):
                 f"A reduced model with {self.modal_stiffness.shape[1]} modal basis vectors cannot have "
                 f"{self.mode_count} modes; build the model anew."
             )
-        for name in ("residual_allowance", "rounding_allowance"):
-            value = getattr(self, name)
-            if not (isfinite(value) and value >= 0.0):
-                raise ReducedModelFileError(
-                    f"The {name} of a reduced model must not be negative, but is {value!r}; build it anew."
-                )
         for name, known in (
             ("stiffness_factors", (len(self.parameters), len(self.regions))),
             ("load_factors", (len(self.controls), len(self.masses))),

@@ -163,27 +163,22 @@ def apply_sensors(
     for item in active:
         columns = columns_of(item, record.channels)
         if columns.size and not isinstance(item, SensorRotation):
-            before = (values.copy(), None if rates is None else rates.copy()) if item.windows else None
-            _apply(item, record, columns, values, rates)
-            if before is not None:
-                _outside_as_before(item, record, before, values, rates)
+            signal, slope = _read(
+                item, record, values[:, columns], None if rates is None else rates[:, columns]
+            )
+            acting = np.flatnonzero(_acts(item, record.time))
+            values[np.ix_(acting, columns)] = signal[acting]
+            if rates is not None and slope is not None:
+                rates[np.ix_(acting, columns)] = slope[acting]
     return values, rates
 
 
-def _outside_as_before(
-    item: Primitive,
-    record: SensorRecord,
-    before: tuple[FloatArray, FloatArray | None],
-    values: FloatArray,
-    rates: FloatArray | None,
-) -> None:
-    """Put back in place what a primitive changed outside of its windows, which are those of the record."""
-    outside = np.ones(len(record.time), dtype=bool)
+def _acts(item: Primitive, time: FloatArray) -> NDArray[np.bool_]:
+    """Return whether a primitive acts at each sample (N,); its windows are those of the record."""
+    inside = np.full(len(time), not item.windows)
     for begin, end in (window.span for window in item.windows):
-        outside &= (record.time < begin) | (record.time >= end)
-    values[outside] = before[0][outside]
-    if rates is not None and before[1] is not None:
-        rates[outside] = before[1][outside]
+        inside |= (begin <= time) & (time < end)
+    return inside
 
 
 def columns_of(item: Primitive, channels: Sequence[tuple[str, str]]) -> NDArray[np.intp]:
@@ -227,47 +222,37 @@ def _rotate(
         rates[:, turned] = rates[:, turned] * cosine**2 + np.gradient(across, record.time, axis=0)
 
 
-def _apply(
-    item: Primitive,
-    record: SensorRecord,
-    columns: NDArray[np.intp],
-    values: FloatArray,
-    rates: FloatArray | None,
-) -> None:
-    """Apply one primitive to columns in place."""
-    added: FloatArray | float = 0.0
-    added_rate: FloatArray | float = 0.0
+def _read(
+    item: Primitive, record: SensorRecord, signal: FloatArray, slope: FloatArray | None
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return what columns (N, C) show with one primitive, and the rates of that."""
     if isinstance(item, SensorGain):
-        values[:, columns] *= 1.0 + item.gain
-        if rates is not None:
-            rates[:, columns] *= 1.0 + item.gain
-        return
+        gain = 1.0 + item.gain
+        return gain * signal, None if slope is None else gain * slope
     if isinstance(item, HighPass):
-        if record.is_dynamic:
-            _filter(item, record, columns, values, rates)
-        return
+        return _filtered(item, record, signal, slope) if record.is_dynamic else (signal, slope)
+    added, rate = _added(item, record)
+    return signal + np.reshape(added, (-1, 1)), None if slope is None else slope + np.reshape(rate, (-1, 1))
+
+
+def _added(item: Primitive, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
+    """Return what a primitive adds at each sample, and the rate of that."""
     if isinstance(item, SensorDrift):
-        added, added_rate = _drift(item, record)
-    elif isinstance(item, ChannelOffset):
-        formula = course_of(item.offset, item.kind)
-        added = formula.course(record.time, {"pi": pi})
-        added_rate = np.gradient(added, record.time) if record.is_dynamic else 0.0
-    elif isinstance(item, ThermalStrain):
-        added = item.coefficient * record.temperature
-    elif isinstance(item, Line) and record.is_dynamic:
+        return _drift(item, record)
+    if isinstance(item, ChannelOffset):
+        added = course_of(item.offset, item.kind).course(record.time, {"pi": pi})
+        return added, np.gradient(added, record.time) if record.is_dynamic else 0.0
+    if isinstance(item, ThermalStrain):
+        return item.coefficient * record.temperature, 0.0
+    if isinstance(item, Line) and record.is_dynamic:
         omega = 2.0 * pi * item.frequency
         c, s = np.cos(omega * record.time), np.sin(omega * record.time)
-        added = item.cosine * c + item.sine * s
-        added_rate = omega * (item.sine * c - item.cosine * s)
-    elif isinstance(item, DecayingLine) and record.kind == "ringdown":
-        added, added_rate = _decaying_line(item, record)
-    elif isinstance(item, RunOffset) and record.kind == "static" and item.run == record.run:
-        added = item.offset
-    else:
-        return
-    values[:, columns] += np.reshape(added, (-1, 1))
-    if rates is not None:
-        rates[:, columns] += np.reshape(added_rate, (-1, 1))
+        return item.cosine * c + item.sine * s, omega * (item.sine * c - item.cosine * s)
+    if isinstance(item, DecayingLine) and record.kind == "ringdown":
+        return _decaying_line(item, record)
+    if isinstance(item, RunOffset) and record.kind == "static" and item.run == record.run:
+        return item.offset, 0.0
+    return 0.0, 0.0
 
 
 def _drift(item: SensorDrift, record: SensorRecord) -> tuple[FloatArray, FloatArray]:
@@ -297,14 +282,10 @@ def _decaying_line(item: DecayingLine, record: SensorRecord) -> tuple[FloatArray
 # ---------------------------------------------------------------- high-pass
 
 
-def _filter(
-    item: HighPass,
-    record: SensorRecord,
-    columns: NDArray[np.intp],
-    values: FloatArray,
-    rates: FloatArray | None,
-) -> None:
-    signal, slope = values[:, columns], None if rates is None else rates[:, columns]
+def _filtered(
+    item: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray | None
+) -> tuple[FloatArray, FloatArray | None]:
+    """Pass columns through a high-pass filter; where sampling is uneven, on an even grid and back."""
     time = record.time
     count = max(len(time) - 1, 1)
     interval = float(time[-1] - time[0]) / count
@@ -315,12 +296,12 @@ def _filter(
         grid = np.linspace(time[0], time[-1], count + 1)
         signal = _at(grid, time, signal)
         slope = None if slope is None else _at(grid, time, slope)
-    held = signal[0] if record.kind == "ringdown" else np.zeros(columns.size)
-    filtered = high_pass(signal, interval, item.time_constant, item.order, held)
-    if rates is not None and slope is not None:
-        changed = _filtered_rates(item, interval, signal, filtered, held, slope)
-        rates[:, columns] = changed if even else _at(time, grid, changed)
-    values[:, columns] = filtered if even else _at(time, grid, filtered)
+    held = signal[0] if record.kind == "ringdown" else np.zeros(signal.shape[1])
+    shown = high_pass(signal, interval, item.time_constant, item.order, held)
+    rates = None if slope is None else _filtered_rates(item, interval, signal, shown, held, slope)
+    if even:
+        return shown, rates
+    return _at(time, grid, shown), None if rates is None else _at(time, grid, rates)
 
 
 def _at(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:

@@ -144,7 +144,7 @@ _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
 
 STANDARD_GRAVITY = 9.80665
-"""[m/s^2]; that of `fe.full.turn_load`, which is not copied into the FMU."""
+"""[m/s^2]; that of `fe.wing.turn_load`, which is not copied into the FMU."""
 EMPTY = ModelPatch()
 
 

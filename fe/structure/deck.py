@@ -15,10 +15,10 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fe.elements.kinds import KINDS, ElementKind
 from fe.runtime.errors import MeshError
 from reporting.toml_file import parse_toml
 
-from .elements import KINDS, ElementKind
 from .mesh import FileMesh
 
 FloatArray = NDArray[np.float64]

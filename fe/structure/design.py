@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from fe.full.assembly import rotate_elasticity
+from fe.elements.cells import rotate_elasticity
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
-from fe.wing.parts import Modulus, Part
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
@@ -27,8 +26,10 @@ from .tables import (
     Commanded,
     Direction,
     Given,
+    Modulus,
     Name,
     Named,
+    Part,
     Region,
     StructureDesign,
     Vector,

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.elements.cells import gradients, strain_matrix
+from fe.elements.kinds import ElementKind, meshio_with_wedges
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
 from fe.runtime.errors import SolutionError
 
 from .affine import AffineStructure
-from .elements import ElementKind, meshio_with_wedges
 from .operators import Structure
 
 FloatArray = NDArray[np.float64]
@@ -113,13 +114,9 @@ def centre_strains(
         Of all nodes.
     """
     centre = kind.places[: len(kind.corners)].mean(axis=0)
-    _, slopes = kind.shape_functions(centre[None])
-    jacobian = np.einsum("nai,aj->nij", points[cells], slopes[0])
-    along = np.einsum("ak,nki->nai", slopes[0], np.linalg.inv(jacobian))
-    gradient = np.einsum("nai,naj->nij", displacement[cells], along)
-    strain = gradient + gradient.transpose(0, 2, 1)
-    diagonal = 0.5 * np.einsum("nii->ni", strain)
-    return np.column_stack((diagonal, strain[:, 1, 2], strain[:, 0, 2], strain[:, 0, 1]))
+    slopes, _ = gradients(kind, points[cells], centre[None])
+    moved = displacement[cells].reshape(len(cells), -1)
+    return np.asarray(np.einsum("nij,nj->ni", strain_matrix(slopes[:, 0]), moved))
 
 
 def write_structure_vtu(

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from fe.elements.cells import strain_weights
 from fe.runtime.errors import InvalidDesignError
 
 from .design import Gauge, Rosette
@@ -111,12 +112,8 @@ def _add_strain(
     mesh: StructureMesh, spot: SurfacePoint, direction: FloatArray, share: float, row: FloatArray
 ) -> None:
     """Add the strain along a direction, the mean of the cells at a spot, to a row (full,)."""
-    _, slopes = mesh.kind.shape_functions(spot.local)
-    nodes = mesh.nodes[spot.cell]
-    jacobian = np.einsum("nai,naj->nij", nodes, slopes)
-    slope = np.einsum("nak,nki,i->na", slopes, np.linalg.inv(jacobian), direction)
-    weights = share / len(spot.cell) * slope[..., None] * direction
-    np.add.at(row.reshape(-1, 3), mesh.cells[spot.cell], weights)
+    weights = strain_weights(mesh.kind, mesh.nodes[spot.cell], spot.local, direction)
+    np.add.at(row.reshape(-1, 3), mesh.cells[spot.cell], share / len(spot.cell) * weights)
 
 
 def spread_rosettes(locator: Locator, count: int) -> list[Rosette]:

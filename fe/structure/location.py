@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.elements.cells import CellMesh, point_jacobians
 from fe.runtime.errors import InvalidDesignError
 
 from .design import Load
@@ -101,9 +102,8 @@ class Locator:
         kind, nodes = self.mesh.kind, self.mesh.nodes[cells]
         local = np.tile(np.mean(kind.corners, axis=0), (len(cells), 1))
         for _ in range(_STEPS):
-            values, slopes = kind.shape_functions(local)
-            residual = point - np.einsum("na,nai->ni", values, nodes)
-            jacobian = np.einsum("nai,naj->nij", nodes, slopes)
+            residual = point - self._position(cells, local)
+            jacobian = point_jacobians(kind, nodes, local)
             # Outside its cell the map may fold: such a place is no solution, wherever the next step leads.
             jacobian[np.linalg.det(jacobian) == 0.0] = np.eye(3)
             step = np.linalg.solve(jacobian, residual[..., None])[..., 0]
@@ -187,7 +187,7 @@ def _on_face(along: FloatArray, *, triangle: bool) -> FloatArray:
     return along
 
 
-def area_vectors(mesh: StructureMesh, surface: Surface) -> FloatArray:
+def area_vectors(mesh: CellMesh, surface: Surface) -> FloatArray:
     """Integral (nodes, 3) [m^2] over faces of each node's shape function times the outward normal."""
     total = np.zeros((len(mesh.points), 3))
     for cells, vectors, values in _face_points(mesh, surface):
@@ -195,7 +195,7 @@ def area_vectors(mesh: StructureMesh, surface: Surface) -> FloatArray:
     return total
 
 
-def area_shares(mesh: StructureMesh, surface: Surface) -> FloatArray:
+def area_shares(mesh: CellMesh, surface: Surface) -> FloatArray:
     """Integral (nodes,) [m^2] over faces of each node's shape function; together they are the area."""
     total = np.zeros(len(mesh.points))
     for cells, vectors, values in _face_points(mesh, surface):
@@ -203,9 +203,7 @@ def area_shares(mesh: StructureMesh, surface: Surface) -> FloatArray:
     return total
 
 
-def _face_points(
-    mesh: StructureMesh, surface: Surface
-) -> list[tuple[NDArray[np.int64], FloatArray, FloatArray]]:
+def _face_points(mesh: CellMesh, surface: Surface) -> list[tuple[NDArray[np.int64], FloatArray, FloatArray]]:
     """Cells (n,), weighted outward normals (n, q, 3) [m^2] and shape functions (q, k), face by face."""
     kind, found = mesh.kind, []
     for number in np.unique(surface.face):

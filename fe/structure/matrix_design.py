@@ -9,9 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from fe.runtime.state import MOST_REGIONS
-from fe.wing.parts import Part
 
-from .tables import ChosenMass, Commanded, Direction, Given, Name, Named, Region, StructureDesign
+from .tables import ChosenMass, Commanded, Direction, Given, Name, Named, Part, Region, StructureDesign
 
 FileName = Annotated[str, Field(min_length=1)]
 Files = Annotated[tuple[FileName, ...], Field(min_length=1)]

@@ -7,9 +7,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.elements.cells import CellMesh
 from fe.runtime.errors import MeshError
-
-from .elements import ElementKind
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -21,19 +20,15 @@ _Content = TypeVar("_Content")
 
 
 @dataclass(frozen=True)
-class FileMesh:
+class FileMesh(CellMesh):
     """What a mesh file holds, before it is checked.
 
     Attributes
     ----------
-    kind : ElementKind
-        Kind of the cells.
-    points : (nn, 3)
-        Places of the nodes, in the unit of the file.
+    kind, points, cells
+        As of `CellMesh`, in the unit of the file.
     node_numbers : (nn,)
         Their numbers in the file, or from 1 where it has none.
-    cells : (nc, k)
-        Nodes of each cell, by their places in `points`.
     cell_numbers : (nc,)
         Numbers of the cells in the file.
     node_sets, cell_sets : dict of str to (m,)
@@ -44,10 +39,7 @@ class FileMesh:
         What a user should know of the file: words that were passed over though nobody knows what they do.
     """
 
-    kind: ElementKind
-    points: FloatArray
     node_numbers: IntArray
-    cells: IntArray
     cell_numbers: IntArray
     node_sets: dict[str, IntArray]
     cell_sets: dict[str, IntArray]
@@ -103,21 +95,6 @@ class StructureMesh(FileMesh):
     unit_name: str = field(kw_only=True)
     loose: IntArray = field(kw_only=True)
     loose_in: dict[str, int] = field(kw_only=True)
-
-    @property
-    def unknowns(self) -> int:
-        """Number of displacements, three for each node."""
-        return 3 * len(self.points)
-
-    @cached_property
-    def nodes(self) -> FloatArray:
-        """Places (nc, k, 3) [m] of the nodes of each cell."""
-        return self.points[self.cells]
-
-    @cached_property
-    def centres(self) -> FloatArray:
-        """Mean (nc, 3) [m] of the corners of each cell."""
-        return np.asarray(self.nodes[:, : len(self.kind.corners)].mean(axis=1))
 
     @cached_property
     def size(self) -> float:

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from fe.elements.cells import BATCH, jacobians
+from fe.elements.kinds import meshio_with_wedges
 from fe.full.cholesky import analyse
 from fe.runtime.errors import MeshError
 
 from .abaqus_file import read_abaqus
 from .deck import one_kind
-from .elements import BATCH, jacobians, meshio_with_wedges
 from .mesh import FileMesh, StructureMesh
 from .nastran_file import read_nastran
 

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.elements.kinds import KINDS
 from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
 from .deck import GLOBAL, Deck, System, fail, frame, included, real, shown, whole, words_of
-from .elements import KINDS
 from .mesh import FileMesh
 
 FloatArray = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """From a structure file and its mesh to affine operators."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from fe.elements.kinds import Rule
 from fe.runtime.errors import InvalidDesignError, MeshError
 
 from .affine import DesignedStructure, LoadTerm, StiffnessTerm, names_of
 from .design import MeshDesign, load_structure, structure_hash
-from .elements import BATCH, Rule, mass_blocks, stiffness_blocks
 from .gauges import GaugePlace, gauge_rows
 from .location import Locator, point_shares, surface_load
 from .matrices import assemble_matrices
@@ -23,8 +23,6 @@ from .supports import SupportedUnknowns, supported
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-_TRIPLETS = 4_000_000  # entries of element arrays that are summed at once, of 16 bytes each
 
 
 @dataclass(frozen=True)
@@ -121,43 +119,6 @@ def _materials(design: MeshDesign, mesh: StructureMesh) -> IntArray:
             f"{mesh.cell_numbers[bare[0]]} at {mesh.place(mesh.centres[bare[0]])}."
         )
     return owner
-
-
-def assembled(
-    mesh: StructureMesh, cells: IntArray, blocks: Callable[[FloatArray], FloatArray], components: int
-) -> sparse.csr_array:
-    """Sum of element arrays (n, components k, components k) over cells, csr (components nodes, ...).
-
-    Parameters
-    ----------
-    mesh : StructureMesh
-        The mesh.
-    cells : (m,)
-        Cells.
-    blocks : callable
-        Element arrays of cells with nodes (n, k, 3).
-    components : int
-        Unknowns of a node.
-    """
-    size = components * len(mesh.points)
-    total = sparse.csr_array((size, size))
-    together = max(BATCH, _TRIPLETS // (components * mesh.kind.node_count) ** 2)
-    for start in range(0, len(cells), together):
-        rows, columns, values = [], [], []
-        for part in _batches(cells[start : start + together]):
-            dofs = (components * mesh.cells[part, :, None] + np.arange(components)).reshape(len(part), -1)
-            dofs = dofs.astype(np.int32)
-            rows.append(np.repeat(dofs, dofs.shape[1], axis=1).ravel())
-            columns.append(np.tile(dofs, (1, dofs.shape[1])).ravel())
-            values.append(blocks(mesh.nodes[part]).ravel())
-        places = (np.concatenate(rows), np.concatenate(columns))
-        total = total + sparse.coo_array((np.concatenate(values), places), shape=total.shape).tocsr()
-    return total
-
-
-def _batches(cells: IntArray) -> Iterator[IntArray]:
-    for start in range(0, len(cells), BATCH):
-        yield cells[start : start + BATCH]
 
 
 def load_and_assemble(
@@ -286,12 +247,7 @@ def _structure_mass(
     """Mass (nodes, nodes) [kg] of one component, without point masses."""
     total = sparse.csr_array((len(mesh.points), len(mesh.points)))
     for number, part in enumerate(design.material):
-        density = part.density
-
-        def blocks(nodes: FloatArray, density: float = density) -> FloatArray:
-            return mass_blocks(mesh.kind, nodes, density, rule)
-
-        total = total + assembled(mesh, np.flatnonzero(material_of == number), blocks, 1)
+        total = total + mesh.mass(np.flatnonzero(material_of == number), part.density, rule)
     return total
 
 
@@ -306,14 +262,9 @@ def _stiffness_terms(
     restriction = held.expansion.T.tocsr()
     found: dict[tuple[str | None, str | None], sparse.csr_array] = {}
     for number, part in enumerate(design.material):
-        elasticity = part.elasticity
-
-        def blocks(nodes: FloatArray, elasticity: FloatArray = elasticity) -> FloatArray:
-            return stiffness_blocks(mesh.kind, nodes, elasticity)
-
         for region in np.unique(region_of[material_of == number]):
             cells = np.flatnonzero((material_of == number) & (region_of == region))
-            matrix = restriction @ assembled(mesh, cells, blocks, 3) @ held.expansion
+            matrix = restriction @ mesh.stiffness(cells, part.elasticity) @ held.expansion
             pair = (part.scaled_by, None if region < 0 else design.damage[region].name)
             found[pair] = found[pair] + matrix if pair in found else matrix
     springs = held.stiffness

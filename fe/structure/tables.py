@@ -1,20 +1,39 @@
 """The tables that every structure file has, whether its structure comes from a mesh or from matrices."""
 
 import itertools
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
 from fe.runtime.state import MOST_REGIONS
-from fe.wing.parts import Part
+from reporting.section import Section
 
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Modulus = Annotated[float, Field(ge=1e6, le=1e13, description="Pa")]
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 """Units of length and their size [m]."""
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
 """Of a rigid set: along the axes, then about them."""
+
+
+class Part(Section):
+    """Section of a design file: unknown keys, non-finite numbers and booleans for numbers are refused."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists_as_tuples(cls, content: object) -> object:
+        return _tuples(content) if isinstance(content, dict) else content
+
+
+def _tuples(content: Any) -> Any:
+    """Return the content of a file with its lists as the tuples that a strict section takes."""
+    if isinstance(content, dict):
+        return {key: _tuples(item) for key, item in content.items()}
+    return tuple(_tuples(item) for item in content) if isinstance(content, list | tuple) else content
 
 
 def _points_somewhere(vector: Vector) -> Vector:

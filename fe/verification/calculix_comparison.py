@@ -1,6 +1,6 @@
 """Structures and the wing against CalculiX on the identical mesh: statics, modes and a ring-down."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -8,14 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.full.assembly import global_gradients, strain_matrix
-from fe.full.modes import eigenmodes
-from fe.full.operators import AffineOperators
-from fe.full.statics import Factorisation, static_outputs
+from fe.elements.cells import gradients, strain_matrix
+from fe.full.statics import Factorisation
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState, Losses
+from fe.structure.affine import AffineStructure
 from fe.structure.field import natural_frequencies, static_responses
 from fe.structure.operators import Structure
+from fe.wing.operators import AffineOperators
+from fe.wing.responses import eigenmodes
 
 from .calculix_deck import CalculixDeck
 from .calculix_job import read_frequencies, read_tables, run_calculix
@@ -69,6 +70,10 @@ def _relative(theirs: FloatArray, ours: FloatArray) -> float:
     return float(np.abs(theirs - ours).max() / np.abs(ours).max())
 
 
+def _relative_each(theirs: FloatArray, ours: FloatArray) -> float:
+    return float(np.abs(theirs / ours - 1.0).max())
+
+
 @dataclass(frozen=True)
 class ModalAgreement:
     """Frequencies (m,) [Hz] of both codes."""
@@ -84,22 +89,48 @@ class ModalAgreement:
 
 @dataclass(frozen=True)
 class LoadAgreement:
-    """Differences under one load, relative to the largest of their kind under that load.
+    """Differences under one load, each relative.
 
     Attributes
     ----------
     load : str
         Its name.
     field : float
-        Nodal displacements.
+        Largest difference of a nodal displacement, over the largest displacement.
     strain, output : float or None
-        Strains of the gauges and displacement outputs; None where there are none.
+        Of the strains of the gauges and of displacement outputs, over the largest of their kind, or of a wing
+        each over its own; None where there are none.
+    tensor : float or None
+        Of a wing: largest difference of a strain component at the integration points of the cells with
+        gauges, over the largest strain there. CalculiX evaluates these strains itself.
     """
 
     load: str
     field: float
     strain: float | None
     output: float | None
+    tensor: float | None = None
+
+
+def _agreement(
+    structure: AffineStructure,
+    deck: CalculixDeck,
+    load: str,
+    displacement: FloatArray,
+    theirs: _Printed,
+    relative: Callable[[FloatArray, FloatArray], float],
+    tensor: FloatArray | None = None,
+) -> LoadAgreement:
+    ours, gauges = deck.probes @ displacement, len(structure.gauges)
+    parts = (slice(0, gauges), slice(gauges, len(ours)))
+    strain, output = (relative(theirs.probes[own], ours[own]) if len(ours[own]) else None for own in parts)
+    return LoadAgreement(
+        load,
+        _relative(theirs.field, structure.full_displacement(displacement)),
+        strain,
+        output,
+        None if tensor is None else _relative(theirs.strain.reshape(tensor.shape), tensor),
+    )
 
 
 @dataclass(frozen=True)
@@ -136,52 +167,13 @@ def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> S
         If CalculiX is not there, fails, or has no such element.
     """
     deck = structure_deck(structure)
-    loads = []
     printed = _statics(deck, structure_loads(structure, deck), folder) if structure.loads else []
-    for (name, ours), theirs in zip(static_responses(structure).items(), printed, strict=True):
-        strain, output = np.split(theirs.probes[: len(ours.strain) + len(ours.output)], [len(ours.strain)])
-        loads.append(
-            LoadAgreement(
-                name,
-                _relative(theirs.field, structure.full_displacement(ours.displacement)),
-                _relative(strain, ours.strain) if len(ours.strain) else None,
-                _relative(output, ours.output) if len(ours.output) else None,
-            )
-        )
+    loads = tuple(
+        _agreement(structure, deck, name, ours.displacement, theirs, _relative)
+        for (name, ours), theirs in zip(static_responses(structure).items(), printed, strict=True)
+    )
     found = ModalAgreement(natural_frequencies(structure, modes)[0], _frequencies(deck, modes, folder))
-    return StructureAgreement(tuple(loads), found)
-
-
-@dataclass(frozen=True)
-class StaticAgreement:
-    """Differences of a static solution to CalculiX's, each relative.
-
-    Attributes
-    ----------
-    load : str
-        "tip force" or "lift".
-    load_point, tip : float
-        Displacement at the place of the static test and at the tip.
-    field : float
-        Largest difference of a nodal displacement over the largest displacement.
-    gauge : float
-        Largest difference of a gauge strain, over that strain.
-    tensor : float
-        Largest difference of a strain component at the integration points of the cells with gauges, over the
-        largest strain there. CalculiX evaluates these strains itself.
-    """
-
-    load: str
-    load_point: float
-    tip: float
-    field: float
-    gauge: float
-    tensor: float
-
-    @property
-    def displacement(self) -> float:
-        """Largest of the differences of displacement."""
-        return max(self.load_point, self.tip, self.field)
+    return StructureAgreement(loads, found)
 
 
 def static_agreement(
@@ -189,7 +181,7 @@ def static_agreement(
     folder: Path,
     young_modulus_factor: float = 1.0,
     stiffness_loss: Losses = (),
-) -> tuple[StaticAgreement, StaticAgreement]:
+) -> tuple[LoadAgreement, ...]:
     """Compare the static test and the lift of the design in one state of health.
 
     Parameters
@@ -206,38 +198,29 @@ def static_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    deck = wing_deck(
-        operators, DigitalState(young_modulus_factor=young_modulus_factor, stiffness_loss=stiffness_loss)
-    )
+    state = DigitalState(young_modulus_factor=young_modulus_factor, stiffness_loss=stiffness_loss)
+    deck = wing_deck(operators, state)
     turn = operators.wing_mesh.design.lift.load_factor
-    loads = {"tip force": operators.load(0.0, TEST_FORCE), "lift": operators.load(turn)}
+    loads = {"tip force": operators.turn(0.0, TEST_FORCE), "lift": operators.turn(turn)}
     printed = _statics(
         deck, map(deck.force_lines, loads.values()), folder, ("*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E")
     )
-    factors = Factorisation(operators.stiffness(young_modulus_factor, stiffness_loss))
+    parameters = {"young_modulus_factor": young_modulus_factor}
+    solve = Factorisation(operators.stiffness(parameters, stiffness_loss)).solve
     found = []
     for (name, load), theirs in zip(loads.items(), printed, strict=True):
-        ours = static_outputs(operators, factors.solve(load))
-        tensor = _strain_tensors(operators, ours.displacement)
-        found.append(
-            StaticAgreement(
-                load=name,
-                load_point=abs(theirs.probes[0] / ours.load_point_displacement - 1.0),
-                tip=abs(theirs.probes[1] / ours.tip_displacement - 1.0),
-                field=_relative(theirs.field, operators.full_displacement(ours.displacement)),
-                gauge=float(np.abs(theirs.probes[2 : 2 + len(ours.strain)] / ours.strain - 1.0).max()),
-                tensor=_relative(theirs.strain.reshape(tensor.shape), tensor),
-            )
-        )
-    return found[0], found[1]
+        ours = solve(load)
+        tensor = _strain_tensors(operators, ours)
+        found.append(_agreement(operators, deck, name, ours, theirs, _relative_each, tensor))
+    return tuple(found)
 
 
 def _strain_tensors(operators: AffineOperators, free: FloatArray) -> FloatArray:
     """Strain tensor (cells, 27, 6) in CalculiX's order at the integration points of the gauges' cells."""
-    body, cells = operators.discretisation, gauge_cells(operators)
-    gradients, _ = global_gradients(body.corners[cells], INTEGRATION_POINTS)
-    displacement = operators.full_displacement(free).ravel()[body.cell_dofs[cells]]
-    voigt = np.einsum("nqij,nj->nqi", strain_matrix(gradients), displacement)
+    mesh, cells = operators.wing_mesh, gauge_cells(operators)
+    slopes, _ = gradients(mesh.kind, mesh.nodes[cells], INTEGRATION_POINTS)
+    displacement = operators.full_displacement(free).ravel()[mesh.unknowns_of(cells)]
+    voigt = np.einsum("nqij,nj->nqi", strain_matrix(slopes), displacement)
     voigt[..., 3:] *= 0.5  # engineering to tensor shear
     return np.asarray(voigt[..., [_VOIGT.index(place) for place in _PRINTED]])
 
@@ -352,9 +335,9 @@ def ring_down_agreement(
     for step in range(steps):
         current = integrator.advance(current, increment, (0.0, 0.0))
         ours[step] = integrator.outputs(current)[-1]
-    text = wing_deck(operators, state).ring_down_steps(operators.load(0.0, TEST_FORCE), increment, steps)
-    tables = read_tables(run_calculix(text, folder, "ring_down"))
-    theirs = np.array([table.rows[0, 2] for table in tables if table.set_name == "NPROBES"])
+    text = wing_deck(operators, state).ring_down_steps(operators.turn(0.0, TEST_FORCE), increment, steps)
+    tables, tip = read_tables(run_calculix(text, folder, "ring_down")), len(operators.gauges)
+    theirs = np.array([table.rows[:, 1:].ravel()[tip] for table in tables if table.set_name == "NPROBES"])
     if len(theirs) != steps:
         raise CalculixError(f"CalculiX printed {len(theirs)} increments of the ring-down instead of {steps}.")
     time = np.asarray(increment * np.arange(1, steps + 1), dtype=np.float64)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.structure.elements import HEXAHEDRA_20
+from fe.elements.kinds import HEXAHEDRA_20
 from fe.structure.supports import RigidSet, SupportedUnknowns
 
 FloatArray = NDArray[np.float64]

@@ -1,19 +1,27 @@
 """A structure, and the wing, as input for CalculiX."""
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from skfem import ElementHexS2
 
-from fe.full.assembly import cell_axes, rotate_elasticity
-from fe.full.operators import AffineOperators, cell_density, cell_elasticity, point_mass_weights
+from fe.elements.cells import CellMesh, rotate_elasticity
+from fe.elements.kinds import WEDGES_6
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
+from fe.structure.affine import AffineStructure
 from fe.structure.design import Load
-from fe.structure.elements import HEXAHEDRA_20, WEDGES_6
 from fe.structure.operators import Structure
-from fe.structure.supports import RigidSet, SupportedUnknowns, rigid_motions
+from fe.structure.supports import SupportedUnknowns
+from fe.wing.operators import (
+    AffineOperators,
+    cell_axes,
+    cell_density,
+    cell_elasticity,
+    point_mass_weights,
+    root_support,
+)
 
 from .calculix_deck import CalculixDeck, PointBlock, number_line
 
@@ -40,21 +48,40 @@ def structure_deck(structure: Structure) -> CalculixDeck:
             f"CalculiX integrates {mesh.kind.name} ({mesh.kind.calculix}) in another way, so that nothing "
             "can be compared; tetrahedra and hexahedra can."
         )
-    masses = []
-    for part in design.mass:
-        shares = structure.point_weights[part.name]
-        weights = {int(node): float(shares[node]) for node in np.flatnonzero(shares)}
-        masses.append(PointBlock(part.mass, mesh.unit * np.asarray(part.point), weights))
+    masses = (
+        _point_block(part.mass, mesh.unit * np.asarray(part.point), structure.point_weights[part.name])
+        for part in design.mass
+    )
+    return _deck(
+        "structure", structure, mesh, structure.unknowns_held, _structure_materials(structure), masses
+    )
+
+
+def _deck(
+    title: str,
+    structure: AffineStructure,
+    mesh: CellMesh,
+    supports: SupportedUnknowns,
+    materials: Iterable[str],
+    masses: Iterable[PointBlock],
+    *probes: FloatArray,
+) -> CalculixDeck:
+    """Return the deck; it probes the gauges, the displacement outputs and further rows (n,)."""
+    rows = (structure.gauge_output.toarray(), structure.displacement_output.toarray())
     return CalculixDeck(
-        title=f"structure {structure.design_hash[:12]}",
+        title=f"{title} {structure.design_hash[:12]}",
         kind=mesh.kind.calculix,
         points=mesh.points,
         cells=mesh.cells,
-        materials=tuple(_structure_materials(structure)),
-        supports=structure.unknowns_held,
+        materials=tuple(materials),
+        supports=supports,
         masses=tuple(masses),
-        probes=np.vstack([structure.gauge_output.toarray(), structure.displacement_output.toarray()]),
+        probes=np.vstack((*rows, *probes)),
     )
+
+
+def _point_block(mass: float, place: FloatArray, shares: FloatArray) -> PointBlock:
+    return PointBlock(mass, place, {int(node): float(shares[node]) for node in np.flatnonzero(shares)})
 
 
 def _structure_materials(structure: Structure) -> Iterator[str]:
@@ -100,30 +127,21 @@ def _load_lines(structure: Structure, deck: CalculixDeck, load: Load) -> Iterato
 
 
 def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
-    """Return the wing in one state; it reads the displacement at the test load, at the tip, then the gauges.
+    """Return the wing in one state; it reads the gauges, the displacement at the tip, then at the test load.
 
     The root is a rigid set about the straight chord line, which moves in heave, flap and yaw on its springs.
     """
-    body, design = operators.discretisation, operators.wing_mesh.design
-    points, root = body.node_points, design.root
-    on_root = np.flatnonzero(np.abs(points[:, 1]) < 1e-9 * design.planform.semi_span)
-    motions = rigid_motions(points[on_root], np.zeros(3), 2.0)
-    springs = np.array([0.0, 0.0, root.transverse_spring, root.flap_spring, 0.0, root.yaw_spring])
-    rib = RigidSet(on_root, np.zeros(3), motions, springs == 0.0, springs)
-    nothing = np.zeros(points.size)
-    given = ElementHexS2().doflocs
-    order = [int(np.flatnonzero(np.all(np.equal(given, place), axis=1))[0]) for place in HEXAHEDRA_20.places]
-    probes = (operators.displacement_output, operators.tip_displacement_output)
-    return CalculixDeck(
-        title=f"wing, design {operators.design_hash[:12]}",
-        kind="C3D20",
-        points=points,
-        cells=body.cell_nodes[:, order],
-        materials=(*_wing_materials(operators, state), *_gauge_set(operators)),
-        supports=SupportedUnknowns(nothing.astype(bool), nothing, (rib,)),
-        masses=tuple(_wing_masses(operators, state)),
-        probes=np.vstack((*probes, operators.gauge_output.toarray())),
+    mesh = operators.wing_mesh
+    masses = (
+        _point_block(
+            state.servo_mass if place.kind == "servo" else state.pitot_mass,
+            np.array([0.0, place.station * mesh.design.planform.semi_span, 0.0]),  # where it is drawn
+            point_mass_weights(mesh, place),
+        )
+        for place in mesh.design.point_masses
     )
+    materials = itertools.chain(_wing_materials(operators, state), _gauge_set(operators))
+    return _deck("wing, design", operators, mesh, root_support(mesh), materials, masses, operators.load_tip)
 
 
 def gauge_cells(operators: AffineOperators) -> IntArray:
@@ -142,24 +160,13 @@ def _gauge_set(operators: AffineOperators) -> Iterator[str]:
     yield from (str(cell + 1) for cell in gauge_cells(operators))
 
 
-def _wing_masses(operators: AffineOperators, state: DigitalState) -> Iterator[PointBlock]:
-    """Yield servos and pitots, each tied to the mean of the two skins."""
-    mesh, body = operators.wing_mesh, operators.discretisation
-    design = mesh.design
-    for place in design.point_masses:
-        shares = point_mass_weights(mesh, body, place)
-        weights = {int(node): float(shares[node]) for node in np.flatnonzero(shares)}
-        mass = state.servo_mass if place.kind == "servo" else state.pitot_mass
-        drawn = np.array([0.0, place.station * design.planform.semi_span, 0.0])
-        yield PointBlock(mass, drawn, weights)
-
-
 def _wing_materials(operators: AffineOperators, state: DigitalState) -> Iterator[str]:
     mesh = operators.wing_mesh
-    axes = cell_axes(mesh.corners)
+    axes = cell_axes(mesh)
     # Constants in the cell's own axes; CalculiX turns them by the orientation.
     local = rotate_elasticity(cell_elasticity(mesh), np.swapaxes(axes, 1, 2))
-    factor = operators.theta(state.young_modulus_factor, state.stiffness_loss)[mesh.stiffness_term]
+    parameters = {"young_modulus_factor": state.young_modulus_factor}
+    factor = operators.theta(parameters, state.stiffness_loss)[mesh.stiffness_term]
     constants = np.column_stack([local[:, row, column] for row, column in ORTHOTROPIC])
     constants *= factor[:, None]
     density = cell_density(mesh)
@@ -189,7 +196,7 @@ def _wing_materials(operators: AffineOperators, state: DigitalState) -> Iterator
         # The station of a node stands as its temperature, on which the skin's constants depend.
         yield "*INITIAL CONDITIONS, TYPE=TEMPERATURE"
         span = mesh.design.planform.semi_span
-        for node, place in enumerate(operators.discretisation.node_points[:, 1] / span, start=1):
+        for node, place in enumerate(mesh.points[:, 1] / span, start=1):
             yield f"{node},{place:.13E}"
     for cell, key in enumerate(rounded):
         yield f"*ORIENTATION, NAME=O{cell}, SYSTEM=RECTANGULAR"

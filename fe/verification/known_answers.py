@@ -11,21 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import brentq
-from skfem import MeshHex
 
-from fe.full.assembly import (
-    Discretisation,
-    gauss_points,
-    global_gradients,
-    isotropic_elasticity,
-    jacobians,
-    shape_functions,
-    strain_matrix,
-)
-from fe.full.modes import eigenmodes
-from fe.full.operators import AffineOperators, assemble, cell_density
-from fe.full.statics import Factorisation, solve_static
+from fe.elements.cells import CellMesh, gradients, hexahedra_20, isotropic_elasticity, strain_matrix
+from fe.elements.kinds import HEXAHEDRA_20, gauss_points
+from fe.full.statics import Factorisation
+from fe.structure.location import area_shares
+from fe.structure.mesh import Surface
+from fe.structure.supports import rigid_motions
 from fe.wing.design import WingDesign
+from fe.wing.operators import AffineOperators, assemble, cell_density, root_support
+from fe.wing.responses import eigenmodes, solve_static
 
 FloatArray = NDArray[np.float64]
 
@@ -34,7 +29,7 @@ _PATCH_GRADIENT = np.array([[1.0, -0.4, 0.3], [0.2, -0.7, 0.5], [-0.6, 0.1, 0.8]
 
 def brick(
     lengths: tuple[float, float, float], cells: tuple[int, int, int], distortion: float = 0.0, seed: int = 0
-) -> Discretisation:
+) -> CellMesh:
     """Brick of 20-node hexahedra with positive Jacobians.
 
     Parameters
@@ -51,18 +46,17 @@ def brick(
     grid = np.stack(
         np.meshgrid(*(np.linspace(0.0, 1.0, n + 1) for n in cells), indexing="ij"), axis=-1
     ).reshape(-1, 3)
-    corner = MeshHex.elem.refdom.p.T.astype(np.int64)
+    corner = np.array(HEXAHEDRA_20.corners)
     first = np.stack(np.meshgrid(*(np.arange(n) for n in cells), indexing="ij"), axis=-1).reshape(-1, 1, 3)
     numbers = np.ravel_multi_index(tuple(np.moveaxis(first + corner, 2, 0)), tuple(n + 1 for n in cells))
     inside = np.all((grid > 1e-9) & (grid < 1.0 - 1e-9), axis=1)
     shift = np.random.default_rng(seed).uniform(-distortion, distortion, grid.shape) / np.array(cells)
     points = (grid + shift * inside[:, None]) * np.array(lengths)
-    return Discretisation(MeshHex(np.ascontiguousarray(points.T), np.ascontiguousarray(numbers.T)))
+    return hexahedra_20(points, numbers)
 
 
-def _uniform_stiffness(body: Discretisation, elasticity: FloatArray) -> sparse.csr_array:
-    cells = np.arange(len(body.corners))
-    return body.stiffness(cells, np.broadcast_to(elasticity, (len(cells), 6, 6)))
+def _uniform_stiffness(body: CellMesh, elasticity: FloatArray) -> sparse.csr_array:
+    return body.stiffness(np.arange(len(body.cells)), elasticity)
 
 
 @dataclass(frozen=True)
@@ -83,15 +77,16 @@ def patch_test(distortion: float = 0.25) -> PatchTest:
     """Impose a linear displacement on the surface of a distorted brick; it must hold inside."""
     body = brick((1.0, 0.8, 1.2), (3, 3, 3), distortion)
     stiffness = _uniform_stiffness(body, isotropic_elasticity(1.0, 0.3))
-    points = body.node_points
+    points = body.points
     exact = (points @ _PATCH_GRADIENT.T).ravel()
     edge = np.isclose(points, 0.0) | np.isclose(points, [1.0, 0.8, 1.2])
     free = np.flatnonzero(np.repeat(~edge.any(axis=1), 3))
     fixed = np.setdiff1d(np.arange(body.unknowns), free)
     found = exact.copy()
     found[free] = Factorisation(stiffness[free][:, free]).solve(-stiffness[free][:, fixed] @ exact[fixed])
-    gradients, _ = global_gradients(body.corners, np.array([[0.5, 0.5, 0.5]]))
-    strain = np.einsum("nij,nj->ni", strain_matrix(gradients[:, 0]), found[body.cell_dofs])
+    slopes, _ = gradients(body.kind, body.nodes, np.array([[0.5, 0.5, 0.5]]))
+    moved = found[body.unknowns_of(np.arange(len(body.cells)))]
+    strain = np.einsum("nij,nj->ni", strain_matrix(slopes[:, 0]), moved)
     symmetric = _PATCH_GRADIENT + _PATCH_GRADIENT.T
     expected = np.array([*(0.5 * np.diag(symmetric)), symmetric[1, 2], symmetric[0, 2], symmetric[0, 1]])
     return PatchTest(
@@ -128,13 +123,9 @@ def rigid_body_check() -> RigidBodyCheck:
 def _rigid_motions(operators: AffineOperators) -> FloatArray:
     """Free unknowns (n, 3) of the rigid motions that the root allows: heave, flap and yaw."""
     expansion = operators.expansion
-    points = operators.discretisation.node_points
-    full = np.zeros((len(points), 3, 3))
-    full[:, 2, 0] = 1.0
-    full[:, 2, 1], full[:, 1, 1] = points[:, 1], -points[:, 2]
-    full[:, 0, 2], full[:, 1, 2] = -points[:, 1], points[:, 0]
+    full = rigid_motions(operators.wing_mesh.points, np.zeros(3), 2.0)[:, [2, 3, 5]]
     scale = np.asarray((expansion.T @ expansion).diagonal())
-    free = (expansion.T @ full.reshape(-1, 3)) / scale[:, None]
+    free = (expansion.T @ full) / scale[:, None]
     free[-3:] = np.eye(3)
     return np.asarray(free)
 
@@ -146,10 +137,7 @@ def rigid_body_residual(operators: AffineOperators) -> float:
     """
     free = _rigid_motions(operators)
     stiffness = operators.stiffness()
-    springs = np.zeros((operators.unknowns, 3))
-    root = operators.wing_mesh.design.root
-    springs[-3:] = np.diag([root.transverse_spring, root.flap_spring, root.yaw_spring])
-    force = stiffness @ free - springs
+    force = (stiffness - root_support(operators.wing_mesh).stiffness) @ free
     bound = np.asarray(abs(stiffness) @ np.abs(free))
     return float(np.abs(force).max() / bound.max())
 
@@ -182,29 +170,24 @@ def cantilever_check(cells_along: int = 10) -> CantileverCheck:
     return CantileverCheck(bent, bending + shear)
 
 
-def _end_deflection(body: Discretisation, elasticity: FloatArray, length: float, component: int) -> float:
+def _end_deflection(body: CellMesh, elasticity: FloatArray, length: float, component: int) -> float:
     """Mean displacement of the end y = `length` along a unit force there; the other end is clamped."""
     stiffness, shares = _uniform_stiffness(body, elasticity), face_shares(body, length)
-    free = np.flatnonzero(np.repeat(body.node_points[:, 1] > 1e-9, 3))
+    free = np.flatnonzero(np.repeat(body.points[:, 1] > 1e-9, 3))
     load, found = np.zeros(body.unknowns), np.zeros(body.unknowns)
     load[component::3] = shares
     found[free] = Factorisation(stiffness[free][:, free]).solve(load[free])
     return float(found[component::3] @ shares)
 
 
-def face_shares(body: Discretisation, place: float) -> FloatArray:
+def face_shares(body: CellMesh, place: float) -> FloatArray:
     """Consistent shares (nodes,) of a uniform traction on the end face y = `place`; they sum to one."""
-    face, weight = gauss_points(3, 2)
-    local = np.column_stack([face[:, 0], np.ones(len(face)), face[:, 1]])
-    values, _ = shape_functions(local)
-    on_face = np.isclose(body.corners[:, :, 1].max(axis=1), place)
-    jacobian = jacobians(body.corners[on_face], local)
-    area = np.linalg.norm(np.cross(jacobian[..., 0], jacobian[..., 2]), axis=-1)
-    shares = np.zeros(body.unknowns // 3)
-    np.add.at(shares, body.cell_nodes[on_face], np.einsum("nq,q,qa->na", area, weight, values))
+    on_end = np.flatnonzero(np.isclose(body.corners[:, :, 1].max(axis=1), place))
+    shares = area_shares(body, Surface(on_end, np.full(len(on_end), _END_FACE)))
     return np.asarray(shares / shares.sum())
 
 
+_END_FACE = 4  # of a hexahedron, where its second coordinate is one
 MACNEAL_HARDER_SHAPES: tuple[str, ...] = ("regular", "trapezoid", "parallelogram")
 
 
@@ -224,12 +207,12 @@ def macneal_harder_beam(shape: str, *, across_depth: bool) -> float:
     """
     length, depth, width = 6.0, 0.2, 0.1
     regular = brick((depth, length, width), (1, 6, 1))
-    points = regular.mesh.p.copy()
-    line = np.rint(points[1]).astype(int)
+    points = regular.points[: regular.cells[:, :8].max() + 1].copy()
+    line = np.rint(points[:, 1]).astype(int)
     lean = {"regular": 0.0 * line, "trapezoid": (-1.0) ** line, "parallelogram": 1.0 + 0.0 * line}[shape]
     inside = (line > 0) & (line < 6)
-    points[1] += np.where(inside, lean * (points[0] - 0.5 * depth), 0.0)
-    body = Discretisation(MeshHex(points, regular.mesh.t))
+    points[:, 1] += np.where(inside, lean * (points[:, 0] - 0.5 * depth), 0.0)
+    body = hexahedra_20(points, regular.cells[:, :8])
     component, exact = (0, 0.1081) if across_depth else (2, 0.4321)
     return _end_deflection(body, isotropic_elasticity(1e7, 0.3), length, component) / exact
 
@@ -267,13 +250,14 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> WingBa
     mesh = operators.wing_mesh
     design = mesh.design
     heave, flap, _ = _rigid_motions(operators).T
-    _, determinant = global_gradients(mesh.corners, _EIGHT_POINTS)
+    local, weight = gauss_points(2)
+    volume = gradients(mesh.kind, mesh.nodes, local)[1] @ weight
     solution = solve_static(operators, load_factor=load_factor)
     u = solution.displacement
-    load = operators.load(load_factor)
+    load = operators.turn(load_factor)
     return WingBalance(
         structural_mass=float(heave @ (operators.mass_terms[0] @ heave)),
-        volume_mass=float((determinant.mean(axis=1) * cell_density(mesh)).sum()),
+        volume_mass=float(volume @ cell_density(mesh)),
         lift=design.lift.force * load_factor / design.lift.load_factor,
         spring_force=float(design.root.transverse_spring * u[-3]),
         lift_moment=float(flap @ load),
@@ -281,12 +265,6 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> WingBa
         work=float(0.5 * load @ u),
         strain_energy=float(0.5 * u @ (operators.stiffness() @ u)),
     )
-
-
-_HALF = 0.5 / np.sqrt(3.0)
-_EIGHT_POINTS = np.array(
-    [[0.5 + a * _HALF, 0.5 + b * _HALF, 0.5 + c * _HALF] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
-)
 
 
 @dataclass(frozen=True)
@@ -319,14 +297,14 @@ def convergence_row(operators: AffineOperators) -> ConvergenceRow:
     """Results of the healthy wing at e = 1 on the mesh of `operators`."""
     design = operators.wing_mesh.design
     factors = Factorisation(operators.stiffness())
-    turn = factors.solve(operators.load(design.lift.load_factor))
+    turn = factors.solve(operators.turn(design.lift.load_factor))
     bent = factors.solve(operators.load_tip)
     modes = eigenmodes(operators, 1.0, (), design.masses.servo, design.masses.pitot, count=4)
     first, second = modes.flapwise_bending
     return ConvergenceRow(
         refinement=design.mesh.refinement,
         unknowns=operators.unknowns,
-        tip_stiffness=1.0 / float(operators.displacement_output @ bent),
+        tip_stiffness=1.0 / float(operators.load_tip @ bent),
         first_bending=float(modes.frequency[first]),
         second_bending=float(modes.frequency[second]),
         strain=np.asarray(operators.gauge_output @ turn),

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
+from fe.structure.tables import Part
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
@@ -26,7 +27,6 @@ from .parts import (
     Lift,
     Masses,
     MeshSettings,
-    Part,
     Planform,
     PointMassPlace,
     Rib,

@@ -8,12 +8,13 @@ and its Jacobian is positive.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from skfem import MeshHex
 
+from fe.elements.cells import CellMesh, hexahedra_20
+from fe.elements.kinds import HEXAHEDRA_20
 from fe.runtime.errors import MeshError
 
 from .design import WingDesign, rib_interval
@@ -26,10 +27,6 @@ IntArray = NDArray[np.int64]
 SKIN = 0
 """Index of the skin in `WingMesh.region_names`; the damage regions follow, then webs and ribs."""
 
-# Corners of a cell in the local order of scikit-fem's reference hexahedron.
-_CORNERS = np.array([(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)])
-
-
 _NARROW = 0.2  # of the widest cell
 
 
@@ -41,21 +38,19 @@ class SurfacePoint(NamedTuple):
 
 
 @dataclass(frozen=True)
-class WingMesh:
-    """Mesh of the wing with its named regions.
+class WingMesh(CellMesh):
+    """Mesh of the wing with its named regions: 20-node hexahedra with straight edges.
 
     Attributes
     ----------
+    kind, points, cells
+        As of `CellMesh`, in metres.
     design : WingDesign
         The design that it was made from.
     span_lines : (ny + 1,) m
         Distances of the mesh lines from the root.
     chord_lines : tuple of ChordLine
         The nx + 1 mesh lines along the span.
-    points : (nv, 3) m
-        Vertices.
-    cells : (nc, 8)
-        Vertices of each cell, in the local order of scikit-fem.
     grid_index : (nc, 3)
         (i, j, k) of each cell.
     region : (nc,)
@@ -71,24 +66,12 @@ class WingMesh:
     design: WingDesign
     span_lines: FloatArray
     chord_lines: tuple[ChordLine, ...]
-    points: FloatArray
-    cells: IntArray
     grid_index: IntArray
     region: IntArray
     web: IntArray
     rib: IntArray
     leading_edge: NDArray[np.bool_]
     height_cells: int
-
-    @cached_property
-    def skfem_mesh(self) -> Any:
-        """The same mesh as a scikit-fem `MeshHex`."""
-        return MeshHex(np.ascontiguousarray(self.points.T), np.ascontiguousarray(self.cells.T))
-
-    @cached_property
-    def corners(self) -> FloatArray:
-        """Corner coordinates of the cells (nc, 8, 3) [m]."""
-        return self.points[self.cells]
 
     @property
     def region_names(self) -> tuple[str, ...]:
@@ -99,11 +82,6 @@ class WingMesh:
     def stiffness_term(self) -> IntArray:
         """Stiffness term (nc,) that each cell belongs to: the skin, a damage region, or the rest."""
         return np.minimum(self.region, len(self.design.regions) + 1)
-
-    @property
-    def centres(self) -> FloatArray:
-        """Centres of the cells (nc, 3) [m]."""
-        return np.asarray(self.corners.mean(axis=1))
 
     @cached_property
     def _cell_of(self) -> IntArray:
@@ -299,15 +277,17 @@ def build_mesh(design: WingDesign) -> WingMesh:
     region = np.select([web >= 0, rib >= 0], [webs, webs + 1], SKIN)
     _mark_defects(design, across, along, cell_index, region)
 
-    corner = cell_index[:, None, :] + _CORNERS
+    corner = cell_index[:, None, :] + np.array(HEXAHEDRA_20.corners)
     flat = np.ravel_multi_index(tuple(np.moveaxis(corner, 2, 0)), grid.shape[:3])
     used, cells = np.unique(flat, return_inverse=True)
+    body = hexahedra_20(grid.reshape(-1, 3)[used], cells.reshape(flat.shape))
     mesh = WingMesh(
+        kind=body.kind,
+        points=body.points,
+        cells=body.cells,
         design=design,
         span_lines=across,
         chord_lines=along,
-        points=grid.reshape(-1, 3)[used],
-        cells=cells.reshape(flat.shape).astype(np.int64),
         grid_index=cell_index,
         region=region,
         web=web,

@@ -6,13 +6,13 @@ The shape of the section is of the symmetric four-digit family of NACA Report 46
 
 import itertools
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from reporting.section import Section
+from fe.structure.tables import Modulus, Part
 
 _SHAPE = (0.2969, -0.1260, -0.3516, 0.2843, -0.1015)
 
@@ -47,29 +47,10 @@ def four_digit_slope(chord_fraction: ArrayLike, thickness_ratio: float) -> NDArr
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Thickness = Annotated[float, Field(gt=0.0, lt=0.1, description="m")]
-Modulus = Annotated[float, Field(ge=1e6, le=1e13, description="Pa")]
 PoissonRatio = Annotated[float, Field(ge=0.0, lt=0.5)]
 ShearRatio = Annotated[float, Field(gt=0.0, le=1.0)]
 Density = Annotated[float, Field(ge=0.0, le=3e4, description="kg/m^3")]
 Spring = Annotated[float, Field(gt=0.0, le=1e15)]
-
-
-class Part(Section):
-    """Section of a design file: unknown keys, non-finite numbers and booleans for numbers are refused."""
-
-    model_config = ConfigDict(allow_inf_nan=False)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _lists_as_tuples(cls, content: object) -> object:
-        return _tuples(content) if isinstance(content, dict) else content
-
-
-def _tuples(content: Any) -> Any:
-    """Return the content of a file with its lists as the tuples that a strict section takes."""
-    if isinstance(content, dict):
-        return {key: _tuples(item) for key, item in content.items()}
-    return tuple(_tuples(item) for item in content) if isinstance(content, list | tuple) else content
 
 
 class Planform(Part):

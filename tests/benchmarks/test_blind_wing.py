@@ -11,8 +11,7 @@ from benchmarks.blind.instruments import Chance, true_signals
 from benchmarks.blind.laws import FRICTION, Law
 from benchmarks.blind.plan import TrialPlan
 from benchmarks.blind.wing_rig import WingRig
-from fe.full.modes import eigenmodes
-from fe.full.statics import solve_static
+from fe.wing.responses import eigenmodes, solve_static
 
 pytestmark = pytest.mark.long  # the full model is projected once, in about 20 s
 

@@ -1,12 +1,12 @@
 import pytest
 from threadpoolctl import threadpool_limits
 
-from fe.full.operators import AffineOperators, assemble
-from fe.full.patch_operators import PatchOperators, assemble_patch_operators
 from fe.reduction.reduced_basis import Reduction, reduce_model
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.wing.design import WingDesign, load_design
+from fe.wing.operators import AffineOperators, assemble
+from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from tests.kept import FE, kept
 
 

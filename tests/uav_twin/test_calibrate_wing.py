@@ -26,12 +26,12 @@ from calibration.result.file import load_calibration
 from calibration.result.record import STATE, Calibration
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
 from calibration.wing.laboratory import write_lab_folder
-from fe.full.operators import assemble
-from fe.full.statics import solve_static
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
 from fe.wing.design import SHIPPED_DESIGN, load_design
+from fe.wing.operators import assemble
+from fe.wing.responses import solve_static
 from fmu_asset.door.session import FmiAsset
 from scenarios import scenario_files
 from tests.command_line import call, command, refused, said

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from fe.full.operators import assemble
 from fe.wing.design import load_design
+from fe.wing.operators import assemble
 from tests import command_line
 from uav_twin import verify
 from uav_twin.verify import Check

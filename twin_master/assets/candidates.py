@@ -10,7 +10,7 @@ from fe.structure.design import Gauge, MeshDesign, load_structure, parse_structu
 from fe.structure.gauges import gauge_rows, spread_rosettes
 from fe.structure.location import Locator
 from fe.structure.mesh_file import read_mesh
-from fe.wing.parts import Part
+from fe.structure.tables import Part
 from reporting.section import checked
 from reporting.toml_file import read_toml
 from twin_master.assets.asset_source import keep_files, read_files

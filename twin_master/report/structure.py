@@ -9,8 +9,8 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.structure.design import MeshDesign, load_structure
-from fe.structure.elements import KINDS, meshio_with_wedges
 from fe.wing.design import WingDesign, load_design
 from reporting import figures as style
 from twin_master.assets.design_source import DESIGN_COPY, FLOWN_DESIGN_COPY

@@ -4,7 +4,7 @@ Parameters: k, z_y, n. Memory: z. NumPy and relative imports only: this file is 
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from .interface import HEAD, FloatArray, PortForce, power
 
@@ -21,12 +21,9 @@ class BoucWen(PortForce):
     hysteretic: ClassVar[bool] = True
     proportional: ClassVar[tuple[str, ...]] = ("stiffness",)
     positive: ClassVar[tuple[str, ...]] = ("yield_displacement", "order")
-    units: ClassVar[dict[str, str]] = {
-        "stiffness": "N/m or N m/rad", "yield_displacement": "m or rad", "order": "1"
-    }  # fmt: skip
-    stiffness: float
-    yield_displacement: float
-    order: float
+    stiffness: Annotated[float, "N/m or N m/rad"]
+    yield_displacement: Annotated[float, "m or rad"]
+    order: Annotated[float, "1"]
 
 
 def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:

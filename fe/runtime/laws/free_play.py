@@ -4,7 +4,7 @@ Parameters: k, d. No memory. NumPy and relative imports only: this file is copie
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from .interface import FloatArray, PortForce
 
@@ -18,9 +18,8 @@ class FreePlay(PortForce):
 
     proportional: ClassVar[tuple[str, ...]] = ("stiffness",)
     not_negative: ClassVar[tuple[str, ...]] = ("half_width",)
-    units: ClassVar[dict[str, str]] = {"stiffness": "N/m or N m/rad", "half_width": "m or rad"}
-    stiffness: float
-    half_width: float
+    stiffness: Annotated[float, "N/m or N m/rad"]
+    half_width: Annotated[float, "m or rad"]
 
     @property
     def magnitude(self) -> float:

@@ -5,7 +5,7 @@ stretches z_i. NumPy and relative imports only: this file is copied into the FMU
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -31,12 +31,9 @@ class MicroSlip(PortForce):
     proportional: ClassVar[tuple[str, ...]] = ("stiffness", "slip_force")
     positive: ClassVar[tuple[str, ...]] = ("slip_force", "element_count")
     not_negative: ClassVar[tuple[str, ...]] = ("stiffness",)
-    units: ClassVar[dict[str, str]] = {
-        "slip_force": "N or N m", "stiffness": "N/m or N m/rad", "chi": "1"
-    }  # fmt: skip
-    slip_force: float
-    stiffness: float
-    chi: float
+    slip_force: Annotated[float, "N or N m"]
+    stiffness: Annotated[float, "N/m or N m/rad"]
+    chi: Annotated[float, "1"]
     element_count: int = 12
 
     @property

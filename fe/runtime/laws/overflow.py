@@ -6,7 +6,7 @@ imports only: this file is copied into the FMU.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -21,14 +21,10 @@ class Overflow(PortForce):
     proportional: ClassVar[tuple[str, ...]] = ("coefficient",)
     positive: ClassVar[tuple[str, ...]] = ("reference_velocity", "exponent")
     not_negative: ClassVar[tuple[str, ...]] = ("coefficient", "level")
-    units: ClassVar[dict[str, str]] = {
-        "coefficient": "N or N m", "exponent": "1", "level": "m/s or rad/s",
-        "reference_velocity": "m/s or rad/s",
-    }  # fmt: skip
-    coefficient: float
-    exponent: float
-    level: float
-    reference_velocity: float
+    coefficient: Annotated[float, "N or N m"]
+    exponent: Annotated[float, "1"]
+    level: Annotated[float, "m/s or rad/s"]
+    reference_velocity: Annotated[float, "m/s or rad/s"]
 
 
 def pull(

@@ -6,7 +6,7 @@ copied into the FMU.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -28,15 +28,11 @@ class PowerDamping(PortForce):
     not_negative: ClassVar[tuple[str, ...]] = (
         "coefficient", "velocity_exponent", "displacement_exponent"
     )  # fmt: skip
-    units: ClassVar[dict[str, str]] = {
-        "coefficient": "N or N m", "velocity_exponent": "1", "displacement_exponent": "1",
-        "reference_velocity": "m/s or rad/s", "reference_displacement": "m or rad",
-    }  # fmt: skip
-    coefficient: float
-    velocity_exponent: float
-    displacement_exponent: float
-    reference_velocity: float
-    reference_displacement: float
+    coefficient: Annotated[float, "N or N m"]
+    velocity_exponent: Annotated[float, "1"]
+    displacement_exponent: Annotated[float, "1"]
+    reference_velocity: Annotated[float, "m/s or rad/s"]
+    reference_displacement: Annotated[float, "m or rad"]
 
 
 def pull(

@@ -5,7 +5,7 @@ FMU.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from ..errors import InvalidPatchError
 from .interface import FloatArray, PortForce, power
@@ -21,13 +21,10 @@ class PowerStiffness(PortForce):
 
     proportional: ClassVar[tuple[str, ...]] = ("coefficient",)
     positive: ClassVar[tuple[str, ...]] = ("reference_displacement", "exponent")
-    units: ClassVar[dict[str, str]] = {
-        "coefficient": "N or N m", "exponent": "1", "reference_displacement": "m or rad"
-    }  # fmt: skip
-    coefficient: float
-    exponent: float
+    coefficient: Annotated[float, "N or N m"]
+    exponent: Annotated[float, "1"]
     side: int
-    reference_displacement: float
+    reference_displacement: Annotated[float, "m or rad"]
 
     def check(self) -> None:
         """Raise `InvalidPatchError` where a number cannot be."""

@@ -4,7 +4,7 @@ Parameters: c, k, p. No memory. NumPy and relative imports only: this file is co
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -16,12 +16,9 @@ class SineForce(PortForce):
     """F = coefficient sin(wave_number x + phase), against x; m g l sin x brings a pendulum back to x = 0."""
 
     proportional: ClassVar[tuple[str, ...]] = ("coefficient",)
-    units: ClassVar[dict[str, str]] = {
-        "coefficient": "N or N m", "wave_number": "rad/m or 1", "phase": "rad"
-    }  # fmt: skip
-    coefficient: float
-    wave_number: float
-    phase: float
+    coefficient: Annotated[float, "N or N m"]
+    wave_number: Annotated[float, "rad/m or 1"]
+    phase: Annotated[float, "rad"]
 
 
 def pull(

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from fe.full.operators import AffineOperators, assemble
 from fe.wing.design import WingDesign, load_design
+from fe.wing.operators import AffineOperators, assemble
 
 
 @pytest.fixture(scope="session")

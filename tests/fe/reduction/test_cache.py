@@ -12,7 +12,6 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import fe.reduction.model_cache
-from fe.full.operators import AffineOperators
 from fe.reduction.built_once import cache_folder
 from fe.reduction.fields import WingFields, field_basis
 from fe.reduction.model_cache import MODELLING_ROOMS, entry, reduced_model, wing_fields
@@ -20,6 +19,7 @@ from fe.reduction.reduced_basis import Reduction
 from fe.reduction.settings import ReductionSettings
 from fe.runtime.errors import ReducedModelFileError
 from fe.wing.design import WingDesign
+from fe.wing.operators import AffineOperators
 
 ROOT = Path(__file__).parents[3]
 

@@ -6,13 +6,12 @@ import meshio
 import numpy as np
 import pytest
 
-from fe.full.assembly import global_gradients, strain_matrix
-from fe.full.modes import eigenmodes
-from fe.full.operators import AffineOperators
-from fe.full.statics import solve_static
+from fe.elements.cells import gradients, strain_matrix
 from fe.reduction.fields import FieldBasis, WingFields, field_basis, write_modes_vtu, write_wing_vtu
 from fe.reduction.reduced_basis import Reduction
 from fe.runtime.errors import OutsideModelError, ReducedModelFileError
+from fe.wing.operators import AffineOperators
+from fe.wing.responses import eigenmodes, solve_static
 
 STATE = {"young_modulus_factor": 0.95, "stiffness_loss": (0.3, 0.6), "load_factor": 3.0, "tip_force": 5.0}
 
@@ -43,33 +42,7 @@ def test_cells_are_right_handed_hexahedra_of_20_nodes(
     edges = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
     for number, (a, b) in enumerate(edges):
         np.testing.assert_allclose(nodes[:, 8 + number], 0.5 * (nodes[:, a] + nodes[:, b]), atol=1e-12)
-    assert len(written.points) == len(coarse_operators.discretisation.node_points)
-
-
-def test_mirrored_cells_would_be_turned(
-    coarse_operators: AffineOperators, coarse_reduction: Reduction
-) -> None:
-    class Mirrored:
-        """The same wing with every cell numbered left-handed."""
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(coarse_operators.discretisation, name)
-
-        @property
-        def corners(self) -> np.ndarray:
-            return coarse_operators.discretisation.corners * [1.0, 1.0, -1.0]
-
-    class Operators:
-        discretisation = Mirrored()
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(coarse_operators, name)
-
-    straight = field_basis(coarse_operators, coarse_reduction)
-    turned = field_basis(Operators(), coarse_reduction)
-    points = straight.points * [1.0, 1.0, -1.0]
-    corners = points[turned.cells]
-    assert np.all(np.linalg.det(corners[:, [1, 3, 4]] - corners[:, :1]) > 0)
+    assert len(written.points) == len(coarse_operators.wing_mesh.points)
 
 
 def test_displacement_is_that_of_the_full_model(
@@ -84,15 +57,16 @@ def test_displacement_is_that_of_the_full_model(
 
 def test_strain_is_that_of_the_full_model(written: meshio.Mesh, coarse_operators: AffineOperators) -> None:
     full = solve_static(coarse_operators, *STATE.values())
-    discretisation = coarse_operators.discretisation
-    gradients, _ = global_gradients(discretisation.corners, np.full((1, 3), 0.5))
-    nodal = coarse_operators.full_displacement(full.displacement).ravel()[discretisation.cell_dofs]
-    wanted = np.einsum("cij,cj->ci", strain_matrix(gradients[:, 0]), nodal)
+    mesh = coarse_operators.wing_mesh
+    slopes, _ = gradients(mesh.kind, mesh.nodes, np.full((1, 3), 0.5))
+    nodal = coarse_operators.full_displacement(full.displacement).ravel()[
+        mesh.unknowns_of(np.arange(len(mesh.cells)))
+    ]
+    wanted = np.einsum("cij,cj->ci", strain_matrix(slopes[:, 0]), nodal)
     (found,) = written.cell_data["strain"]
     np.testing.assert_allclose(found, wanted, atol=1e-2 * np.abs(wanted).max())
     np.testing.assert_array_equal(written.cell_data["spanwise_strain"][0], -found[:, 1])
     # the upper skin is compressed where the gauges are
-    mesh = coarse_operators.wing_mesh
     plan = mesh.design.planform
     cells = [
         mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe.full.patch_operators import strip_edges
 from fe.reduction import model_cache
 from fe.reduction.model_cache import entry
-from fe.reduction.patch_basis import PatchSettings, area_shares
+from fe.reduction.patch_basis import PatchSettings
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.patch_arrays import PatchArrays
 from fe.wing.design import WingDesign
+from fe.wing.patch_operators import area_shares, strip_edges
 
 
 def test_a_file_gives_the_arrays_back(coarse_patch_arrays: PatchArrays, tmp_path: Path) -> None:

@@ -10,17 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from fe.full.operators import (
-    AffineOperators,
-    assemble,
-    cell_elasticity,
-    gauge_output,
-    modulus_variation,
-    section_displacement,
-)
-from fe.full.patch_operators import PatchOperators, TurnedStrain
 from fe.full.statics import Factorisation
-from fe.full.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load
 from fe.reduction.reduced_basis import Reduction
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
@@ -37,10 +27,22 @@ from fe.runtime.patch import (
 )
 from fe.runtime.patched_wing import PatchedWing
 from fe.wing.design import WingDesign
+from fe.wing.operators import (
+    AffineOperators,
+    assemble,
+    cell_elasticity,
+    gauge_output,
+    modulus_variation,
+    point_masses,
+    section_displacement,
+)
+from fe.wing.patch_operators import PatchOperators
+from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
 STATE = (1.0073, (0.2, 0.1))
+FACTOR = {"young_modulus_factor": STATE[0]}
 MASSES = (0.1688, 0.1344)
 STRAIN, DISPLACEMENT, FREQUENCY = 1e-3, 1e-3, 1e-4
 """Accuracy wanted, relative to the largest strain, the largest displacement, and of the first frequencies."""
@@ -53,12 +55,12 @@ def patched(*primitives: Primitive) -> ModelPatch:
 def compare(wing: PatchedWing, reduced: FloatArray, operators: AffineOperators, full: FloatArray) -> None:
     strain = operators.gauge_output @ full
     assert np.abs(wing.arrays.strain_rows[0] @ reduced - strain).max() <= STRAIN * np.abs(strain).max()
-    tip = float(operators.tip_displacement_output @ full)
+    tip = float(operators.tip_row @ full)
     assert float(wing.arrays.tip_row @ reduced) == pytest.approx(tip, rel=DISPLACEMENT)
 
 
 def solved(operators: AffineOperators, loads: FloatArray, stiffness: Any = None) -> FloatArray:
-    matrix = operators.stiffness(*STATE) if stiffness is None else stiffness
+    matrix = operators.stiffness(FACTOR, STATE[1]) if stiffness is None else stiffness
     return Factorisation(matrix).solve(loads)
 
 
@@ -107,7 +109,7 @@ def test_root_compliance_is_a_softer_root_spring(
         (wing.force_row("tip_load"), operators.load_tip),
     ):
         compare(wing, structure.static(reduced), operators, solved(operators, full))
-    wanted = frequencies(operators.stiffness(*STATE), operators.mass(*MASSES))
+    wanted = frequencies(operators.stiffness(FACTOR, STATE[1]), operators.mass(point_masses(*MASSES)))
     assert structure.modes(3)[0] == pytest.approx(wanted, rel=FREQUENCY)
 
 
@@ -121,14 +123,14 @@ def test_local_loss_between_mesh_lines_is_softer_cells(
 ) -> None:
     wing, operators, mesh = coarse_patched_wing, coarse_operators, coarse_operators.wing_mesh
     start, end = wing.arrays.strip_lines[[first, last]]
-    stiffness = operators.stiffness(*STATE)
+    stiffness = operators.stiffness(FACTOR, STATE[1])
     elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
     restriction = operators.expansion.T.tocsr()
-    for region, factor in zip(range(3), operators.theta(STATE[0], STATE[1])[:3], strict=True):
+    for region, factor in zip(range(3), operators.theta(FACTOR, STATE[1])[:3], strict=True):
         middle = mesh.centres[:, 1]
         cells = np.flatnonzero((mesh.region == region) & (middle > start) & (middle < end))
         if cells.size:
-            part = operators.discretisation.stiffness(cells, elasticity[cells], variation[cells])
+            part = operators.wing_mesh.stiffness(cells, elasticity[cells], variation[cells])
             stiffness = stiffness - loss * factor * (restriction @ (part @ operators.expansion))
     patch = patched(LocalStiffnessLoss(loss, start, end - start))
     structure = wing.structure(*STATE, *MASSES, patch)
@@ -137,7 +139,7 @@ def test_local_loss_between_mesh_lines_is_softer_cells(
         (wing.force_row("tip_load"), operators.load_tip),
     ):
         compare(wing, structure.static(reduced), operators, solved(operators, full, stiffness.tocsr()))
-    wanted = frequencies(stiffness.tocsr(), operators.mass(*MASSES))
+    wanted = frequencies(stiffness.tocsr(), operators.mass(point_masses(*MASSES)))
     frequency = structure.modes(3)[0]
     assert frequency[[0, 2]] == pytest.approx(wanted[[0, 2]], rel=FREQUENCY)  # flapwise
     assert frequency[1] == pytest.approx(wanted[1], rel=1e-3)
@@ -161,7 +163,7 @@ def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(
     elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
     inside = (mesh.centres[:, 1] > start) & (mesh.centres[:, 1] < end)
     cells = np.flatnonzero(inside & (mesh.stiffness_term < 3))
-    part = operators.discretisation.stiffness(cells, elasticity[cells], variation[cells])
+    part = operators.wing_mesh.stiffness(cells, elasticity[cells], variation[cells])
     whole = operators.stiffness()
     softer = whole - loss * (operators.expansion.T @ (part @ operators.expansion))
     before, after = (solved(operators, operators.load_lift, matrix) for matrix in (whole, softer.tocsr()))
@@ -177,7 +179,7 @@ def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(
     scale = np.abs(strain) / np.abs(strain).max()
     assert np.abs((ratio - wanted) * scale).max() < 0.03 * np.abs((wanted - 1.0) * scale).max()
     # the strips of this mesh are 0.26 m long, four times those of the shipped one
-    tip = operators.tip_displacement_output
+    tip = operators.tip_row
     moved = wing.arrays.tip_row
     effect = float(tip @ after) / float(tip @ before) - 1.0
     assert float(moved @ u) / float(moved @ plain) - 1.0 == pytest.approx(effect, rel=0.05)
@@ -217,7 +219,8 @@ def test_point_mass_is_a_pitot_tube_that_was_moved(
         places = [place.model_dump() for place in coarse_design.point_masses if place.kind == "servo"]
         moved = {"kind": "pitot", "station": station, "chord": coarse_design.tip_load.chord}
         operators = assemble(coarse_design.changed(point_masses=[*places, moved]))
-        wanted = frequencies(operators.stiffness(*STATE), operators.mass(MASSES[0], added))
+        mass = operators.mass(point_masses(MASSES[0], added))
+        wanted = frequencies(operators.stiffness(FACTOR, STATE[1]), mass)
         patch = patched(PointMass(added, station * wing.span))
         frequency = wing.structure(*STATE, MASSES[0], 0.0, patch).modes(3)[0]
         assert frequency == pytest.approx(wanted, rel=FREQUENCY)
@@ -229,7 +232,8 @@ def test_temperature_is_a_change_of_the_modulus_factor(
     wing, operators = coarse_patched_wing, coarse_operators
     patch = patched(ModulusTemperature(2e-3))
     u = wing.structure(*STATE, *MASSES, patch, 25.0).static(wing.load(1.0))
-    full = solved(operators, operators.load_lift, operators.stiffness(STATE[0] * 0.95, STATE[1]))
+    warm = operators.stiffness({"young_modulus_factor": STATE[0] * 0.95}, STATE[1])
+    full = solved(operators, operators.load_lift, warm)
     compare(wing, u, operators, full)
     cold = wing.structure(*STATE, *MASSES, patch, 0.0).stiffness
     assert np.array_equal(cold, wing.structure(*STATE, *MASSES).stiffness)
@@ -240,8 +244,8 @@ def test_temperature_is_a_change_of_the_modulus_factor(
 
 def _section_force(operators: AffineOperators, y: float, chord: float) -> FloatArray:
     mesh = operators.wing_mesh
-    full = np.zeros(operators.discretisation.unknowns)
-    full[2::3] = section_displacement(mesh, operators.discretisation, y, chord)
+    full = np.zeros(operators.wing_mesh.unknowns)
+    full[2::3] = section_displacement(mesh, y, chord)
     return np.asarray(operators.expansion.T @ full)
 
 
@@ -330,9 +334,9 @@ def test_washout_is_another_lift_distribution(
         return lambda station: course(station) * (1.0 - coefficient * factor * station**exponent)
 
     restriction = operators.expansion.T
-    plain = restriction @ lift_load(operators.wing_mesh, operators.discretisation)
+    plain = restriction @ lift_load(operators.wing_mesh)
     monkeypatch.setitem(DISTRIBUTIONS, lift.distribution, washed)
-    changed = restriction @ lift_load(operators.wing_mesh, operators.discretisation) * share
+    changed = restriction @ lift_load(operators.wing_mesh) * share
     # what balances the weight is lift of the same course
     z_force = lift.force / lift.load_factor
     mass = wing.arrays.mass[0], coarse_design.masses
@@ -346,24 +350,24 @@ def test_washout_is_another_lift_distribution(
 
 
 def _weight(operators: AffineOperators, design: WingDesign) -> float:
-    up = np.zeros(operators.discretisation.unknowns)
+    up = np.zeros(operators.wing_mesh.unknowns)
     up[2::3] = 1.0
     rigid = np.zeros(operators.unknowns)
     rigid[:-3] = up[np.setdiff1d(np.arange(len(up)), _held(operators))]
     rigid[-3] = 1.0
-    mass = operators.mass(design.masses.servo, design.masses.pitot)
+    mass = operators.mass(point_masses(design.masses.servo, design.masses.pitot))
     return STANDARD_GRAVITY * float(rigid @ (mass @ rigid))
 
 
 def _held(operators: AffineOperators) -> FloatArray:
-    points = operators.discretisation.node_points
+    points = operators.wing_mesh.points
     root = np.flatnonzero(np.abs(points[:, 1]) < 1e-9)
     return (3 * root[:, None] + np.arange(3)).ravel()
 
 
 def _vertical(operators: AffineOperators, load: FloatArray) -> FloatArray:
     """Keep the vertical part of a load of free unknowns."""
-    component = np.zeros(operators.discretisation.unknowns)
+    component = np.zeros(operators.wing_mesh.unknowns)
     component[2::3] = 1.0
     free = np.zeros(operators.unknowns)
     free[:-3] = component[np.setdiff1d(np.arange(len(component)), _held(operators))]
@@ -376,11 +380,11 @@ def test_inertia_relief_is_weight_where_it_lies(
 ) -> None:
     wing, operators = coarse_patched_wing, coarse_operators
     gravity = np.zeros(operators.unknowns)
-    component = np.zeros(operators.discretisation.unknowns)
+    component = np.zeros(operators.wing_mesh.unknowns)
     component[2::3] = 1.0
     gravity[:-3] = component[np.setdiff1d(np.arange(len(component)), _held(operators))]
     gravity[-3] = 1.0
-    mass = operators.mass(coarse_design.masses.servo, coarse_design.masses.pitot)
+    mass = operators.mass(point_masses(coarse_design.masses.servo, coarse_design.masses.pitot))
     weight = -STANDARD_GRAVITY * (mass @ gravity)
     fraction, factor = 0.2, 2.5
     full = solved(operators, factor * (operators.load_lift + fraction * _vertical(operators, weight)))
@@ -400,7 +404,7 @@ def test_a_turned_gauge_follows_from_the_three_components(
 ) -> None:
     wing, operators = coarse_patched_wing, coarse_operators
     angle = np.deg2rad(degrees)
-    turned = gauge_output(operators.wing_mesh, TurnedStrain.of(operators.discretisation, angle))
+    turned = gauge_output(operators.wing_mesh, angle)
     full = solved(operators, operators.load_lift)
     wanted = turned @ (operators.expansion @ full)
     u = wing.structure(*STATE, *MASSES).static(wing.load(1.0))

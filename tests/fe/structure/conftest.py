@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fe.structure.elements import KINDS, meshio_with_wedges
+from fe.elements.kinds import KINDS, meshio_with_wedges
 
 FloatArray = NDArray[np.float64]
 Divisions = tuple[int, int, int]

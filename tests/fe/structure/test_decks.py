@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fe.elements.cells import jacobians
+from fe.elements.kinds import meshio_with_wedges
 from fe.runtime.errors import MeshError
 from fe.structure.deck import words_of
-from fe.structure.elements import jacobians, meshio_with_wedges
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import _from_meshio, read_mesh
 

@@ -13,14 +13,20 @@ from skfem.element import ElementHex1, ElementHexS2, ElementTetP1, ElementTetP2,
 from skfem.helpers import ddot, sym_grad
 from skfem.models.elasticity import lame_parameters, linear_stress
 
-from fe.full.assembly import isotropic_elasticity
+from fe.elements.cells import (
+    isotropic_elasticity,
+    jacobians,
+    mass_blocks,
+    orthotropic_elasticity,
+    rotate_elasticity,
+    stiffness_blocks,
+)
+from fe.elements.kinds import KINDS
 from fe.structure.design import Gauge
-from fe.structure.elements import KINDS, jacobians, mass_blocks, stiffness_blocks
 from fe.structure.gauges import gauge_rows
 from fe.structure.location import Locator, area_shares, area_vectors
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
-from fe.structure.operators import assembled
 
 SKFEM: dict[str, Any] = {
     "tetra": ElementTetP1(),
@@ -95,12 +101,7 @@ def test_patch_test_and_gauges(distorted: StructureMesh) -> None:
     gradient = 1e-3 * np.array([[1.0, 2.0, -0.5], [0.3, -1.5, 0.8], [0.6, -0.2, 0.9]])
     exact = distorted.points @ gradient.T
     elasticity = isotropic_elasticity(7e10, 0.3)
-    K = assembled(
-        distorted,
-        np.arange(len(distorted.cells)),
-        lambda nodes: stiffness_blocks(distorted.kind, nodes, elasticity),
-        3,
-    )
+    K = distorted.stiffness(np.arange(len(distorted.cells)), elasticity)
     inner = ((distorted.points > 1e-9) & (distorted.points < np.array([1, 2, 0.5]) - 1e-9)).all(axis=1)
     assert inner.any()
     free = np.repeat(inner, 3)
@@ -137,3 +138,18 @@ def test_a_point_inside_is_found(distorted: StructureMesh) -> None:
         cell, local = locator.attach(point, "here")
         values, _ = distorted.kind.shape_functions(local[None])
         np.testing.assert_allclose(values[0] @ distorted.nodes[cell], point, atol=1e-12)
+
+
+def test_an_isotropic_material_does_not_feel_a_rotation():
+    elasticity = isotropic_elasticity(7.0, 0.3)
+    rotation, _ = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))
+    assert rotate_elasticity(elasticity[None], rotation[None])[0] == pytest.approx(elasticity, abs=1e-13)
+
+
+def test_turning_an_orthotropic_material_by_a_right_angle_swaps_its_axes():
+    local = orthotropic_elasticity(5.0, 0.1, 0.3, 0.7, 1.1)
+    local[0, 0] += 2.0
+    quarter = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = rotate_elasticity(local[None], quarter[None])[0]
+    order = [1, 0, 2, 4, 3, 5]
+    assert turned == pytest.approx(local[np.ix_(order, order)], abs=1e-13)

@@ -11,8 +11,8 @@ import meshio
 import numpy as np
 import pytest
 
+from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime.errors import MeshError
-from fe.structure.elements import KINDS, meshio_with_wedges
 from fe.structure.field import static_responses
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh

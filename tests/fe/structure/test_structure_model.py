@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fe.elements.kinds import KINDS
 from fe.runtime.errors import InvalidDesignError, InvalidStateError, MeshError
-from fe.structure.elements import KINDS
 from fe.structure.field import natural_frequencies, static_responses, weighed, write_structure_vtu
 from fe.structure.mesh_file import analysed_estimate, check_memory, read_mesh, upper_estimate
 from fe.structure.operators import Structure, load_and_assemble

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fe.full.turn_load import DISTRIBUTIONS, lifting_line, schrenk
 from fe.wing.parts import Planform, four_digit_half_thickness, four_digit_slope
+from fe.wing.turn_load import DISTRIBUTIONS, lifting_line, schrenk
 
 UAV = Planform(semi_span=1.828, root_chord=0.433, tip_chord=0.260, straight_chord_line=0.3)
 

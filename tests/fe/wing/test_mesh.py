@@ -3,7 +3,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fe.full.assembly import gauss_points, jacobians, positions
+from fe.elements.cells import jacobians
+from fe.elements.kinds import gauss_points
 from fe.runtime.errors import InvalidDesignError, MeshError
 from fe.wing.grid import chord_lines
 from fe.wing.mesh import build_mesh, straight_edged
@@ -19,13 +20,13 @@ def coarse_mesh(coarse_design):
 
 def _volumes(mesh):
     local, weight = gauss_points(3)
-    return np.linalg.det(jacobians(mesh.corners, local)) @ weight
+    return np.linalg.det(jacobians(mesh.kind, mesh.nodes, local)) @ weight
 
 
 def test_every_cell_has_a_positive_jacobian_everywhere(coarse_mesh, shipped_design):
     local, _ = gauss_points(3)
     for mesh in (coarse_mesh, build_mesh(shipped_design)):
-        assert np.linalg.det(jacobians(mesh.corners, local)).min() > 0.0
+        assert np.linalg.det(jacobians(mesh.kind, mesh.nodes, local)).min() > 0.0
 
 
 def test_every_named_region_has_cells_and_they_partition_the_mesh(coarse_mesh):
@@ -96,7 +97,7 @@ def test_a_point_of_the_skin_is_found_where_it_is(coarse_mesh):
     chord = coarse_mesh.design.planform.chord(0.8 / 1.828)
     for upper in (True, False):
         point = coarse_mesh.skin_point(0.8, 0.2 * chord, upper=upper)
-        place = positions(coarse_mesh.corners[point.cell][None], point.local[None])[0, 0]
+        place = coarse_mesh.positions(np.array([point.cell]), point.local[None])[0, 0]
         assert place[:2] == pytest.approx([(0.2 - 0.3) * chord, 0.8])
         assert (place[2] > 0.0) == upper
     with pytest.raises(MeshError, match="does not lie on the skin"):
@@ -128,11 +129,11 @@ def test_cells_beside_the_edges_of_defects_are_small(shipped_design):
             assert mesh.span_lines[at] == pytest.approx(place)
             assert np.diff(mesh.span_lines)[at - 1 : at + 1].max() <= 1.5 * size + 1e-9
     local, _ = gauss_points(3)
-    assert np.linalg.det(jacobians(mesh.corners, local)).min() > 0.0
+    assert np.linalg.det(jacobians(mesh.kind, mesh.nodes, local)).min() > 0.0
 
 
 def test_the_shipped_mesh_is_of_the_intended_size(shipped_operators):
-    assert 24_000 <= shipped_operators.discretisation.unknowns <= 40_000
+    assert 24_000 <= shipped_operators.wing_mesh.unknowns <= 40_000
 
 
 def test_refinement_refines_the_whole_grid(shipped_design, coarse_mesh):

@@ -1,11 +1,10 @@
-"""The kinds of elements that a structure may be made of: nodes, faces, integration, element arrays.
+"""The kinds of elements that a structure may be made of: nodes, faces, shape functions, integration.
 
 Shape functions are the polynomials of scikit-fem's elements of the same name, made for many places at once;
 nodes stand in the order of the mesh file, which is that of VTK and, for these kinds, of Abaqus and CalculiX.
 All kinds are isoparametric: the mid-edge nodes of a file bend the edges and faces. Stiffness is integrated as
 CalculiX integrates C3D4, C3D8, C3D10 and C3D20; mass is integrated exactly on straight cells, while CalculiX
-takes the points of the stiffness for it. Element arrays are contracted for many cells at once, as in
-`fe.full.assembly`. Strains are in Voigt order 11, 22, 33, 23, 13, 12.
+takes the points of the stiffness for it.
 """
 
 import itertools
@@ -18,14 +17,10 @@ from numpy.typing import NDArray
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTet, RefTri
 
-from fe.full.assembly import gauss_points, strain_matrix
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Rule = tuple[FloatArray, FloatArray]
 
-BATCH = 512
-"""Cells whose arrays are contracted at once."""
 
 _TET = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
 _TET_EDGES = ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))
@@ -47,6 +42,14 @@ _SERENDIPITY = tuple(power for power in _POWERS if sum(p for p in power if p > 1
 _PRISMATIC = tuple(power for power in _POWERS if power[0] + power[1] <= 1 and power[2] <= 1)
 # Quadratic in the triangle and linear along it, or the other way round.
 _PRISMATIC_QUADRATIC = tuple(power for power in _POWERS if power[0] + power[1] + power[2] // 2 <= 2)
+
+
+def gauss_points(order: int, dimensions: int = 3) -> Rule:
+    """Tensor Gauss rule on the unit cube: points (q, dimensions), weights (q,)."""
+    line, weight = np.polynomial.legendre.leggauss(order)
+    grids = np.meshgrid(*([0.5 * (line + 1.0)] * dimensions), indexing="ij")
+    weights = np.meshgrid(*([0.5 * weight] * dimensions), indexing="ij")
+    return np.stack([g.ravel() for g in grids], axis=1), np.prod([w.ravel() for w in weights], axis=0)
 
 
 def _simplex_rule(cell: type[RefTet] | type[RefTri], order: int) -> Rule:
@@ -206,41 +209,3 @@ def meshio_with_wedges() -> Any:
 
     topological_dimension.setdefault("wedge15", 3)
     return meshio
-
-
-def jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> FloatArray:
-    """Jacobians dx_i/dX_j (n, q, 3, 3) at local places (q, 3) of cells with nodes (n, k, 3)."""
-    _, gradients = kind.shape_functions(local)
-    return np.asarray(np.einsum("nai,qaj->nqij", nodes, gradients, optimize=True))
-
-
-def stiffness_blocks(kind: ElementKind, nodes: FloatArray, elasticity: FloatArray) -> FloatArray:
-    """Element stiffness (n, 3k, 3k) [N/m] of cells with nodes (n, k, 3) [m].
-
-    Parameters
-    ----------
-    kind : ElementKind
-        Kind of the cells.
-    nodes : (n, k, 3)
-        Places of the nodes [m].
-    elasticity : (6, 6)
-        Elasticity in space [Pa].
-    """
-    local, weight = kind.stiffness_rule
-    _, slopes = kind.shape_functions(local)
-    jacobian = jacobians(kind, nodes, local)
-    B = strain_matrix(slopes[None] @ np.linalg.inv(jacobian))
-    measure = weight * np.linalg.det(jacobian)
-    n, q = measure.shape
-    width = 3 * kind.node_count
-    left = B.reshape(n, q * 6, width).swapaxes(1, 2)
-    blocks = left @ ((elasticity @ B) * measure[..., None, None]).reshape(n, q * 6, width)
-    return np.asarray(0.5 * (blocks + blocks.swapaxes(1, 2)))
-
-
-def mass_blocks(kind: ElementKind, nodes: FloatArray, density: float, rule: Rule) -> FloatArray:
-    """Consistent element mass (n, k, k) [kg] of one component, cells with nodes (n, k, 3) [m]."""
-    local, weight = rule
-    values, _ = kind.shape_functions(local)
-    factor = np.linalg.det(jacobians(kind, nodes, local)) * weight * density
-    return np.asarray(np.einsum("nq,qa,qb->nab", factor, values, values, optimize=True))

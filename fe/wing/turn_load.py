@@ -14,11 +14,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fe.wing.design import WingDesign
-from fe.wing.mesh import WingMesh
-from fe.wing.parts import Planform
+from fe.elements.cells import jacobians
+from fe.elements.kinds import gauss_points
 
-from .assembly import Discretisation, gauss_points, jacobians, positions, shape_functions
+from .mesh import WingMesh
+from .parts import Planform
 
 FloatArray = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ STANDARD_GRAVITY = 9.80665
 """m/s^2."""
 
 
-def lift_load(mesh: WingMesh, discretisation: Discretisation) -> FloatArray:
+def lift_load(mesh: WingMesh) -> FloatArray:
     """Load (full,) [N] at load factor 1: up and forward, half on each skin.
 
     Along the span the design's distribution, along the chord (1 - xi)^p with the design's exponent p; each
@@ -103,14 +103,13 @@ def lift_load(mesh: WingMesh, discretisation: Discretisation) -> FloatArray:
     design, plan = mesh.design, mesh.design.planform
     per_length = DISTRIBUTIONS[design.lift.distribution](plan)
     face, weight = gauss_points(4, 2)
-    load = np.zeros(discretisation.unknowns // 3)
+    load = np.zeros(len(mesh.points))
     for upper in (True, False):
         cells = mesh.skin_cells(upper=upper)
         local = np.column_stack([face, np.full(len(face), 1.0 if upper else 0.0)])
-        values, _ = shape_functions(local)
-        corners = mesh.corners[cells]
-        place = positions(corners, local)
-        jacobian = jacobians(corners, local)
+        values, _ = mesh.kind.shape_functions(local)
+        place = mesh.positions(cells, local)
+        jacobian = jacobians(mesh.kind, mesh.nodes[cells], local)
         area = (
             jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
         )  # in the plan view
@@ -118,31 +117,23 @@ def lift_load(mesh: WingMesh, discretisation: Discretisation) -> FloatArray:
         chord = plan.root_chord + (plan.tip_chord - plan.root_chord) * station
         xi = place[..., 0] / chord + plan.straight_chord_line
         pressure = per_length(station) * (1.0 - xi) ** design.lift.chordwise_exponent / chord
-        np.add.at(
-            load, discretisation.cell_nodes[cells], np.einsum("nq,qa->na", pressure * area * weight, values)
-        )
+        np.add.at(load, mesh.cells[cells], (pressure * area * weight) @ values)
     load /= load.sum() * design.lift.load_factor
-    full = np.zeros(discretisation.unknowns)
+    full = np.zeros(mesh.unknowns)
     full[2::3] = design.lift.force * load
     full[0::3] = -design.lift.forward_force * load
     return full
 
 
 def inertia_relief(
-    design: WingDesign,
-    discretisation: Discretisation,
-    density: FloatArray,
-    point_masses: Weights,
-    lift: FloatArray,
+    mesh: WingMesh, density: FloatArray, point_masses: Weights, lift: FloatArray
 ) -> FloatArray:
     """Load (full,) [N] to add at load factor 1: the weight where it lies, and as much lift against it.
 
     Parameters
     ----------
-    design : WingDesign
+    mesh : WingMesh
         The wing; its nominal masses count.
-    discretisation : Discretisation
-        Degrees of freedom.
     density : (nc,) kg/m^3
         Of the cells.
     point_masses : tuple of two tuples of (nodes,)
@@ -150,11 +141,17 @@ def inertia_relief(
     lift : (full,) N
         `lift_load`.
     """
-    weight = discretisation.nodal_mass(density)
-    for mass, places in zip((design.masses.servo, design.masses.pitot), point_masses, strict=True):
-        for weights in places:
-            weight = weight + mass * weights
-    weight = STANDARD_GRAVITY * weight
+    weight = nodal_weight(mesh, density, point_masses)
     added = np.zeros(len(lift))
     added[2::3] = lift[2::3] * (weight.sum() / lift[2::3].sum()) - weight
     return added
+
+
+def nodal_weight(mesh: WingMesh, density: FloatArray, point_masses: Weights) -> FloatArray:
+    """Weight (nodes,) [N] of structure and nominal point masses; parameters as of `inertia_relief`."""
+    mass = np.asarray(mesh.mass(np.arange(len(mesh.cells)), density).sum(axis=1))
+    masses = mesh.design.masses
+    for own, places in zip((masses.servo, masses.pitot), point_masses, strict=True):
+        for weights in places:
+            mass = mass + own * weights
+    return STANDARD_GRAVITY * mass

@@ -1,0 +1,243 @@
+"""Cells of one kind between nodes: elasticity, element arrays and their sums.
+
+Element arrays are contracted for many cells at once, an order of magnitude faster than one bilinear form
+after the other. Strains are in Voigt order 11, 22, 33, 23, 13, 12 with engineering shear strains.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+
+from .kinds import HEXAHEDRA_20, ElementKind, Rule
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+BATCH = 512
+"""Cells whose arrays are contracted at once."""
+_TRIPLETS = 4_000_000  # entries of element arrays that are summed at once, of 16 bytes each
+_VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+
+
+def jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> FloatArray:
+    """Jacobians dx_i/dX_j (n, q, 3, 3) at local places (q, 3) of cells with nodes (n, k, 3)."""
+    _, slopes = kind.shape_functions(local)
+    return np.asarray(np.einsum("nai,qaj->nqij", nodes, slopes, optimize=True))
+
+
+def gradients(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gradients (n, q, k, 3) of the shape functions in space and Jacobian determinants (n, q)."""
+    jacobian = jacobians(kind, nodes, local)
+    _, slopes = kind.shape_functions(local)
+    return np.asarray(slopes[None] @ np.linalg.inv(jacobian)), np.asarray(np.linalg.det(jacobian))
+
+
+def strain_matrix(gradients: FloatArray) -> FloatArray:
+    """Strain matrix B (..., 6, 3k) of gradients (..., k, 3); the unknowns of a node are consecutive."""
+    nodes = gradients.shape[-2]
+    B = np.zeros((*gradients.shape[:-2], 6, nodes, 3))
+    for row, (i, j) in enumerate(_VOIGT):
+        B[..., row, :, i] += gradients[..., j]
+        if i != j:
+            B[..., row, :, j] += gradients[..., i]
+    return B.reshape(*B.shape[:-2], 3 * nodes)
+
+
+def point_jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> FloatArray:
+    """Jacobians dx_i/dX_j (p, 3, 3) at one local place (p, 3) of each of p cells with nodes (p, k, 3)."""
+    _, slopes = kind.shape_functions(local)
+    return np.asarray(np.einsum("pai,paj->pij", nodes, slopes))
+
+
+def strain_weights(
+    kind: ElementKind, nodes: FloatArray, local: FloatArray, direction: FloatArray
+) -> FloatArray:
+    """Weights (p, k, 3) [1/m] of nodal displacements in the strain along unit vectors.
+
+    Parameters
+    ----------
+    kind : ElementKind
+        Of the cells.
+    nodes : (p, k, 3) m
+        Their nodes.
+    local : (p, 3)
+        One local place in each cell.
+    direction : (p, 3) or (3,)
+        Unit vectors.
+    """
+    _, slopes = kind.shape_functions(local)
+    inverse = np.linalg.inv(point_jacobians(kind, nodes, local))
+    direction = np.broadcast_to(direction, local.shape)
+    slope = np.einsum("pai,pij,pj->pa", slopes, inverse, direction)
+    return np.asarray(slope[:, :, None] * direction[:, None, :])
+
+
+def stiffness_blocks(
+    kind: ElementKind, nodes: FloatArray, elasticity: FloatArray, factor: FloatArray | float = 1.0
+) -> FloatArray:
+    """Element stiffness (n, 3k, 3k) [N/m] of cells with nodes (n, k, 3).
+
+    Parameters
+    ----------
+    kind : ElementKind
+        Of the cells.
+    nodes : (n, k, 3) m
+        Their nodes.
+    elasticity : (6, 6) or (n, 6, 6) Pa
+        In space.
+    factor : (n, q), optional
+        On the elasticity at the points of the rule of the kind.
+    """
+    local, weight = kind.stiffness_rule
+    slopes, determinant = gradients(kind, nodes, local)
+    B = strain_matrix(slopes)
+    measure = weight * determinant * factor
+    n, q = measure.shape
+    width = 3 * kind.node_count
+    left = B.reshape(n, q * 6, width).swapaxes(1, 2)
+    scaled = (elasticity.reshape(-1, 1, 6, 6) @ B) * measure[..., None, None]
+    blocks = left @ scaled.reshape(n, q * 6, width)
+    return np.asarray(0.5 * (blocks + blocks.swapaxes(1, 2)))
+
+
+def mass_blocks(kind: ElementKind, nodes: FloatArray, density: ArrayLike, rule: Rule) -> FloatArray:
+    """Element mass (n, k, k) [kg] of one component: nodes (n, k, 3) of the cells, density (n,) [kg/m^3]."""
+    local, weight = rule
+    values, _ = kind.shape_functions(local)
+    factor = np.linalg.det(jacobians(kind, nodes, local)) * weight * np.reshape(density, (-1, 1))
+    return np.asarray(np.einsum("nq,qa,qb->nab", factor, values, values, optimize=True))
+
+
+def orthotropic_elasticity(
+    young_modulus: float, poisson_ratio: float, shear_23: float, shear_13: float, shear_12: float
+) -> FloatArray:
+    """Elasticity (6, 6) [Pa] of a material with equal Young's moduli and free shear moduli."""
+    compliance = np.zeros((6, 6))
+    compliance[:3, :3] = -poisson_ratio / young_modulus
+    compliance[range(3), range(3)] = 1.0 / young_modulus
+    compliance[range(3, 6), range(3, 6)] = 1.0 / shear_23, 1.0 / shear_13, 1.0 / shear_12
+    return np.asarray(np.linalg.inv(compliance), dtype=np.float64)
+
+
+def isotropic_elasticity(young_modulus: float, poisson_ratio: float) -> FloatArray:
+    """Elasticity (6, 6) [Pa] of an isotropic material."""
+    shear = young_modulus / (2.0 * (1.0 + poisson_ratio))
+    return orthotropic_elasticity(young_modulus, poisson_ratio, shear, shear, shear)
+
+
+def rotate_elasticity(elasticity: FloatArray, axes: FloatArray) -> FloatArray:
+    """Elasticity (n, 6, 6) in space of local elasticity (n, 6, 6) in axes (n, 3, 3), rows the local axes."""
+    unit = np.zeros((6, 3, 3))
+    for row, (i, j) in enumerate(_VOIGT):
+        unit[row, i, j] += 0.5 if i != j else 1.0
+        unit[row, j, i] += 0.5 if i != j else 0.0
+    turned = np.einsum("nai,kij,nbj->nkab", axes, unit, axes)
+    transform = np.empty((len(axes), 6, 6))
+    for row, (i, j) in enumerate(_VOIGT):
+        transform[:, row, :] = turned[:, :, i, j] * (1.0 if i == j else 2.0)
+    return np.asarray(np.swapaxes(transform, 1, 2) @ elasticity @ transform)
+
+
+@dataclass(frozen=True)
+class CellMesh:
+    """Nodes and cells of one kind.
+
+    Attributes
+    ----------
+    kind : ElementKind
+        Kind of the cells.
+    points : (nn, 3)
+        Places of the nodes.
+    cells : (nc, k)
+        Nodes of each cell, by their places in `points`.
+    """
+
+    kind: ElementKind
+    points: FloatArray
+    cells: IntArray
+
+    @property
+    def unknowns(self) -> int:
+        """Number of displacements, three for each node; that of a component is 3 node + component."""
+        return 3 * len(self.points)
+
+    @cached_property
+    def nodes(self) -> FloatArray:
+        """Places (nc, k, 3) [m] of the nodes of each cell."""
+        return self.points[self.cells]
+
+    @property
+    def corners(self) -> FloatArray:
+        """Places (nc, c, 3) [m] of the corners of each cell."""
+        return self.nodes[:, : len(self.kind.corners)]
+
+    @cached_property
+    def centres(self) -> FloatArray:
+        """Mean (nc, 3) [m] of the corners of each cell."""
+        return np.asarray(self.corners.mean(axis=1))
+
+    def unknowns_of(self, cells: IntArray, components: int = 3) -> IntArray:
+        """Unknowns (n, components k) of cells (n,)."""
+        own = components * self.cells[cells][:, :, None] + np.arange(components)
+        return np.asarray(own.reshape(len(cells), -1))
+
+    def positions(self, cells: IntArray, local: FloatArray) -> FloatArray:
+        """Places (n, q, 3) of local places (q, 3) in cells (n,)."""
+        values, _ = self.kind.shape_functions(local)
+        return np.asarray(np.einsum("qa,nai->nqi", values, self.nodes[cells]))
+
+    def stiffness(
+        self, cells: IntArray, elasticity: FloatArray, factor: FloatArray | float = 1.0
+    ) -> sparse.csr_array:
+        """Stiffness, csr (unknowns, unknowns) [N/m], of cells (n,); the rest as of `stiffness_blocks`."""
+        points = len(self.kind.stiffness_rule[1])
+        moduli = np.broadcast_to(elasticity, (len(cells), 6, 6))
+        factors = np.broadcast_to(factor, (len(cells), points))
+
+        def blocks(part: slice) -> FloatArray:
+            return stiffness_blocks(self.kind, self.nodes[cells[part]], moduli[part], factors[part])
+
+        return self._assembled(cells, blocks, 3)
+
+    def mass(self, cells: IntArray, density: ArrayLike, rule: Rule | None = None) -> sparse.csr_array:
+        """Mass, csr (nodes, nodes) [kg], of one component of cells (n,) with density (n,) [kg/m^3]."""
+        densities = np.broadcast_to(density, len(cells))
+
+        def blocks(part: slice) -> FloatArray:
+            own = rule or self.kind.mass_rule
+            return mass_blocks(self.kind, self.nodes[cells[part]], densities[part], own)
+
+        return self._assembled(cells, blocks, 1)
+
+    def _assembled(
+        self, cells: IntArray, blocks: Callable[[slice], FloatArray], components: int
+    ) -> sparse.csr_array:
+        size = components * len(self.points)
+        total = sparse.csr_array((size, size))
+        together = max(BATCH, _TRIPLETS // (components * self.kind.node_count) ** 2)
+        for start in range(0, len(cells), together):
+            rows, columns, values = [], [], []
+            last = min(start + together, len(cells))
+            for first in range(start, last, BATCH):
+                part = slice(first, min(first + BATCH, last))
+                unknowns = self.unknowns_of(cells[part], components).astype(np.int32)
+                rows.append(np.repeat(unknowns, unknowns.shape[1], axis=1).ravel())
+                columns.append(np.tile(unknowns, (1, unknowns.shape[1])).ravel())
+                values.append(blocks(part).ravel())
+            places = (np.concatenate(rows), np.concatenate(columns))
+            total = total + sparse.coo_array((np.concatenate(values), places), shape=total.shape).tocsr()
+        return total
+
+
+def hexahedra_20(points: FloatArray, cells: IntArray) -> CellMesh:
+    """20-node hexahedra of vertices (nv, 3) and cells (nc, 8); the middles of edges follow the vertices."""
+    ends = np.sort(cells[:, np.array(HEXAHEDRA_20.edges)], axis=2)
+    edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+    middles = len(points) + number.reshape(len(cells), -1)
+    return CellMesh(
+        HEXAHEDRA_20, np.vstack((points, points[edges].mean(axis=1))), np.hstack((cells, middles))
+    )

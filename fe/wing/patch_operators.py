@@ -1,0 +1,176 @@
+"""Full operators of the primitives of `fe.runtime.patch`: what a missing effect does to the full model.
+
+Stations are the sections of the mesh that hold nodes: its lines along the span and the middles between them.
+Forces and displacements of a section are those of lines along the span, the elastic line (the chord line of
+the static test) and the webs; between two of them the section moves as a straight line, beyond the outermost
+as the straight line through the last two, and a force goes to two lines by the law of the lever. A force
+between two webs therefore does not dent the thin skin; nor would one in a test, where a clamp or a cord
+around the section takes it.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from .design import WingDesign
+from .operators import (
+    AffineOperators,
+    all_point_mass_weights,
+    cell_density,
+    gauge_output,
+    section_displacement,
+    stiffness_parts,
+    turn_load,
+    upward,
+)
+from .turn_load import nodal_weight
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LEAST_LINE_DISTANCE = 0.1
+"""Least distance between lines of a section, as a fraction of the chord."""
+
+
+class PatchOperators(NamedTuple):
+    """What `fe.runtime.patch_arrays.PatchArrays` hold of a wing, on its n free unknowns, by the same names.
+
+    Attributes
+    ----------
+    operators : AffineOperators
+        The wing that they belong to.
+    rows : dict of str to csr (..., n), (n,), or a tuple of csr
+        What is multiplied with a basis; of `strain_rows` the first are `AffineOperators.gauge_output`.
+    plain : dict of str to array or float
+        What has no unknowns.
+    strips : tuple of csr (n, n) N/m
+        Parts of the stiffness terms of the skin that lie in the strips.
+    """
+
+    operators: AffineOperators
+    rows: dict[str, Any]
+    plain: dict[str, Any]
+    strips: tuple[sparse.csr_array, ...]
+
+
+def area_shares(stations: FloatArray, root_chord: float, tip_chord: float) -> FloatArray:
+    """Weights (P,) of the mean over the planform of what is quadratic between every other station."""
+    chord = root_chord + (tip_chord - root_chord) * stations / stations[-1]
+    weights = np.zeros(len(stations))
+    length = stations[2::2] - stations[:-2:2]
+    for offset, share in ((0, 1.0), (1, 4.0), (2, 1.0)):
+        np.add.at(weights, np.arange(offset, len(stations) - 2 + offset, 2), share / 6.0 * length)
+    weights *= chord
+    return np.asarray(weights / weights.sum())
+
+
+def section_lines(design: WingDesign) -> tuple[float, ...]:
+    """Return the chord fractions of the elastic line and of the webs that are other lines, ascending."""
+    elastic = design.tip_load.chord
+    webs = sorted((web.chord for web in design.webs), key=lambda chord: abs(chord - elastic))
+    lines = [elastic]
+    for chord in webs:  # the nearest first: what is too near to one gives no lever
+        if min(abs(chord - line) for line in lines) >= LEAST_LINE_DISTANCE:
+            lines.append(chord)
+    return elastic, *sorted(lines[1:])
+
+
+def strip_edges(lines: FloatArray, count: int) -> FloatArray:
+    """Return at most `count` + 1 of the mesh lines, ends included, that part the span most evenly."""
+    if count >= len(lines) - 1:
+        return np.array(lines)
+    wanted = np.linspace(lines[0], lines[-1], count + 1)
+    nearest = np.abs(lines[:, np.newaxis] - wanted).argmin(axis=0)
+    return np.asarray(lines[np.unique(nearest)])
+
+
+def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) -> PatchOperators:
+    """Assemble the operators of the primitives for a wing.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The wing.
+    strip_count : int
+        Largest number of strips of the skin.
+    """
+    mesh, design, expansion = operators.wing_mesh, operators.wing_mesh.design, operators.expansion
+    restriction = expansion.T.tocsr()
+    lines = mesh.span_lines
+    stations = np.sort(np.concatenate([lines, 0.5 * (lines[1:] + lines[:-1])]))
+    chords = section_lines(design)
+
+    def rows(chord: float, component: int) -> sparse.csr_array:
+        weights = [section_displacement(mesh, place, chord) for place in stations]
+        nodal = sparse.csr_array(np.array(weights))
+        spread = sparse.kron(nodal, sparse.csr_array(np.eye(3)[component : component + 1]))
+        return sparse.csr_array(spread @ expansion)
+
+    weight = -upward(nodal_weight(mesh, cell_density(mesh), all_point_mass_weights(mesh)))
+    lift = turn_load(mesh)
+    if design.lift.inertia_relief:  # the load holds the weight
+        lift = lift - weight
+    node_station = np.abs(mesh.points[:, 1:2] - stations).argmin(axis=1)
+    by_station = sparse.coo_array(
+        (lift, (np.repeat(node_station, 3), np.arange(mesh.unknowns))), shape=(len(stations), len(lift))
+    ).tocsr()
+
+    along = operators.gauge_output
+    across, diagonal = (
+        sparse.csr_array(gauge_output(mesh, angle) @ expansion) for angle in (0.5 * np.pi, 0.25 * np.pi)
+    )
+
+    edges = strip_edges(lines, strip_count)
+    strips = np.searchsorted(edges, mesh.centres[:, 1]) - 1
+    skin = np.flatnonzero(mesh.stiffness_term <= len(design.regions))
+    found, part_of = np.unique(
+        np.stack((strips, mesh.stiffness_term), axis=1)[skin], axis=0, return_inverse=True
+    )
+    parts = (skin[part_of == number] for number in range(len(found)))
+    flap = np.zeros(operators.unknowns)
+    flap[-2] = 1.0
+    return PatchOperators(
+        operators,
+        rows={
+            "flap_row": flap,
+            "line_rows": (
+                *(rows(chords[0], component) for component in range(3)),
+                *(rows(chord, 2) for chord in chords[1:]),
+            ),
+            "load_tip": operators.load_tip,
+            "load_lift": operators.load_lift,
+            "lift_rows": sparse.csr_array(by_station @ expansion),
+            "weight": np.asarray(restriction @ weight),
+            "strain_rows": (along, across, sparse.csr_array(2.0 * diagonal - along - across)),
+            "tip_row": operators.tip_row,
+        },
+        plain={
+            "strip_lines": edges,
+            "strip_of": found[:, 0],
+            "term_of": found[:, 1],
+            **_plain(design, stations, chords),
+        },
+        strips=tuple(
+            sparse.csr_array(restriction @ (matrix @ expansion)) for matrix in stiffness_parts(mesh, parts)
+        ),
+    )
+
+
+def _plain(design: WingDesign, stations: FloatArray, chords: tuple[float, ...]) -> dict[str, Any]:
+    """Return what is the same in every basis, but for the strips."""
+    plan = design.planform
+    return {
+        "flap_spring": design.root.flap_spring,
+        "semi_span": plan.semi_span,
+        "root_chord": plan.root_chord,
+        "tip_chord": plan.tip_chord,
+        "straight_chord_line": plan.straight_chord_line,
+        "load_place": plan.semi_span - design.tip_load.distance_from_tip,
+        "stations": stations,
+        "line_chord": np.array(chords),
+        "station_weights": area_shares(stations, plan.root_chord, plan.tip_chord),
+        "gauge_stations": np.array([place for place, _ in design.gauges.positions]),
+        "gauge_length": design.gauges.averaging_spanwise,
+    }
