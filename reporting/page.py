@@ -13,15 +13,16 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup, escape
-from matplotlib.figure import Figure
 
 from reporting import words
 from reporting.errors import InvalidFigureError
-from reporting.figures import inline_svg, to_svg
+
+if TYPE_CHECKING:  # words are said where nothing is drawn, too
+    from matplotlib.figure import Figure
 
 _UNIT_SPACE = re.compile(r"(?<=\d) (?=(%|µε|s|ms|µs|Hz|mm|m|kg|N)(?!\w))")
 
@@ -92,7 +93,7 @@ class ReportFigure(NamedTuple):
     """
 
     name: str
-    figure: Figure
+    figure: "Figure"
     title: str
     caption: str
 
@@ -201,12 +202,16 @@ class Page:
         InvalidFigureError
             `svg` is not an SVG that can be scaled.
         """
+        from reporting.figures import inline_svg
+
         number = self._count("figure") + 1
         drawing = Markup(inline_svg(svg, prefix=f"f{number}", description=title))
         return self._add("figure", number=number, drawing=drawing, title=title, caption=caption)
 
     def add_report_figure(self, figure: ReportFigure) -> int:
         """Add a figure that has its words; return its number."""
+        from reporting.figures import to_svg
+
         return self.add_figure(to_svg(figure.figure), figure.caption, title=figure.title)
 
     def add_table(self, table: Table, caption: str, *, title: str) -> int:

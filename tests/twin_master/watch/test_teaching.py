@@ -151,7 +151,7 @@ def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(
     assert b"<svg" in picture.drawing.read_bytes()
     asked = Request(number=1, flight=-1, first=0, end=0, turn=18, shown=-1, count=-1)
     assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time
-    shown = json.loads(str(teller.answer(replace(asked, turn=19))))["picture"]
+    shown = json.loads(str(teller.answer(asked.model_copy(update={"turn": 19}))))["picture"]
     assert shown["said"] == found.verdict.sentence
     (picture.drawing.parent.parent / "verdict.json").write_text("{}")
     assert seen(watch).pictures == []
