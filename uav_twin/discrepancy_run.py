@@ -69,11 +69,9 @@ def run(
     json: terminal.Json = False,
 ) -> None:
     """Find out what the model lacks: verdict, report, patch, residuals."""
-    from discrepancy.application import gives
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.errors import CampaignFileError
     from discrepancy.judgement.separability import separability
-    from discrepancy.verdict import VerdictKind
     from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
     from discrepancy.workflow import investigate
 
@@ -115,18 +113,29 @@ def run(
         place = write_verdict_folder(folder, content, replace_it=replace, report=not no_report)
     if json:
         terminal.print_json(_record(folder, report=None if no_report else place))
-    if found.verdict.kind is VerdictKind.DATA_ERROR:
+    _conclude(found, tried, folder, f"{'Verdict' if no_report else 'Report'}: {place}", silent=json)
+
+
+def _conclude(
+    found: "Investigation", tried: "SelfCalibration | None", folder: Path, place: str, *, silent: bool
+) -> None:
+    """Print the conclusion; data at fault end the command with 1."""
+    from discrepancy.application import gives
+    from discrepancy.verdict import VerdictKind
+
+    fault = found.verdict.kind is VerdictKind.DATA_ERROR
+    if fault:
         for sentence in (found.verdict.sentence, *(fault.sentence for fault in found.faults[1:])):
             typer.secho(sentence, fg="red", err=True)
-    elif not json:
+    elif not silent:
         _show(found, folder)
         if tried is not None:
             terminal.say(_trials_sentence(tried))
-    if not json:
-        terminal.say(f"{'Verdict' if no_report else 'Report'}: {place}")
-    if found.verdict.kind is VerdictKind.DATA_ERROR:
+    if not silent:
+        terminal.say(place)
+    if fault:
         raise typer.Exit(1)
-    if not json and gives(found.verdict):
+    if not silent and gives(found.verdict):
         terminal.say(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}")
 
 

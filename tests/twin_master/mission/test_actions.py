@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import norm
-from twin_master.scenario.notice import Noticing
 
 import uav_twin
 from fe.reduction.model_cache import reduced_model
@@ -49,6 +48,7 @@ from twin_master.network.transition import TransitionModel
 from twin_master.report.reading import open_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.tables import Noticing
 
 TEXT = scenario_files()["inspected_wing"].read_text(encoding="utf-8")
 INSPECT, REPAIR_1 = 2, 3

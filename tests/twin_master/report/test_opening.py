@@ -11,7 +11,7 @@ from twin_master.report.check import predictive_check
 from twin_master.report.opening import opening_sentences
 from twin_master.report.page import render_page
 from twin_master.report.reading import Run
-from twin_master.store.learnt import LearntQuantity
+from twin_master.store.mission_result import LearntQuantity
 
 REGION = "the stiffness loss of region 1"
 KEPT = "The twin kept 3g at every turn"
