@@ -322,9 +322,9 @@ def _fallback_figures(fallback: Fallback, scenario: Scenario, step: str) -> list
         title = "policy leaves the first control"
         return [Figure(FALLBACK_FIGURES[0], title, "nowhere, or by several states")]
     scale, unit = _printed(scenario.state[scenario.state_names.index(name)].unit)
-    delay = fallback.delay
-    if fallback.early_step is not None and delay == 0:  # in force since before the damage
+    if fallback.early_step is not None and fallback.delay == 0:  # in force since before the damage
         fallback = replace(fallback, fallback_step=None)
+    delay = fallback.delay
     told: tuple[tuple[str, float | None, str], ...] = (
         (f"policy leaves the first control from {name}", scale * level, unit),
         (f"{step} of the damage that calls for it", fallback.called_for_step, ""),

@@ -149,12 +149,14 @@ def test_the_present_is_chosen_before_the_first_change_of_control(run: Run) -> N
 
 
 def test_a_fallback_that_came_before_the_damage_has_no_delay() -> None:
+    from twin_master.scenario.reading import load_scenario
     from twin_master.store.summary import Fallback, _fallback_figures
 
+    scenario = load_scenario("level_turns").scenario
+
     def values(*steps: int | None) -> list[object]:
-        return [
-            figure.value for figure in _fallback_figures(Fallback("z1", 0.6, *steps), {"z1": "1"}, "turn")
-        ]
+        fallback = Fallback("z1", 0.6, *steps)
+        return [figure.value for figure in _fallback_figures(fallback, scenario, "turn")]
 
     assert values(30, 30, 12) == [60.0, 30, None, None, 12]
     assert values(30, 31, None) == [60.0, 30, 31, 1, None]
