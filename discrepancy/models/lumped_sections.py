@@ -1,6 +1,6 @@
 """The tables of a lumped model's file: matrices, named vectors, laws, controllers and parameters."""
 
-from dataclasses import fields
+from dataclasses import replace
 from math import isfinite
 from typing import Annotated, Literal, Self
 
@@ -186,14 +186,7 @@ class LawSection(Section):
         law = self.primitive
         if factor == 1.0:
             return law
-        return type(law)(
-            **{
-                item.name: getattr(law, item.name) * (factor if item.name in law.proportional else 1)
-                if item.type is float
-                else getattr(law, item.name)
-                for item in fields(law)
-            }
-        )
+        return replace(law, **{name: factor * getattr(law, name) for name in law.proportional})
 
 
 class ControllerSection(Section):
