@@ -172,7 +172,9 @@ def test_every_primitive_with_any_numbers_survives_the_file(
 
 def test_every_real_parameter_of_every_primitive_has_a_unit() -> None:
     for kind, primitive in PRIMITIVES.items():
-        assert set(PRIMITIVE_UNITS[kind]) == {item.name for item in fields(primitive) if item.type is float}
+        assert set(PRIMITIVE_UNITS[kind]) == {
+            name for name, own in primitive.values().items() if own is float
+        }
     assert set(PRIMITIVE_UNITS) == set(PRIMITIVES)
 
 
