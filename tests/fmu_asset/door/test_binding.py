@@ -118,7 +118,7 @@ def test_patterns_count(first: int, more: int) -> None:
 
 
 def variable(unit: str | None) -> VariableInfo:
-    return VariableInfo("v", 0, "Real", "input", "continuous", "", unit, None, None, None, None)
+    return VariableInfo("v", 0, causality="input", unit=unit)
 
 
 SI = (0, 0, 0, 0, 0, 0, 0, 0)

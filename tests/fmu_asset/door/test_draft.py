@@ -61,13 +61,11 @@ def test_roles_units_and_step_size_come_from_the_description(foreign_fmu: Any) -
 
 
 def description(*variables: VariableInfo) -> FmuDescription:
-    return FmuDescription(
-        Path("x.fmu"), "", 0, "2.0", "x", "x", "", "", "", ("linux64",), False, False, True, variables, ()
-    )
+    return FmuDescription(Path("x.fmu"), model_name="x", variables=variables)
 
 
 def variable(name: str, causality: str, about: str = "", unit: str | None = None) -> VariableInfo:
-    return VariableInfo(name, 0, "Real", causality, "continuous", about, unit, None, None, None, "0")
+    return VariableInfo(name, 0, causality=causality, description=about, unit=unit, start="0")
 
 
 def test_without_an_output_there_is_nothing_to_observe() -> None:
