@@ -22,7 +22,15 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.models.acting import Acting, Course
-from discrepancy.models.interface import Conditions, Model, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import (
+    Conditions,
+    Model,
+    ModelParameter,
+    Outputs,
+    PortScale,
+    Response,
+    Scales,
+)
 from discrepancy.models.questions import release_of
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.sensing import observe
@@ -193,13 +201,7 @@ class Cantilever(Model):
             ports=ports,
         )
 
-    def _respond(
-        self,
-        trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
-        patch: ModelPatch,
-        conditions: Conditions,
-    ) -> Response:
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial."""
         rows = np.array(
             [SKIN * curvature_row(GAUGES[name]) if name in GAUGES else TIP for name, _ in outputs]

@@ -101,7 +101,7 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
         If there is no such model, or its file cannot be used.
     """
     if name is None:
-        return _wing(None, progress)
+        return _wing(WingModel.shipped(progress), ModelKind.WING, None)
     path = Path(name)
     file = str(path.resolve() if path.exists() else name)
     return replace(_chosen(path, progress), file=file)
@@ -119,7 +119,7 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
     if path.suffix and not path.is_file():
         raise ModelError(f"There is no model file {path}; give a calibration (.nc) or a model (.toml).")
     if path.suffix == ".nc":
-        return _calibrated(path, progress)
+        return _wing(WingModel.of_calibration(path, progress), ModelKind.CALIBRATION, path)
     if path.suffix == ".json":
         return _patched(path, progress)
     if path.suffix not in ("", ".toml"):
@@ -135,7 +135,7 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
         if is_structure(content):
             return _structure(path, progress)
         if "format" not in content:  # a wing design has none
-            return _wing(path, progress)
+            return _wing(WingModel.of_design(path, progress), ModelKind.WING, path)
     if not path.exists() and str(path) in structure_files():
         return _structure(structure_files()[str(path)], progress)
     model = LumpedModel.load(path)
@@ -209,15 +209,13 @@ def choice_of_run(folder: Path) -> ModelChoice:
     CampaignFileError, ModelError
         As `run_model`.
     """
-    model = run_model(folder)
-    calibration = folder / CALIBRATION_FILE
-    tailored = is_calibrated_wing(folder)
-    choice = _calibrated(calibration, None) if tailored else _wing(folder / DESIGN_FILE, None)
+    model, tailored = run_model(folder), is_calibrated_wing(folder)
+    kind = ModelKind.CALIBRATION if tailored else ModelKind.WING
+    choice = _wing(model, kind, folder / (CALIBRATION_FILE if tailored else DESIGN_FILE))
     patch = patch_of_run(folder)
     if patch is None:
-        return replace(choice, model=model)
-    source = hash_record({"model": choice.source_hash, "patch": hash_file(patch)})
-    return replace(choice, model=model, source_hash=source)
+        return choice
+    return replace(choice, source_hash=hash_record({"model": choice.source_hash, "patch": hash_file(patch)}))
 
 
 def shipped_lumped_models() -> tuple[str, ...]:
@@ -261,17 +259,11 @@ def _fmu(path: Path) -> ModelChoice:
     return ModelChoice(model, ModelKind.FMU, path.name, source, path=path, design_hash=packed)
 
 
-def _wing(path: Path | None, progress: Progress | None) -> ModelChoice:
-    model = WingModel.of_design(path, progress)
-    prior = {name: list(values) for name, values in SHIPPED_PRIOR.items()}
-    source = hash_record({"design": hash_file(path or SHIPPED_DESIGN), "prior": prior})
-    return _of_wing(model, ModelKind.WING, path, source)
-
-
-def _calibrated(path: Path, progress: Progress | None) -> ModelChoice:
-    return _of_wing(WingModel.of_calibration(path, progress), ModelKind.CALIBRATION, path, hash_file(path))
-
-
-def _of_wing(model: WingModel, kind: ModelKind, path: Path | None, source: str) -> ModelChoice:
+def _wing(model: WingModel, kind: ModelKind, path: Path | None) -> ModelChoice:
+    if path is not None and kind is ModelKind.CALIBRATION:
+        source = hash_file(path)
+    else:
+        prior = {name: list(values) for name, values in SHIPPED_PRIOR.items()}
+        source = hash_record({"design": hash_file(path or SHIPPED_DESIGN), "prior": prior})
     label, made_of = "" if path is None else path.name, "" if model.design is None else model.design.hash
     return ModelChoice(model, kind, label, source, model.design, path, made_of)

@@ -1,6 +1,6 @@
 """Normal equations of a fit; the trials' own unknowns are eliminated trial by trial (Schur complement)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
@@ -85,40 +85,37 @@ def trial_block(
     )
 
 
+def trial_blocks(
+    problem: Problem, found: Fitted, candidate: Candidate, precision: FloatArray
+) -> list[TrialBlock]:
+    """Return the normal equations of all trials."""
+    numbers = range(len(problem.trials))
+    return [trial_block(problem, number, found, candidate, precision) for number in numbers]
+
+
 class Eliminated(NamedTuple):
     """Normal equations of shared unknowns and effect parameters, the trials' own unknowns eliminated.
 
     Attributes
     ----------
-    blocks : tuple of TrialBlock
+    blocks : list of TrialBlock
         Of each trial.
     matrix, gradient : (Q + E, Q + E), (Q + E,) ndarray
         With prior.
-    diagonal : (Q + E,) ndarray
-        Of the matrix before anything is eliminated.
     """
 
-    blocks: tuple[TrialBlock, ...]
+    blocks: list[TrialBlock]
     matrix: FloatArray
     gradient: FloatArray
-    diagonal: FloatArray
 
 
-def eliminated(
-    problem: Problem, found: Fitted, candidate: Candidate, precision: FloatArray, damping: float = 0.0
-) -> Eliminated:
-    """Return the normal equations of a problem, what the trials know of their own damped."""
-    size = problem.shared.size + candidate.size
+def eliminated(problem: Problem, found: Fitted, candidate: Candidate, precision: FloatArray) -> Eliminated:
+    """Return the normal equations of a problem."""
+    blocks = trial_blocks(problem, found, candidate, precision)
     prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
-    matrix, diagonal = np.diag(prior + 1e-12), prior.copy()
-    gradient = -prior * np.concatenate((found.point.shared, found.point.effect))[:size]
-    blocks = []
-    for number in range(len(problem.trials)):
-        block = trial_block(problem, number, found, candidate, precision)
-        if damping:
-            block = replace(block, local=block.local + damping * np.diag(np.diag(block.local)))
-        blocks.append(block)
+    matrix = np.diag(prior + 1e-12)
+    gradient = -prior * np.concatenate((found.point.shared, found.point.effect))[: len(prior)]
+    for block in blocks:
         matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ block.followed
         np.add.at(gradient, block.index, block.shared_gradient - block.followed.T @ block.local_gradient)
-        np.add.at(diagonal, block.index, np.diag(block.shared))
-    return Eliminated(tuple(blocks), matrix, gradient, diagonal)
+    return Eliminated(blocks, matrix, gradient)

@@ -14,7 +14,7 @@ from discrepancy.errors import DiscrepancyError, FitError
 
 from .candidate import Candidate
 from .cholesky import Cholesky, finite
-from .elimination import eliminated
+from .elimination import eliminated, trial_blocks
 from .linearisation import Base, Linearisation, Point
 from .problem import Problem
 from .remainder import Remainder
@@ -293,18 +293,27 @@ def _step(
     """Return the step, the decrease it promises [nat], and the deviations (E,) of the effect parameters."""
     shared_size = problem.shared.size
     size = shared_size + candidate.size
-    blocks, matrix, gradient, diagonal = eliminated(
-        problem, state, candidate, problem.precisions(state.sums), damping
-    )
+    prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
+    matrix, diagonal = np.diag(prior + 1e-12), np.zeros(size)
+    gradient = -prior * np.concatenate((state.point.shared, state.point.effect))
+    blocks = trial_blocks(problem, state, candidate, problem.precisions(state.sums))
+    inner, inner_gradients = [], []
+    for block in blocks:
+        local = block.local + damping * np.diag(np.diag(block.local))
+        solved = np.linalg.solve(finite(local), np.column_stack((block.cross, block.local_gradient)))
+        inner.append(solved[:, :-1])
+        inner_gradients.append(solved[:, -1])
+        matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner[-1]
+        np.add.at(diagonal, block.index, np.diag(block.shared))
+        np.add.at(gradient, block.index, block.shared_gradient - block.cross.T @ inner_gradients[-1])
     variance = np.diag(Cholesky.of(matrix).solve(np.eye(size)[:, shared_size:])[shared_size:])
-    damped = matrix + damping * np.diag(diagonal)
+    damped = matrix + damping * np.diag(diagonal + prior)
     step = np.zeros(size) if local_only else Cholesky.of(damped).solve(finite(gradient))
     promised = 0.5 * float(gradient @ step)
     local_steps = []
-    for block in blocks:
-        own = block.factor.solve(block.local_gradient)
+    for block, followed, own in zip(blocks, inner, inner_gradients, strict=True):
         promised += 0.5 * float(block.local_gradient @ own)
-        local_steps.append(np.asarray(own - block.followed @ step[block.index], dtype=np.float64))
+        local_steps.append(np.asarray(own - followed @ step[block.index], dtype=np.float64))
     return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised, np.sqrt(variance)
 
 
@@ -315,7 +324,7 @@ def _finished(
     covariance, log_evidence = np.zeros((size, size)), -state.objective
     spent = np.zeros(len(problem.channel_names))
     if evidence:
-        blocks, matrix, *_ = eliminated(problem, state, candidate, problem.precisions(state.sums))
+        blocks, matrix, _ = eliminated(problem, state, candidate, problem.precisions(state.sums))
         factor = Cholesky.of(matrix)
         covariance = factor.solve(np.eye(size))
         log_evidence -= 0.5 * sum(item.log_determinant for item in (factor, *(b.factor for b in blocks)))

@@ -18,6 +18,7 @@ from discrepancy.campaign.records import Campaign, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.models.interface import Model
+from discrepancy.models.memory import Memory
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
@@ -30,6 +31,8 @@ from .unknowns import GlobalUnknowns, global_unknowns
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+KEPT = 2000
+"""Responses that a problem keeps."""
 QUIETEST = 1e-12
 """Least variance of an unknown noise over its stand-in: a billionth of the range, from rounding."""
 
@@ -92,7 +95,7 @@ class Problem:
             np.add.at(counts, data.groups, data.weight.sum(axis=0))
         self.counts = counts
         self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
-        self._responses: dict[object, tuple[FloatArray, FloatArray | None]] = {}
+        self._responses = Memory(KEPT)
         self.refusals: dict[str, str] = {} if like is None else like.refusals
         self.shared: GlobalUnknowns
         if like is not None:
@@ -150,15 +153,12 @@ class Problem:
         data = self.trials[number]
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
         conditions = replace(conditions, refinement=self.refinement * finer)
-        key = (number, patch.primitives, conditions.key)
-        kept = self._responses.get(key)
-        if kept is None:
+
+        def answer() -> tuple[FloatArray, FloatArray | None]:
             observed = observe(self.model, self.campaign, data.trial, patch, conditions)
-            kept = (observed.values, observed.rates)
-            if len(self._responses) > 2000:
-                self._responses.clear()
-            self._responses[key] = kept
-        return kept
+            return observed.values, observed.rates
+
+        return self._responses.get((number, patch.primitives, conditions.key), answer)
 
     def prediction(self, number: int, point: Point, response: FloatArray) -> FloatArray:
         """Return the prediction (N, C) with gains and zeros."""
@@ -230,13 +230,12 @@ class Problem:
             parameters, by_local = there.parameters, there.local
         else:
             shared, local = point.shared, point.local[number]
-            response, rates = self.response(number, shared, local, patch)
+            response, _ = self.response(number, shared, local, patch)
             at_base = response
             if known is not None:
                 parameters, by_local = known.parameters, known.local
             elif derivatives:
-                parameters = self._by_parameters(number, shared, local, patch, response)
-                by_local = self._by_local(data, number, shared, local, patch, response, rates)
+                parameters, by_local = self._by_nuisances(number, shared, local, patch)
         if not derivatives:
             return Linearisation(response, _NOTHING, _NOTHING, _NOTHING)
         effect = np.zeros((candidate.size, *response.shape))
@@ -254,38 +253,25 @@ class Problem:
                 effect[k] = (ends[0] - other) / (width * steps[k])
         return Linearisation(response, parameters, by_local, effect)
 
-    def _by_parameters(
-        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, response: FloatArray
-    ) -> FloatArray:
-        columns = [
-            (self.response(number, moved(shared, k, SHARED_STEP), local, patch)[0] - response) / SHARED_STEP
+    def _by_nuisances(
+        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the derivatives by the calibrated parameters and by the trial's own unknowns but zeros."""
+        response, rates = self.response(number, shared, local, patch)
+        data, first = self.trials[number], self.trials[number].unknowns.zeros
+        unknowns = data.unknowns
+
+        def slope(by_shared: FloatArray, by_local: FloatArray, step: float = PARAMETER_STEP) -> FloatArray:
+            return (self.response(number, by_shared, by_local, patch)[0] - response) / step
+
+        parameters = [
+            slope(moved(shared, k, SHARED_STEP), local, SHARED_STEP)
             for k in range(len(self.shared.parameter_mean))
         ]
-        return np.stack(columns) if columns else np.zeros((0, *response.shape))
-
-    def _by_local(
-        self,
-        data: TrialData,
-        number: int,
-        shared: FloatArray,
-        local: FloatArray,
-        patch: ModelPatch,
-        response: FloatArray,
-        rates: FloatArray | None,
-    ) -> FloatArray:
-        unknowns = data.unknowns
-        first = unknowns.zeros
-        columns = [
-            (self.response(number, shared, moved(local, first + k), patch)[0] - response) / PARAMETER_STEP
-            for k in range(unknowns.initials)
-        ]
+        columns = [slope(shared, moved(local, first + k)) for k in range(unknowns.initials)]
         if unknowns.time_zero_scale > 0.0:
-            if rates is None:
-                at = first + unknowns.initials
-                rates = (self.response(number, shared, moved(local, at), patch)[0] - response) / (
-                    PARAMETER_STEP * unknowns.time_zero_scale
-                )
-            columns.append(rates * unknowns.time_zero_scale)
+            at, scale = first + unknowns.initials, unknowns.time_zero_scale
+            columns.append(slope(shared, moved(local, at)) if rates is None else rates * scale)
         if len(unknowns.health_rows):
             at = unknowns.size - len(unknowns.health_rows)
             by_entry = np.zeros((len(unknowns.health_rows), *response.shape))
@@ -297,14 +283,15 @@ class Problem:
                 # away from the limits of the loss; rows do not act on each other
                 sign = np.where(there[at + entries] > 0.0, -1.0, 1.0)
                 there[at + entries] += sign * PARAMETER_STEP
-                change = (self.response(number, shared, there, patch)[0] - response) / PARAMETER_STEP
+                change = slope(shared, there)
                 if data.trial.is_dynamic:
                     by_entry[entries] = sign[:, np.newaxis, np.newaxis] * change
                 else:
                     rows = unknowns.health_rows[entries]
                     by_entry[entries, rows] = sign[:, np.newaxis] * change[rows]
             columns.extend(by_entry)
-        return np.stack(columns) if columns else np.zeros((0, *response.shape))
+        shape = (-1, *response.shape)
+        return np.array(parameters).reshape(shape), np.array(columns).reshape(shape)
 
     def derivatives(
         self, number: int, point: Point, parts: Linearisation, candidate: Candidate

@@ -108,7 +108,7 @@ class Screen:
         known = problem.freedom > 0.0
         left = problem.precisions(fit.sums)
         precision = np.where(known, 1.0, left) if record_noise else left
-        blocks, matrix, gradient, _ = eliminated(problem, fit, Candidate(), precision)
+        blocks, matrix, gradient = eliminated(problem, fit, Candidate(), precision)
         self._pieces: list[_Piece] = []
         for block, residual in zip(blocks, fit.residuals, strict=True):
             root = np.sqrt(block.precision)[:, np.newaxis]

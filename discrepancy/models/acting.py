@@ -93,11 +93,6 @@ class Course:
         return found[:-1] - bend * curve[:-1], found[1:] - bend * curve[1:]
 
 
-def acting_force(trial: Trial, gain: float, tare: float) -> FloatArray:
-    """Return (1 + gain) times the recorded force (N,) of a trial, plus the tare where it is not zero [N]."""
-    return (1.0 + gain) * trial.force + tare * (trial.force != 0.0) if gain or tare else trial.force
-
-
 @dataclass(frozen=True, eq=False)
 class FormulaCourse:
     """A load by a formula in time, zero outside of its spans.

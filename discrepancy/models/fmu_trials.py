@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course, acting_force
+from discrepancy.models.acting import Course
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Run, State
@@ -155,7 +155,7 @@ class FmuTrials:
                 f"load_factor in [inputs]; leave it out."
             )
         count = len(trial.force)
-        held, acting = self._held(trial, conditions), acting_force(trial, patch.load.gain, patch.load.tare)
+        held, acting = self._held(trial, conditions), patch.load.changed(trial.force, trial.force)
         loads: list[dict[str, float]] = []
         for row in range(count):
             if flight:

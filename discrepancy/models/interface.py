@@ -243,15 +243,12 @@ NO_PATCH = ModelPatch()
 class Model(ABC):
     """A model that can be patched.
 
-    Parameters
+    Attributes
     ----------
     name : str
         For people.
     parameters : tuple of ModelParameter
         Calibrated parameters.
-
-    Attributes
-    ----------
     patch : ModelPatch
         What is added to every question: a known addition, or an effect that was found.
     follows_windows : bool
@@ -267,9 +264,6 @@ class Model(ABC):
     shows_ports: ClassVar[bool] = False
     _declared: tuple[ModelParameter, ...] | None = None
     _kept: Memory | None = None
-
-    def __init__(self, name: str, parameters: tuple[ModelParameter, ...]) -> None:
-        self.name, self.parameters = name, parameters
 
     # ------------------------------------------------------------ what each model says
 

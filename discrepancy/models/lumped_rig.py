@@ -16,7 +16,6 @@ from discrepancy.models.acting import (
     FormulaCourse,
     Load,
     Shown,
-    acting_force,
     order_of,
 )
 from discrepancy.models.interface import Conditions, Place
@@ -220,8 +219,8 @@ class LumpedRig:
                 values = self.factors.get(item.name, 1.0) * values
                 drives[item.name] = Drive.of(trial.time, values, order_of(item.quantity))
                 continue
-            if (change.gain or change.tare) and item.quantity in (Quantity.FORCE, Quantity.TORQUE):
-                values = (1.0 + change.gain) * values + change.tare * (item.values != 0.0)
+            if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
+                values = change.changed(values, item.values)
             course = Course.of(trial.time, values, item.hold)
             loads.append((self.moved_row(section, change), course))
         reactions = {item.reaction for item in self.description.output}
@@ -334,7 +333,7 @@ class LumpedRig:
     def static_loads(self, trial: Trial, change: LoadChange = UNCHANGED) -> FloatArray:
         """Return the loads (L, n + m) of a static trial."""
         row = self.moved_row(self.input_at(trial.load_place), change)
-        return np.outer(acting_force(trial, change.gain, change.tare), row) + self._constant
+        return np.outer(change.changed(trial.force, trial.force), row) + self._constant
 
     def held(self, trial: Trial) -> FloatArray:
         """Return the displacements (L, n + m) in a static trial, or from which a ring-down is released."""

@@ -70,8 +70,9 @@ class DescribedModel(Model):
     """
 
     def __init__(self, description: ModelDescription, quantities: Mapping[str, Quantity]) -> None:
-        super().__init__(description.name, tuple(item.calibrated for item in description.parameter))
-        self.quantities, self._port_names = quantities, tuple(item.name for item in description.port)
+        self.name, self.quantities = description.name, quantities
+        self.parameters = tuple(item.calibrated for item in description.parameter)
+        self._port_names = tuple(item.name for item in description.port)
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""

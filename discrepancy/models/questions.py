@@ -53,6 +53,12 @@ class LoadChange(NamedTuple):
                 span, chord = span + item.along_span, chord + item.along_chord
         return cls(gain, tare, span, chord)
 
+    def changed(self, values: FloatArray, recorded: FloatArray) -> FloatArray:
+        """Return what acts (N,) of recorded values [N, or N m], the values themselves or with a constant."""
+        if not (self.gain or self.tare):
+            return values
+        return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
+
 
 class SortedPatch(NamedTuple):
     """Structure (or what the model carries itself), internal forces, change of loads, loads at ports."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, acting_force
+from discrepancy.models.acting import Acting, Course
 from discrepancy.models.interface import (
     NO_PATCH,
     Conditions,
@@ -107,7 +107,7 @@ class StructuralModel(Model):
     shows_ports: ClassVar[bool] = True
 
     def __init__(self, name: str, parameters: tuple[ModelParameter, ...]) -> None:
-        super().__init__(name, parameters)
+        self.name, self.parameters = name, parameters
         self._statics = Memory(2048)
 
     # ------------------------------------------------------------ what each structure says
@@ -377,5 +377,4 @@ def _amounts(trial: Trial, loads: ModelPatch) -> FloatArray:
     """Return the factors (N, k) of the unit loads of a trial: load factor and its square, or the force."""
     if trial.kind is TrialKind.FLIGHT:
         return np.column_stack((trial.load_factor, trial.load_factor**2))
-    gain, tare, *_ = LoadChange.of(loads)
-    return acting_force(trial, gain, tare)[:, None]
+    return LoadChange.of(loads).changed(trial.force, trial.force)[:, None]

@@ -15,7 +15,6 @@ from calibration.errors import CalibrationError
 from calibration.result.file import load_calibration
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
-from discrepancy.models.interface import Model
 from discrepancy.models.wing import WingModel
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
@@ -145,7 +144,7 @@ def _campaign(
     )
 
 
-def run_model(folder: Path | str) -> Model:
+def run_model(folder: Path | str) -> WingModel:
     """Return the model that the twin of a run believed: the wing of its design or calibration, patched.
 
     The whole patch of the twin's model is in it, sensors too: they act in
@@ -160,7 +159,6 @@ def run_model(folder: Path | str) -> Model:
     """
     folder = Path(folder)
     _config(folder)
-    model: Model
     if is_calibrated_wing(folder):
         model = WingModel.of_calibration(folder / CALIBRATION_FILE)
     elif (folder / DESIGN_FILE).is_file():

@@ -18,7 +18,15 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.models.interface import Conditions, Model, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import (
+    Conditions,
+    Model,
+    ModelParameter,
+    Outputs,
+    PortScale,
+    Response,
+    Scales,
+)
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch, Primitive, RunOffset, SensorDrift
@@ -59,13 +67,7 @@ class ClosedForm(Model):
         w = 2.0 * np.pi * float(FREQUENCIES[0])
         return Scales(1.0, 1.0, 1.0, w, 10.0, 1.0, 1.0, 100.0, {"y": PortScale(1.0, 1.0, w)})
 
-    def _respond(
-        self,
-        trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
-        patch: ModelPatch,
-        conditions: Conditions,
-    ) -> Response:
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         columns = [OUTPUTS.index(output) for output, _ in outputs]
         theta = conditions.parameters
         if not trial.is_dynamic:

@@ -9,7 +9,15 @@ import pytest
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Conditions, Model, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import (
+    Conditions,
+    Model,
+    ModelParameter,
+    Outputs,
+    PortScale,
+    Response,
+    Scales,
+)
 from fe.runtime.patch import ModelPatch, Primitive
 
 # Gauges of a square patch of skin in plane stress: strain along, across, shear per metre of displacement.
@@ -46,13 +54,7 @@ class Oscillator(Model):
             1.0, self.stiffness, self.mass, w, 1.0, 1.0, 1.0, 1.0, {"x": PortScale(0.01, self.stiffness, w)}
         )
 
-    def _respond(
-        self,
-        trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
-        patch: ModelPatch,
-        conditions: Conditions,
-    ) -> Response:
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         stiffness = self.stiffness * float(conditions.parameters[0])
         x, v = self._motion(trial, stiffness, conditions)
         scale = np.zeros((3, len(outputs)))

@@ -18,7 +18,15 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Quantity, Trial
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.model_choice import ModelChoice, ModelKind, choose_model
-from discrepancy.models.interface import Conditions, Model, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import (
+    Conditions,
+    Model,
+    ModelParameter,
+    Outputs,
+    PortScale,
+    Response,
+    Scales,
+)
 from discrepancy.parameters.calibration import calibrate_parameters
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.patch import ModelPatch, Primitive
@@ -47,13 +55,7 @@ class Curve(Model):
         ports: Mapping[str, PortScale] = {}
         return Scales(1.0, 1.0, 1.0, 1.0, 60.0, 0.0, 1.0, 1.0, ports)
 
-    def _respond(
-        self,
-        trial: Trial,
-        outputs: tuple[tuple[str, Quantity], ...],
-        patch: ModelPatch,
-        conditions: Conditions,
-    ) -> Response:
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         values = self.law(trial.force, conditions.parameters)
         return Response(np.tile(values[:, np.newaxis], (1, len(outputs))))
 
