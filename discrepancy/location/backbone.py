@@ -244,5 +244,5 @@ def at_amplitude(curves: Sequence[Backbone], amplitude: float, factor: float = 2
     found = table.mean(axis=0)
     if len(table) > 1:
         found[1::2] = table[:, ::2].std(axis=0, ddof=1) / sqrt(len(table))
-    frequency, its_error, ratio, ratio_error = found.tolist()
-    return BackboneValue(amplitude, frequency, its_error, ratio, ratio_error, len(table))
+    frequency, frequency_error, ratio, ratio_error = found.tolist()
+    return BackboneValue(amplitude, frequency, frequency_error, ratio, ratio_error, len(table))
