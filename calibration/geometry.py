@@ -1,8 +1,9 @@
 """Calibration step 1: the planform of the real wing, and the design brought to it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from calibration.result.record import ParameterPrior, Reading
 from calibration.static.experiments import HALF_WIDTH_95
@@ -23,9 +24,6 @@ READING_UNCERTAINTY = 0.2e-3
 GEOMETRY_FILE = Path("step1") / "geometry_data.csv"
 """Where the authors' calibration folder keeps the lengths of step 1."""
 
-LENGTH_NAMES = ("semi_span", "root_chord", "tip_chord")
-"""The lengths, in the order of `fe.runtime.state.Geometry`."""
-
 PUBLISHED_NAMES = {"length": "semi_span", "chord_{root}": "root_chord", "chord_{tip}": "tip_chord"}
 """The names that the published file gives to the lengths, beside those of `fe.runtime.state.Geometry`."""
 
@@ -40,7 +38,7 @@ class MeasuredLength:
     Attributes
     ----------
     name : str
-        One of `LENGTH_NAMES`.
+        A field of `Lengths`.
     designed, measured : float
         The length on the drawing and on the wing [m].
     tolerance, reading_uncertainty : float
@@ -95,40 +93,28 @@ class MeasuredLength:
         return GaussianPrior(mean, (prior + reading) ** -0.5)
 
 
-@dataclass(frozen=True)
-class GeometryCalibration:
-    """Posterior of the planform g, Kapteyn et al. 2021, Table 1.
-
-    Attributes
-    ----------
-    semi_span, root_chord, tip_chord : MeasuredLength
-        The three lengths; their errors are independent.
-    """
+class Lengths(NamedTuple):
+    """The measured lengths of a planform g, as `fe.runtime.state.Geometry` has them; errors independent."""
 
     semi_span: MeasuredLength
     root_chord: MeasuredLength
     tip_chord: MeasuredLength
 
-    @property
-    def lengths(self) -> tuple[MeasuredLength, MeasuredLength, MeasuredLength]:
-        """The three lengths in the order of `LENGTH_NAMES`."""
-        return self.semi_span, self.root_chord, self.tip_chord
 
-
-def published_lengths() -> GeometryCalibration:
+def published_lengths() -> Lengths:
     """Return the lengths of the real wing.
 
     Source: M. G. Kapteyn, UAV-Experimental-Calibration, `step1/geometry_data.csv` (BSD 3-clause);
     Kapteyn et al. 2021, Table 1.
     """
-    return GeometryCalibration(
+    return Lengths(
         semi_span=MeasuredLength("semi_span", 1.8288, 1.8280),
         root_chord=MeasuredLength("root_chord", 0.43561, 0.4330),
         tip_chord=MeasuredLength("tip_chord", 0.261112, 0.2600),
     )
 
 
-def read_lengths(path: Path) -> GeometryCalibration:
+def read_lengths(path: Path) -> Lengths:
     """Read the lengths of step 1 from the authors' calibration folder, or from one CSV file.
 
     Parameters
@@ -168,18 +154,18 @@ def read_lengths(path: Path) -> GeometryCalibration:
                     "give it in mm."
                 )
         found[name] = MeasuredLength(name, *(value * 1e-3 for value in millimetres))
-    return GeometryCalibration(**found)
+    return Lengths(**found)
 
 
-def tailored_geometry(lengths: GeometryCalibration) -> Geometry:
+def tailored_geometry(lengths: Lengths) -> Geometry:
     """Return the posterior means, rounded to what the measurement leaves uncertain, 0.1 mm [m].
 
     The paper keeps the means and drops their standard deviation, which is 0.1 mm.
     """
-    return Geometry(*(round(length.posterior.mean, 4) for length in lengths.lengths))
+    return Geometry(*(round(length.posterior.mean, 4) for length in lengths))
 
 
-def tailored_design(design: WingDesign, lengths: GeometryCalibration) -> WingDesign:
+def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
     """Return the design with the measured planform; the mesh follows.
 
     The planform alone is replaced. What the design places by a fraction moves with it: ribs, point masses
@@ -194,8 +180,7 @@ def tailored_design(design: WingDesign, lengths: GeometryCalibration) -> WingDes
     InvalidDesignError
         If the tailored wing cannot be built; the sentence names the place.
     """
-    geometry = tailored_geometry(lengths)
-    planform = {name: getattr(geometry, name) for name in LENGTH_NAMES}
+    planform = asdict(tailored_geometry(lengths))
     for name, value in planform.items():
         drawn = getattr(design.planform, name)
         if abs(value / drawn - 1.0) > _LARGEST_DEVIATION:

@@ -82,18 +82,18 @@ def _arranged(content: Mapping[str, Any]) -> PublishedStrains:
     first = observations[str(levels[0][0])][str(levels[1][0])][controls[0]]
     draws = [key for key in first if key != "mean"]
     gauges = len(first["mean"])
-    table = np.empty((len(draws) + 1, len(levels[0]), len(levels[1]), len(controls), gauges))
-    for i, z1 in enumerate(levels[0]):
-        for j, z2 in enumerate(levels[1]):
-            for u, control in enumerate(controls):
-                entry = observations[str(z1)][str(z2)][control]
-                for e, draw in enumerate(["mean", *draws]):
-                    row = np.asarray(entry[draw], dtype=np.float64)
-                    if row.shape != (gauges,) or not np.all(np.isfinite(row)):
-                        raise ValueError(
-                            f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauges} finite strains"
-                        )
-                    table[e, i, j, u] = row
+    rows = [
+        (draw, z1, z2, control, observations[str(z1)][str(z2)][control][draw])
+        for draw in ("mean", *draws)
+        for z1 in levels[0]
+        for z2 in levels[1]
+        for control in controls
+    ]
+    for draw, z1, z2, control, row in rows:
+        if np.shape(row) != (gauges,) or not np.all(np.isfinite(np.asarray(row, dtype=np.float64))):
+            raise ValueError(f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauges} finite strains")
+    shape = (len(draws) + 1, len(levels[0]), len(levels[1]), len(controls), gauges)
+    table = np.array([row for *_, row in rows], dtype=np.float64).reshape(shape)
     table *= MICROSTRAIN
     table.setflags(write=False)
     one, two = (tuple(float(level) * PERCENT for level in given) for given in levels)

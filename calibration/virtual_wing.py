@@ -29,7 +29,7 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState, Geometry
 
 from .errors import ExperimentDataError
-from .geometry import READING_UNCERTAINTY, GeometryCalibration, MeasuredLength, published_lengths
+from .geometry import READING_UNCERTAINTY, Lengths, MeasuredLength, published_lengths
 
 FloatArray = NDArray[np.float64]
 
@@ -262,7 +262,7 @@ def measure_lengths(
     *,
     designed: Geometry | None = None,
     reading_uncertainty: float = READING_UNCERTAINTY,
-) -> GeometryCalibration:
+) -> Lengths:
     """Measure semi-span and chords of a wing.
 
     Parameters
@@ -278,7 +278,7 @@ def measure_lengths(
     """
     generator = np.random.default_rng(child_seed(seed, _PURPOSES["geometry"]))
     measured = {}
-    for drawn in published_lengths().lengths:
+    for drawn in published_lengths():
         error = float(generator.normal(0.0, reading_uncertainty / HALF_WIDTH_95))
         length = getattr(geometry, drawn.name) + error
         measured[drawn.name] = MeasuredLength(
@@ -287,7 +287,7 @@ def measure_lengths(
             length,
             reading_uncertainty=reading_uncertainty,
         )
-    return GeometryCalibration(**measured)
+    return Lengths(**measured)
 
 
 def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> Reading:

@@ -94,16 +94,14 @@ def infer(
     density = _Density(priors, compare, generator)
     centre: FloatArray = np.zeros(len(priors))
     factor: FloatArray = np.eye(len(priors))
-    good = 0
+    good, least = 0, _TEMPERED_SHARE * _ADAPTATION_COUNT
     for _ in range(_MOST_ROUNDS):
         points, log_weight = density.weighted(centre, factor, _ADAPTATION_COUNT, generator)
-        if np.count_nonzero(np.isfinite(log_weight)) <= _TEMPERED_SHARE * len(points):
+        if np.count_nonzero(np.isfinite(log_weight)) <= least:
             factor = 0.5 * factor  # most draws lie outside the range
             continue
         weight, tempered = _normalised(log_weight), False
-        while _effective(weight) < _TEMPERED_SHARE * len(
-            points
-        ):  # they say too little: begin closer next time
+        while _effective(weight) < least:  # they say too little: the next round begins closer
             log_weight, tempered = 0.5 * log_weight, True
             weight = _normalised(log_weight)
         centre = weight @ points
@@ -150,6 +148,7 @@ class _Density:
         self._mean, self._deviation, low, high = np.array(
             [(prior.mean, prior.deviation, prior.low, prior.high) for prior in priors]
         ).T
+        self._ends = low, high
         self._low, self._high = (low - self._mean) / self._deviation, (high - self._mean) / self._deviation
         starts = [np.zeros(len(priors)), *generator.standard_normal((_STARTS - 1, len(priors)))]
         width = self._high - self._low
@@ -166,7 +165,11 @@ class _Density:
 
     def values(self, points: FloatArray) -> FloatArray:
         """Return the parameters of points z (N, P) [their units]."""
-        return np.asarray(self._mean + self._deviation * (self._optimum + points @ self._stretch.T))
+        return self._at(self._optimum + points @ self._stretch.T)
+
+    def _at(self, u: FloatArray) -> FloatArray:
+        # within the range to the last digit, whatever rounding does
+        return np.asarray(np.clip(self._mean + self._deviation * u, *self._ends))
 
     def weighted(
         self, centre: FloatArray, factor: FloatArray, count: int, generator: np.random.Generator
@@ -186,14 +189,14 @@ class _Density:
         inside = np.all((u >= self._low) & (u <= self._high), axis=1)
         value = np.full(len(u), -np.inf)
         if inside.any():
-            difference, deviation = self._compare(self._mean + self._deviation * u[inside])
+            difference, deviation = self._compare(self._at(u[inside]))
             terms = -0.5 * (difference / deviation) ** 2 - np.log(deviation) - 0.5 * math.log(2.0 * math.pi)
             prior = -0.5 * np.sum(u[inside] ** 2, axis=1) - 0.5 * u.shape[1] * math.log(2.0 * math.pi)
             value[inside] = prior + terms.sum(axis=1)
         return value
 
     def _residuals(self, u: FloatArray) -> FloatArray:
-        difference, deviation = self._compare(self._mean + self._deviation * u)
+        difference, deviation = self._compare(self._at(u))
         return np.hstack([difference / deviation, u])
 
     def _jacobian(self, u: FloatArray) -> FloatArray:

@@ -137,22 +137,16 @@ def log_likelihood(
         if zero_offset_standard_deviation:
             raise PosteriorError("the ratio of load and displacement has no likelihood with a zero offset.")
         return np.asarray(log_ratio_density(curve, data, factor).sum(axis=0))
+    total = pair_log_likelihoods(curve, data, factor).sum(axis=0)
     k = curve.stiffness(factor)
     variance = residual_variance(data, k)
     shared = (k * zero_offset_standard_deviation) ** 2
-    total = np.zeros(factor.shape)
-    for index in data.run_indices:
-        of_run = data.run == index
-        count = int(of_run.sum())
-        residual = data.load[of_run, None] - k * data.displacement[of_run, None]
-        sum_of_squares = (residual**2).sum(axis=0)
-        correction = shared * residual.sum(axis=0) ** 2 / (variance + count * shared)  # Sherman and Morrison
-        log_determinant = (count - 1) * np.log(variance) + np.log(variance + count * shared)
-        log_determinant += count * math.log(2.0 * math.pi)
-        total -= 0.5 * ((sum_of_squares - correction) / variance + log_determinant)
-    if measure == "load":
-        total += data.count * np.log(k)
-    return total
+    for run in data.run_indices:
+        of_run = data.run == run
+        whole = variance + of_run.sum() * shared  # Sherman and Morrison
+        residual = data.load[of_run].sum() - k * data.displacement[of_run].sum()
+        total += 0.5 * (shared * residual**2 / (variance * whole) - np.log(whole / variance))
+    return np.asarray(total + data.count * np.log(k) if measure == "load" else total)
 
 
 def exact_posterior(
@@ -191,11 +185,7 @@ def exact_posterior(
     for _ in range(60):
         grid = np.linspace(lower, upper, grid_size)
         log_density = prior.log_density(grid) + log_likelihood(
-            curve,
-            data,
-            grid,
-            measure=measure,
-            zero_offset_standard_deviation=zero_offset_standard_deviation,
+            curve, data, grid, measure=measure, zero_offset_standard_deviation=zero_offset_standard_deviation
         )
         posterior = ScalarPosterior(grid, np.exp(log_density - log_density.max()))
         spacing = (upper - lower) / (grid_size - 1)

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from calibration.geometry import GeometryCalibration, tailored_design
+from calibration.geometry import Lengths, tailored_design
 from calibration.joint.posterior import joint_posterior
 from calibration.joint.prior import wing_priors
 from calibration.joint.wing_table import QUANTITIES, tabulate_wing
@@ -139,7 +139,7 @@ def calibrate_wing(
         paper = fit_masses(table.frequency, factors, table.validity, lab.readings)
     with progress.stage("Step 3: masses and damping, joint posterior"):
         joint = joint_posterior(table, lab.pairs, lab.readings, seed=seed, count=SAMPLE_COUNT)
-    priors = (*wing_priors(model.validity), *(length.prior for length in lab.lengths.lengths))
+    priors = (*wing_priors(model.validity), *(length.prior for length in lab.lengths))
     prior = prior_samples(priors, SAMPLE_COUNT, seed)
     prior = np.column_stack([prior, table.outputs(prior)])
 
@@ -198,13 +198,11 @@ def _fits(static: StaticCalibration, factor: float) -> tuple[ChannelFit, ...]:
     )  # fmt: skip
 
 
-def _lengths(lengths: GeometryCalibration, count: int, seed: int) -> Float:
+def _lengths(lengths: Lengths, count: int, seed: int) -> Float:
     """Return samples (count, 3) of the posterior of the lengths [m]."""
     generator = np.random.default_rng(child_seed(seed, _LENGTHS_PURPOSE))
     strata = (np.arange(count) + generator.random(count)) / count
-    return np.column_stack(
-        [length.posterior.quantile(generator.permutation(strata)) for length in lengths.lengths]
-    )
+    return np.column_stack([length.posterior.quantile(generator.permutation(strata)) for length in lengths])
 
 
 def _readings(lab: LabData) -> tuple[Reading, ...]:
@@ -215,7 +213,7 @@ def _readings(lab: LabData) -> tuple[Reading, ...]:
     stiffness = float(pairs.load @ pairs.displacement) / square
     scatter = np.hypot(pairs.load_standard_deviation, stiffness * pairs.displacement_standard_deviation)
     load_test = Reading("tip_stiffness", "load test", stiffness, float(scatter / np.sqrt(square)))
-    return *(length.reading for length in lab.lengths.lengths), load_test, *lab.readings
+    return *(length.reading for length in lab.lengths), load_test, *lab.readings
 
 
 def _measured(pairs: LoadDisplacementData) -> xr.Dataset:

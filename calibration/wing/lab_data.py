@@ -1,6 +1,6 @@
 """What a lab folder holds for the three steps of the calibration, and what is published instead."""
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -9,7 +9,7 @@ from calibration.dynamics.records import STEP_FOLDER, find_records, read_records
 from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import RingDownTrials, fit_trials
 from calibration.errors import ExperimentFileError
-from calibration.geometry import GEOMETRY_FILE, GeometryCalibration, published_lengths, read_lengths
+from calibration.geometry import GEOMETRY_FILE, Lengths, published_lengths, read_lengths
 from calibration.joint.measurement import PUBLISHED_MODES, measured_modes
 from calibration.joint.prior import weighed
 from calibration.lab_folder import lab_place
@@ -43,7 +43,7 @@ class LabData:
 
     Attributes
     ----------
-    lengths : GeometryCalibration
+    lengths : Lengths
         Step 1.
     pairs : LoadDisplacementData
         Step 2.
@@ -59,7 +59,7 @@ class LabData:
         Name of an input -> SHA-256 of its content.
     """
 
-    lengths: GeometryCalibration
+    lengths: Lengths
     pairs: LoadDisplacementData
     readings: tuple[Reading, ...]
     trials: RingDownTrials | None
@@ -165,10 +165,5 @@ def _fitted(path: Path, frequencies: Frequencies) -> RingDownTrials:
     return refine_by_extremes(trials) if all(record.lowest is not None for record in records) else trials
 
 
-def _hash_of_lengths(lengths: GeometryCalibration) -> str:
-    return hash_record(
-        [
-            [item.name, item.designed, item.measured, item.tolerance, item.reading_uncertainty]
-            for item in lengths.lengths
-        ]
-    )
+def _hash_of_lengths(lengths: Lengths) -> str:
+    return hash_record([[*astuple(item)] for item in lengths])

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.dynamics.records import STEP_FOLDER, RingDownRecord
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, GeometryCalibration
+from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, Lengths
 from calibration.joint.prior import weighed
 from calibration.lab_folder import lab_table
 from calibration.result.record import Reading
@@ -25,7 +25,7 @@ _WEIGHED_COLUMNS = ("mass", "standard_deviation")
 def write_lab_folder(
     folder: Path,
     *,
-    lengths: GeometryCalibration,
+    lengths: Lengths,
     load_test: LoadDisplacementData,
     records: Sequence[RingDownRecord],
     total_mass: Reading | None = None,
@@ -36,7 +36,7 @@ def write_lab_folder(
     ----------
     folder : Path
         Where `step1`, `step2` and `step3` are made.
-    lengths : GeometryCalibration
+    lengths : Lengths
         Lengths, to `step1/geometry_data.csv` [mm].
     load_test : LoadDisplacementData
         Pairs in the order of their runs, to `step2/load_displacement_measurements.csv` [N], [mm].
@@ -57,11 +57,10 @@ def write_lab_folder(
         If a file cannot be written.
     """
     folder = Path(folder)
-    measured = [getattr(lengths, name) for name in PUBLISHED_NAMES.values()]
     columns = [
         [*PUBLISHED_NAMES],
-        [f"{length.designed * 1e3:.10g}" for length in measured],
-        [f"{length.measured * 1e3:.10g}" for length in measured],
+        [f"{length.designed * 1e3:.10g}" for length in lengths],
+        [f"{length.measured * 1e3:.10g}" for length in lengths],
     ]
     text = table_text(("parameter", "designed", "manufactured"), columns)
     files = [atomic_write_text(folder / GEOMETRY_FILE, text)]

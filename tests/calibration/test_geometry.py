@@ -18,7 +18,7 @@ REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference" / "uav_exp
 
 def test_the_published_lengths() -> None:
     result = published_lengths()
-    for length, measured in zip(result.lengths, (1.828, 0.433, 0.260), strict=True):
+    for length, measured in zip(result, (1.828, 0.433, 0.260), strict=True):
         assert length.prior.deviation == pytest.approx(2.54e-3 / 1.96)
         # The tolerance is 12.7 times the reading's: the posterior is the measurement within 0.02 mm.
         assert length.posterior.mean == pytest.approx(measured, abs=0.02e-3)
@@ -58,7 +58,7 @@ def test_posterior_lies_between_and_is_narrower(
 def test_the_published_file_gives_the_published_figures() -> None:
     if not REFERENCE.is_dir():
         pytest.skip("the reference data are not beside the project")
-    for read, published in zip(read_lengths(REFERENCE).lengths, published_lengths().lengths, strict=True):
+    for read, published in zip(read_lengths(REFERENCE), published_lengths(), strict=True):
         assert read.designed == pytest.approx(published.designed, rel=1e-12)
         assert read.measured == pytest.approx(published.measured, rel=1e-12)
 
@@ -73,7 +73,7 @@ chord_{tip},261.112,260.0
 def test_a_file_of_its_own(tmp_path: Path) -> None:
     file = tmp_path / "lengths.csv"
     file.write_text(GOOD, encoding="utf-8")
-    for read, published in zip(read_lengths(file).lengths, published_lengths().lengths, strict=True):
+    for read, published in zip(read_lengths(file), published_lengths(), strict=True):
         assert read.posterior.mean == pytest.approx(published.posterior.mean, rel=1e-12)
 
 

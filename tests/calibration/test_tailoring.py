@@ -8,7 +8,7 @@ import pytest
 
 from calibration.errors import ExperimentDataError
 from calibration.geometry import (
-    GeometryCalibration,
+    Lengths,
     MeasuredLength,
     published_lengths,
     tailored_design,
@@ -19,11 +19,11 @@ from fe.wing.design import WingDesign, load_design
 from fe.wing.mesh import build_mesh
 
 
-def lengths(**measured: float) -> GeometryCalibration:
+def lengths(**measured: float) -> Lengths:
     """The published lengths, some measured otherwise [m]."""
     published = published_lengths()
     changes = {name: replace(getattr(published, name), measured=value) for name, value in measured.items()}
-    return replace(published, **changes)  # type: ignore[arg-type]
+    return published._replace(**changes)  # type: ignore[arg-type]
 
 
 def test_the_published_lengths_are_the_shipped_design() -> None:
