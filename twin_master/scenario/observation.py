@@ -189,8 +189,7 @@ class ObservationSection(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        for key, value in (("unit", self.unit), ("standard_deviation", self.standard_deviation)):
-            check_one_or_each(f"observation.{key}", value, self.count)
-        if self.titles:
-            check_one_or_each("observation.titles", self.titles, self.count)
+        for key in ("unit", "standard_deviation", "titles"):
+            check_one_or_each(f"observation.{key}", getattr(self, key) or None, self.count)
+        check_one_or_each("observation.model_error_percent", self.model_error, self.count)
         return self

@@ -347,7 +347,6 @@ class Scenario(Section):
             raise ValueError("`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`")
         for gain in self.truth.gains:
             check_known(gain.state, states, "truth.gains.state", "state")
-        self._check_model_error()
         self._check_sensors()
         self._check_modes()
         for fault in self.truth.sensor_faults:
@@ -376,14 +375,6 @@ class Scenario(Section):
             raise ValueError(
                 "`planner.inspections_a_turn` is for assets that fly side by side, and twins with `learning`"
                 " or `notice` fly alone: leave one of them out"
-            )
-
-    def _check_model_error(self) -> None:
-        error = self.observation.model_error
-        if isinstance(error, tuple) and len(error) != self.observation.count:
-            raise ValueError(
-                f"`observation.model_error_percent` must be one number or one for each of the "
-                f"{self.observation.count} sensors, and {len(error)} came"
             )
 
     def _check_modes(self) -> None:

@@ -68,20 +68,25 @@ class Transition(Section):
                     )
 
 
-class Gain(Section):
+class Span(Section):
+    """Steps of a mission, the last one included."""
+
+    first_step: Step
+    last_step: Step | None = None
+
+    @model_validator(mode="after")
+    def _check_steps(self) -> Self:
+        if self.last_step is not None and self.last_step < self.first_step:
+            raise ValueError(f"`last_step` {self.last_step} lies before `first_step` {self.first_step}")
+        return self
+
+
+class Gain(Span):
     """What one factor of the true state gains at each step from `first_step` to `last_step`."""
 
     units: ClassVar[Mapping[str, str]] = {"gain": "percent"}
     state: Name
-    first_step: Step
-    last_step: Step | None = None
     gain: Number
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.last_step is not None and self.last_step < self.first_step:
-            raise ValueError(f"`last_step` {self.last_step} lies before `first_step` {self.first_step}")
-        return self
 
 
 class Noise(Section):
@@ -92,22 +97,18 @@ class Noise(Section):
     """One for all sensors or one for each."""
 
 
-class SensorFault(Section):
+class SensorFault(Span):
     """A fault of some sensors (numbered from 1) between two steps, the last one included."""
 
     units: ClassVar[Mapping[str, str]] = {"rate": "microstrain_per_step"}
     kind: Literal["dropout", "drift"]
     sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)]
-    first_step: Step
-    last_step: Step | None = None
     rate: Number | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if (self.kind == "drift") != (self.rate is not None):
             raise ValueError("a drift needs `rate_microstrain_per_step`, and a dropout has none")
-        if self.last_step is not None and self.last_step < self.first_step:
-            raise ValueError(f"`last_step` {self.last_step} lies before `first_step` {self.first_step}")
         return self
 
 

@@ -69,32 +69,10 @@ class LearntQuantity:
         return {"quantity": self.name, "title": self.title, "unit": self.unit, "of": of}
 
 
-def learnt_quantities(
-    scenario: Scenario,
-    names: Sequence[str],
-    values: Float,
-    prior: Mapping[str, Learnt],
-    units: Mapping[str, str],
-    *,
-    simulated: bool,
-) -> tuple[LearntQuantity, ...]:
-    """Return what was learnt in T turns.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        What was flown.
-    names : (N,)
-        As the estimator gives them: `young_modulus_factor`, or `noise_scale[3]` of sensor 3.
-    values : (T, N, 4)
-        The figures of `MOMENTS`.
-    prior : dict of str to Learnt
-        Before the first turn, by the same names.
-    units : dict of str to str
-        Units of quantities that are not dimensionless.
-    simulated : bool
-        Whether the scenario tells what really happened.
-    """
+def _learnt(result: "MissionResult", prior: Mapping[str, Learnt]) -> tuple[LearntQuantity, ...]:
+    """Return what was learnt; names are as the estimator gives them, such as `noise_scale[3]` of sensor 3."""
+    scenario, names, values = result.scenario, result.flight.learnt_names, result.flight.learnt
+    units = {scenario.calibration.parameter: result.parameter_unit, "gauge_offset": result.observation_unit}
     parts: dict[str, list[tuple[int | None, int]]] = {}
     for place, name in enumerate(names):
         match = _OF_A_SENSOR.fullmatch(name)
@@ -114,7 +92,7 @@ def learnt_quantities(
             whole, first = np.full((len(values), count, 4), np.nan), np.full((count, 4), np.nan)
             whole[:, sensors], first[sensors] = course, before
             course, before = whole, first
-        truth = _truth(scenario, name) if simulated else None
+        truth = None if result.truth is None else _truth(scenario, name)
         title = _TITLES.get(name, parameter_title(name))
         found.append(LearntQuantity(name, title, units.get(name, "1"), course, before, truth))
     return tuple(found)
@@ -239,13 +217,4 @@ class MissionResult:
     @cached_property
     def learnt(self) -> tuple[LearntQuantity, ...]:
         """What was learnt; empty where nothing is."""
-        if self.learning is None:
-            return ()
-        return learnt_quantities(
-            self.scenario,
-            self.flight.learnt_names,
-            self.flight.learnt,
-            self.learning.prior,
-            {self.scenario.calibration.parameter: self.parameter_unit, "gauge_offset": self.observation_unit},
-            simulated=self.truth is not None,
-        )
+        return () if self.learning is None else _learnt(self, self.learning.prior)
