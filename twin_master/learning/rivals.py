@@ -100,8 +100,9 @@ def weigh_gauges(
     log_likelihood are of the model. belief (G K, N), squares (G, K) and sums are brought up to date;
     returned is the log evidence (G, K).
     """
-    belief[belief < NEGLIGIBLE_RIVAL] = 0.0
-    rival, place = np.nonzero(belief)
+    held = belief >= NEGLIGIBLE_RIVAL
+    belief[~held] = 0.0
+    rival, place = np.nonzero(held)
     g, k = np.divmod(rival, len(gains))
     left, unknown = shown.degrees + squares, 1.0 / (1.0 + sums[..., 0])
     fitted = np.clip(unknown * sums[..., 1], -1.0, 1.0)
@@ -144,7 +145,7 @@ def weigh_none(
     their spread (West and Harrison 1997, section 4.6).
     """
     belief[belief < NEGLIGIBLE_RIVAL] = 0.0
-    place = np.flatnonzero(belief)
+    place = np.flatnonzero(belief > 0.0)
     if not place.size:
         return -np.inf
     free, plain, cc, cx, squares = statistics.T.copy()

@@ -297,11 +297,18 @@ def predict(
             f"expected a control index between 0 and {controls - 1} and a horizon of 0 or more steps, "
             f"got {control_index} and {horizon}"
         )
-    predicted = np.empty((horizon, size))
+    predicted, transition = np.empty((horizon, size)), model.transition
     now: Float = belief
+    closed_loop = None if transition.is_product else np.einsum("su,usn->sn", policy, transition.matrix)
     for h in range(horizon):
-        flows = [(control_index, now)] if h == 0 else list(enumerate((now[:, None] * policy).T))
-        now = predicted[h] = np.sum([model.transition.forward(u, flow) for u, flow in flows], axis=0)
+        if h == 0:
+            now = transition.forward(control_index, now)
+        elif closed_loop is not None:
+            now = now @ closed_loop
+        else:
+            flows = enumerate((now[:, None] * policy).T)
+            now = np.sum([transition.forward(u, flow) for u, flow in flows], axis=0)
+        predicted[h] = now
     joint = predicted[:, :, None] * policy
     return Predicted(predicted=predicted, control_probability=joint.sum(axis=1), joint=joint)
 

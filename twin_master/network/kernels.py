@@ -64,16 +64,15 @@ def _move_one(lists: Lists, control: int, before: Float, after: Float) -> None:
             power[:] = NOTHING
             for k in range(start[row], start[row + 1]):
                 share, share_power = probability[k], probability_power[k]
-                value = from_value[source[k] * rest : (source[k] + 1) * rest]
-                value_power = from_power[source[k] * rest : (source[k] + 1) * rest]
+                first = source[k] * rest
                 for i in range(rest):
                     # What is two steps below the other is 2^-512 of it at most.
-                    its = value_power[i] + share_power
+                    its = from_power[first + i] + share_power
                     largest = max(power[i], its)
                     below, its_below = largest - power[i], largest - its
                     weight = 1.0 if below == 0.0 else (STEP if below == 1.0 else 0.0)
                     its_weight = 1.0 if its_below == 0.0 else (STEP if its_below == 1.0 else 0.0)
-                    total[i] = total[i] * weight + value[i] * its_weight * share
+                    total[i] = total[i] * weight + from_value[first + i] * its_weight * share
                     power[i] = largest
             for i in range(rest):
                 if 0.0 < total[i] < LEAST:

@@ -129,9 +129,10 @@ def _checked(
 
 def _action_value(transition: TransitionModel, reward: Float, discount: Float, value: Float) -> Float:
     """Return the reward of each control first and the value afterwards: (S, U)."""
+    if not transition.is_product:
+        return np.asarray(reward + discount * (transition.matrix @ value).T)
     later = [transition.expected(control, value) for control in range(reward.shape[1])]
-    result: Float = reward + discount * np.stack(later, axis=1)
-    return result
+    return np.asarray(reward + discount * np.stack(later, axis=1))
 
 
 def value_iteration(

@@ -289,10 +289,10 @@ class GaussianSensorModel(QuantityModel):
         distance = np.where(seen, observation - value, 0.0).clip(-LARGEST, LARGEST)
         residual = distance * self._inverse_deviation[control_index] * root
         inverse = np.linalg.inv(np.eye(scaled.shape[-1]) + scaled.swapaxes(1, 2) @ scaled)
-        place = np.einsum("sfh,sgh,esg->esf", inverse, scaled, residual, optimize=True)
-        moved = np.einsum("sgf,esf->esg", self.interval[:, control_index], place, optimize=True)
-        left = 1.0 - np.einsum("sgf,sfh,sgh->sg", scaled, inverse, scaled, optimize=True)
-        left = left.clip(LEAST_LEFT)
+        weight = inverse @ scaled.swapaxes(1, 2)  # (S, F, G)
+        place = (weight @ residual[..., None])[..., 0]
+        moved = (self.interval[:, control_index] @ place[..., None])[..., 0]
+        left = (1.0 - np.einsum("sgf,sfg->sg", scaled, weight)).clip(LEAST_LEFT)
         return Nearest(
             value=value + moved,
             alone=value + (distance - (distance - moved) / left),
