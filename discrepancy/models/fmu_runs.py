@@ -98,8 +98,8 @@ class FmuRuns:
     input_factors : dict of str to float
         By which an `[[input]]` of the description is multiplied, by the FMU's name: revolutions in a minute
         stand for an angular velocity and have no unit that converts to rad/s.
-    run_count, step_count : int
-        What has been asked of the FMU so far.
+    step_count : int
+        Steps that have been asked of the FMU so far.
 
     Raises
     ------
@@ -112,7 +112,7 @@ class FmuRuns:
         self._path = folder / description.fmu
         self._assets = Memory(MOST_INSTANCES, end=FmiAsset.close)
         self._kept = Memory(KEPT_BYTES, lambda found: found.nbytes)
-        self.run_count = self.step_count = 0
+        self.step_count = 0
         with self._refusals():
             file = binding_file(description, folder)
             self._base = None if file is None else load_binding(file)
@@ -290,7 +290,6 @@ class FmuRuns:
         ModelError
             If the FMU refuses, or does not come to rest.
         """
-        self.run_count += 1
         with self._refusals():
             asset = self.open(step)
             asset.reset(parameters, load=inputs or None)
