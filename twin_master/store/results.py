@@ -205,7 +205,8 @@ def _predicted(result: MissionResult, made: _Groups) -> Group:
         expected = _expected(result, predicted, None, flown=False)
     else:
         expected = learns.predicted(flight.carried, predicted.shape[1])
-    controls = {"control_probability": predicted @ result.knowledge.plan.policy}
+    joint = predicted[..., None] * result.knowledge.plan.policy
+    controls = {"control_probability": joint.sum(axis=-2)}
     return made.group(
         "predicted",
         _belief(result, predicted, expected) + _plain(controls),
