@@ -23,14 +23,14 @@ def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width:
     headings : sequence of str
         One for each column.
     rows : iterable of sequence of str
-        Cells.
+        Cells; what a row lacks at its end stays empty.
     width : int
         Columns of the terminal.
     """
     from rich import box
     from rich.table import Table
 
-    cells = [tuple(row) for row in rows]
+    cells = [(*row, *[""] * (len(headings) - len(row))) for row in rows]
     kept = [at for at in range(len(headings)) if not cells or any(row[at] for row in cells)]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for at in kept:
