@@ -68,7 +68,7 @@ class Column:
         if self.to_si is None or not decimal:
             return ("",) * len(self.sheet.lines)
         cells = self.sheet.numbers(self.head, decimal)
-        return tuple(cell and repr(self.to_si.to_si(float(cell))) for cell in cells)
+        return tuple(cell and self.to_si.si_text(cell) for cell in cells)
 
 
 class Understanding:
@@ -157,8 +157,8 @@ class Understanding:
         )
         if found := re.fullmatch(r"\s*([-+]?\d+\.?\d*(?:e[-+]?\d+)?)\s*(\S+)\s*", said, re.ASCII):
             for quantity in (item for item in _HELD if item in quantities_of(found[2])):
-                size = conversion_of(quantity, found[2]).to_si(float(found[1]))
-                return {"displacement": size, "unit": UNITS[quantity].si}
+                size = conversion_of(quantity, found[2]).si_text(found[1])
+                return {"displacement": float(size), "unit": UNITS[quantity].si}
         raise CampaignFileError(f"--release must be a length or a voltage such as 15.5mm, and {said!r} came.")
 
     # ---------------------------------------------------------------- columns

@@ -6,7 +6,7 @@ from contextlib import suppress
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache
-from math import pi
+from math import isfinite, pi
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -93,6 +93,13 @@ class Conversion(NamedTuple):
     def to_si(self, value: _Value) -> _Value:
         """Return numbers of the unit in SI."""
         return value * self.numerator / self.denominator
+
+    def si_text(self, number: str) -> str:
+        """Return the text of a printed number in SI, rounded once."""
+        value = float(number)
+        if value == 0.0 or not isfinite(value * self.factor):  # also what is too large or small for a number
+            return repr(value * self.factor)
+        return repr(float(Fraction(number) * Fraction(self.numerator) / Fraction(self.denominator)))
 
     def from_si(self, value: _Value) -> _Value:
         """Return numbers of SI in the unit."""

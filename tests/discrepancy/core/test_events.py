@@ -113,7 +113,7 @@ def campaign() -> Campaign:
     base = Campaign("a bolt", channels, tuple(trials), None, {}, "0" * 64, events=events)
     measured = []
     for trial in base.trials:
-        shown = observe(MODEL, base, trial, patch, Conditions(np.array([1.01, 0.9])), 4).values
+        shown = observe(MODEL, base, trial, patch, Conditions(np.array([1.01, 0.9]), refinement=4)).values
         measured.append(replace(trial, values=shown + NOISE * rng.standard_normal(shown.shape)))
     return replace(base, trials=tuple(measured))
 
