@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import (
@@ -78,7 +79,6 @@ class ClosedForm(Model):
             else:
                 values = values + np.outer(force, np.ones(3)) * (conditions.health @ HEALTH_SHAPES)
             return Response(np.asarray(values)[:, columns])
-        assert trial.release is not None
         rate, zero = conditions.clock
         time = (1.0 + rate) * trial.time + zero
         factor = float(np.sqrt(theta[0])) if self.bent else 1.0
@@ -287,6 +287,12 @@ def closed_problem(
     return Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
 
 
+def fitted(problem: Problem, *terms: Term, **given: Any) -> CandidateFit:
+    """Return the fit of some terms, from the start that the problem has for them."""
+    candidate = Candidate(terms)
+    return fit(problem, candidate, problem.start(candidate), **given)
+
+
 def _local_point(problem: Problem, shared: FloatArray, local: FloatArray, number: int) -> Point:
     locals_ = [np.zeros(data.unknowns.size) for data in problem.trials]
     locals_[number] = local
@@ -350,7 +356,6 @@ class Bench:
             drawn = (noise or (lambda g, shape: g.standard_normal(shape)))(generator, values.shape)
             for column, name in enumerate(trial.channels):
                 channel = self.campaign.channels[name]
-                assert channel.noise is not None
                 s0 = channel.noise.standard_deviation * noise_scale
                 values[:, column] = values[:, column] * gains[name] + s0 * drawn[:, column]
                 values[:, column] += channel.offset_deviation * generator.standard_normal()
@@ -416,6 +421,7 @@ class Kit:
     ClosedForm = ClosedForm
     Linear = Linear
     closed_problem = staticmethod(closed_problem)
+    fitted = staticmethod(fitted)
     offset_effect = staticmethod(offset_effect)
     drift_effect = staticmethod(drift_effect)
     chain_bench = staticmethod(chain_bench)
