@@ -165,37 +165,28 @@ def test_an_effect_whose_place_is_no_port(write, setting: Setting) -> None:
         ('confusable = ["point_mass"]', "colour = 1", "'colour' is not a key of an effect"),
         ('confusable = ["point_mass"]', 'places = "wings"', "'places' must be a list or one of ports"),
         ('confusable = ["point_mass"]', 'places = ["ports"]', 'write places = "ports", without brackets'),
-        (
-            'shape = "log_normal", low = 0.01',
-            'shape = "gamma", low = 0.01',
-            "parameters[1].prior.shape: input should be 'log_normal'",
-        ),
+        ('shape = "log_normal", low = 0.01', 'shape = "gamma", low = 0.01',
+         "parameters[1].prior.shape: input should be 'log_normal'"),
         ('confusable = ["point_mass"]', 'needs = ["luck"]', "'needs' has 'luck', but known are trial, event"),
         ("low = 0.01", "low = 0.0", "must have low > 0"),
         ("magnitude = true", "height = 2", "'parameters[1].height' is not a key of an effect"),
         ("mass_ratio * modal", "mean_power * modal", "unknown name 'mean_power'"),  # of a shape `exponent`
         ("low = 0.01", "low = 0.5", "must have low < high"),
         ("low = 0.01", "low = nan", "parameters[1].prior.low: a finite number is expected, but nan came"),
-        (
-            "magnitude = true",
-            'magnitude = "yes"',
-            "parameters[1].magnitude: true or false is expected, but 'yes' came",
-        ),
+        ("magnitude = true", 'magnitude = "yes"',
+         "parameters[1].magnitude: true or false is expected, but 'yes' came"),
         ('name = "mass_ratio"', 'name = "length"', "must not be called 'length'"),
         ('kind = "point_mass"', 'kind = "mass"', "'kind' is 'mass', but known are point_mass"),
         ('station = "length / 2"', "", "lacks station"),
         ('station = "length / 2"', 'station = "length / 2"\nplace = 1.0', "unknown key 'place'"),
         ('station = "length / 2"', 'station = "length / b"', "unknown name 'b'"),
         ('station = "length / 2"', "station = \"__import__('os')\"", "may hold numbers, names"),
-        (
-            'station = "length / 2"',
-            "station = [1.0]",
-            "primitives[1].station: a text in quotes is expected, but [1.0] came",
-        ),
+        ('station = "length / 2"', "station = [1.0]",
+         "primitives[1].station: a text in quotes is expected, but [1.0] came"),
         ("[[primitives]]", "[[primitive]]", "'primitive' is not a key of an effect"),
         ('id = "store_pylon"', "id = store", "is not valid TOML"),
     ],
-)
+)  # fmt: skip
 def test_a_bad_entry_is_refused_with_one_sentence(write, old: str, new: str, sentence: str) -> None:
     assert old in PYLON
     with pytest.raises(CatalogueError) as caught:
