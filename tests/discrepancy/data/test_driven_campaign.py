@@ -9,6 +9,7 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Hold, Quantity, Start
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignFileError
+from tests.discrepancy.data.test_campaign_file import same
 
 TOML = """
 format = 1
@@ -81,17 +82,7 @@ def test_inputs_come_out_in_si(tmp_path: Path) -> None:
 
 def test_driven_trials_come_back_as_they_were(tmp_path: Path) -> None:
     campaign = read_campaign(folder_of(tmp_path))
-    (tmp_path / "again").mkdir()
-    again = read_campaign(write_campaign(campaign, tmp_path / "again"))
-    assert again.remarks == campaign.remarks
-    for one, other in zip(campaign.trials, again.trials, strict=True):
-        np.testing.assert_array_equal(one.values, other.values)
-        np.testing.assert_array_equal(one.time, other.time)
-        assert one.begins == other.begins
-        for given, found in zip(one.inputs, other.inputs, strict=True):
-            np.testing.assert_array_equal(given.values, found.values)
-            assert (given.name, given.quantity, given.hold) == (found.name, found.quantity, found.hold)
-            assert given.offset_deviation == found.offset_deviation
+    assert same(read_campaign(write_campaign(campaign, tmp_path / "again")), campaign)
 
 
 def test_a_begin_is_written_where_it_was_said(tmp_path: Path) -> None:
@@ -118,11 +109,8 @@ def test_a_forced_trial_says_what_it_assumes_of_its_begin(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        (
-            'unit = "kW"',
-            'unit = "kN"',
-            "the unit of 'heater': heat must have a unit such as W, mW or kW, and 'kN'",
-        ),
+        ('unit = "kW"', 'unit = "kN"',
+         "the unit of 'heater': heat must have a unit such as W, mW or kW, and 'kN'"),
         ('column = "x"', 'column = "x"\nhold = "linear"', "'table' is a motion, which no drive makes"),
         ('column = "x"', 'column = "plate"', "more than one channel or input reads the column 'plate'"),
         ('column = "x"', 'column = "z1"', "the column 'z1' is reserved"),
@@ -130,7 +118,7 @@ def test_a_forced_trial_says_what_it_assumes_of_its_begin(tmp_path: Path) -> Non
         ('kind = "driven"', 'kind = "flight"', "`begins` is for forced and driven ones"),
         ('name = "fan"', 'name = "heater"', "more than one input called 'heater'"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_input_is_named_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
     assert old in TOML
     with pytest.raises(CampaignFileError) as caught:
