@@ -149,16 +149,9 @@ def test_is_a_model_with_what_its_file_says(rig: FmuModel) -> None:
 
 def test_a_changed_binding_is_another_model(foreign_fmu: Any, tmp_path: Path) -> None:
     binding = """
-[binding]
-name = "rig"
-step_size = 0.01
-[load.push]
-variable = "slide.force"
-unit = "N"
-maximum = 50.0
-[observation.place]
-variables = ["slide.position"]
-unit = "m"
+binding = { name = "rig", step_size = 0.01 }
+load = { push = { variable = "slide.force", unit = "N", maximum = 50.0 } }
+observation = { place = { variables = ["slide.position"], unit = "m" } }
 """
     fmu = foreign_fmu("rig2")
     bare = choose_model(write(tmp_path, fmu))
@@ -346,11 +339,8 @@ def test_what_is_hidden_is_named_and_nothing_where_nothing_is(
         ('variable = "leaf"', 'variable = "laef"', "'laef', which is not a variable"),
         ('force = "slide.force",', 'force = "slide.speed",', "must be of causality input"),
         ('variable = "stiffness"', 'variable = "leaf"', "must be of causality parameter"),
-        (
-            'displacement = "slide.position", velocity = "slide.speed"',
-            'displacement = "slide.speed"',
-            "is in 'm'",
-        ),
+        ('displacement = "slide.position", velocity = "slide.speed"', 'displacement = "slide.speed"',
+         "is in 'm'"),
         ("scales = {", 'effects = { point_mass = "extra" }\nscales = {', "effect.extra.active"),
         ("scales = {", 'effects = { free_play = "gap" }\nscales = {', "internal forces act at ports"),
         ('name = "slide"', 'name = "slide", hinge = 1', "is not a key of an FMU model"),
@@ -358,7 +348,7 @@ def test_what_is_hidden_is_named_and_nothing_where_nothing_is(
         ('velocity = "release_speed"', 'hold = "slide.force"', "exactly one of displacement"),
         ("low = 0.7", "low = 1.7", "is not between low"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_file_is_refused_in_one_sentence(
     foreign_fmu: Any, tmp_path: Path, old: str, new: str, sentence: str
 ) -> None:

@@ -123,13 +123,11 @@ def test_what_is_offered(model: LumpedModel, tmp_path: Path) -> None:
     ("loggers", "sentence"),
     [
         ('a = ["laser", "camera"]', "'shaker' must be on one of the `loggers`, and it is on none"),
-        (
-            'a = ["laser", "shaker"], b = ["laser", "camera"]',
-            "'laser' must be on one .* it is on more than one",
-        ),
+        ('a = ["laser", "shaker"], b = ["laser", "camera"]',
+         "'laser' must be on one .* it is on more than one"),
         ('a = ["laser", "wire"]', "`loggers` names 'wire', but the channels and inputs are laser, camera"),
     ],
-)
+)  # fmt: skip
 def test_wrong_loggers_are_named(tmp_path: Path, loggers: str, sentence: str) -> None:
     with pytest.raises(CampaignFileError, match=sentence):
         campaign_of(tmp_path, f"loggers = {{ {loggers} }}")
