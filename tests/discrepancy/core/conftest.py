@@ -123,7 +123,7 @@ def offset_effect(identifier: str = "offset", deviation: float = 0.3) -> Effect:
     def build(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
         return ModelPatch((RunOffset("A", values["offset"], channel=place, quantity=""),))
 
-    return _effect(identifier, build, ("offset",), deviation, frozenset({TrialKind.STATIC}), OUTPUTS[:1])
+    return _effect(identifier, build, "offset", deviation, frozenset({TrialKind.STATIC}), "y1")
 
 
 def drift_effect(
@@ -134,33 +134,19 @@ def drift_effect(
     def build(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
         return ModelPatch((SensorDrift(place, values["drift"], 100.0, exponent),))
 
-    return _effect(identifier, build, ("drift",), deviation, frozenset(TrialKind), (channel,))
+    return _effect(identifier, build, "drift", deviation, frozenset(TrialKind), channel)
 
 
 def _effect(
-    identifier: str,
-    build: Callable[[Setting, Mapping[str, float], str], ModelPatch],
-    names: tuple[str, ...],
-    deviation: float,
-    acts_on: frozenset[TrialKind],
-    places: tuple[str, ...],
-) -> Effect:
+    identifier: str, build: Callable[[Setting, Mapping[str, float], str], ModelPatch], name: str,
+    deviation: float, acts_on: frozenset[TrialKind], place: str,
+) -> Effect:  # fmt: skip
     ninety = 1.6448536269514722 * deviation
+    size = EffectParameter(name, name, "m", name, Prior("normal", -ninety, ninety), magnitude=True)
     return Effect(
-        identifier=identifier,
-        name=identifier,
-        family=identifier,
-        equation="-",
-        signature="-",
-        reference="-",
-        acts_on=acts_on,
-        parameters=tuple(
-            EffectParameter(name, name, "m", name, Prior("normal", -ninety, ninety), magnitude=True)
-            for name in names
-        ),
-        build=build,
-        places=lambda setting: places,
-    )
+        identifier=identifier, name=identifier, family=identifier, equation="-", signature="-", reference="-",
+        acts_on=acts_on, parameters=(size,), build=build, places=lambda setting: (place,),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
