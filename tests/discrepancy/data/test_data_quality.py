@@ -72,6 +72,7 @@ def test_sound_data_have_no_fault(oscillator, seed: int) -> None:
         ModelPatch((SensorGain("*", -0.2, "strain"), HighPass("x", 2.0))),
     ):
         campaign = example_campaign(oscillator, "complete", seed, PLAN, patch)
+        assert campaign.channels["g0"].noise.degrees_of_freedom == 399
         assert check_data(campaign) == ()
         assert check_against_model(campaign, oscillator) == ()
         marked = mark_outliers(campaign)
