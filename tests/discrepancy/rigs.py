@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
+from typing import Any
 
 from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.files.document import Origin
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.lumped_file import parse_lumped
 from discrepancy.sources.examples import example_campaign, plan_for
 from fe.runtime.patch import (
     ModelPatch,
@@ -19,6 +22,18 @@ MODEL = "single_mass_rig"
 
 
 ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run rig", collect_provenance(0))
+
+
+def model_of(text: str) -> LumpedModel:
+    """Return the lumped model that a text says."""
+    return LumpedModel(parse_lumped(tomllib.loads(text)))
+
+
+def one_mass(**terms: Any) -> LumpedModel:
+    """Return a mass of 2 kg and what holds it; the force on it is `push`, its place `x`, its port `slide`."""
+    ends = {"input": "push", "output": "x", "port": "slide"}
+    rows = {key: [{"name": name, "vector": 1.0}] for key, name in ends.items()}
+    return LumpedModel(parse_lumped({"format": 1, "name": "One mass", "mass": 2.0, **rows, **terms}, "here"))
 
 
 def measured(hidden: str = "", value: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:

@@ -15,50 +15,24 @@ from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import CampaignDataError, CampaignFileError, CatalogueError
 from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
 from discrepancy.models.sensing import observe
+from tests.discrepancy.rigs import one_mass
 
 PAGE = Path(__file__).parents[3] / "docs" / "when.md"
-TOML = """
+TRIALS = """
 format = 1
 name = "A mass beside a pump"
-[[channel]]
-name = "x"
-quantity = "displacement"
-unit = "m"
-output = "x"
-noise = { standard_deviation = 1e-4 }
-[[trial]]
-name = "quiet"
-kind = "driven"
-file = "a.csv"
-begins = "still"
-[[trial]]
-name = "pumping"
-kind = "driven"
-file = "b.csv"
-begins = "still"
-[[event]]
-name = "pump_on"
-trial = "pumping"
-time = 2.5
-until = 8.0
+channel = [
+  { name = "x", quantity = "displacement", unit = "m", output = "x", noise = { standard_deviation = 1e-4 } },
+]
+trial = [
+  { name = "quiet", kind = "driven", file = "a.csv", begins = "still" },
+  { name = "pumping", kind = "driven", file = "b.csv", begins = "still" },
+]
 """
-MODEL = LumpedModel(
-    parse_lumped(
-        {
-            "format": 1,
-            "name": "A free mass",
-            "mass": 2.0,
-            "free": True,
-            "input": [{"name": "push", "vector": 1.0}],
-            "output": [{"name": "x", "vector": 1.0}],
-            "port": [{"name": "slide", "vector": 1.0}],
-        },
-        "here",
-    )
-)
+EVENT = '{ name = "pump_on", trial = "pumping", time = 2.5, until = 8.0 }'
+TOML = f"{TRIALS}event = [{EVENT}]\n"
+MODEL = one_mass(free=True)
 TIME = np.linspace(0.0, 10.0, 101)
 
 
@@ -121,30 +95,30 @@ def test_events_survive_the_files(campaign: Campaign, tmp_path: Path) -> None:
     assert campaign.event_times("pumping") == {"pump_on": 2.5, "pump_on_until": 8.0}
     assert campaign.event_times("quiet") == {}
     assert read_campaign(write_campaign(campaign, tmp_path / "again")).events == campaign.events
-    every = TOML.replace('trial = "pumping"\ntime', "time")
+    every = TOML.replace('trial = "pumping", time', "time")
     assert read_campaign(folder_of(tmp_path, every)).events[0].trials == ("quiet", "pumping")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('trial = "pumping"\ntime', 'trial = "pomping"\ntime', "not among the trials quiet, pumping"),
+        ('trial = "pumping", time', 'trial = "pomping", time', "not among the trials quiet, pumping"),
         ("until = 8.0", "until = 2.0", "begins at 2.5 s and must end later, but `until` is 2 s"),
-        ("time = 2.5", "time = 25.0\n#", "record of the trial 'pumping' goes from 0 to 10 s"),
+        ("time = 2.5, until = 8.0", "time = 25.0", "record of the trial 'pumping' goes from 0 to 10 s"),
         ('"pump_on"', '"pump on"', "must be of letters, digits and underscores"),
-        ('trial = "pumping"\ntime', 'trial = "quiet"\ntrials = ["quiet"]\ntime', "give one of the two"),
-        ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on"\ntime = 1.0', "moment 'pump_on' in"),
+        ('trial = "pumping", time', 'trial = "quiet", trials = ["quiet"], time', "give one of the two"),
+        ("until = 8.0", 'until = 8.0 }, { name = "pump_on", time = 1.0', "moment 'pump_on' in"),
         *(('name = "pump_on"', f'name = "{name}"', "means something else in an expression: rename it")
           for name in ("time", "step", "max", "lambda")),
-        ("[[event]]", "[event]", "several of 'event', so write [[event]] for each, not [event]"),
-        ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on_until"\ntime = 1.0', "'pump_on_until' in"),
-        ('trial = "pumping"\ntime', "trials = []\ntime", "at least 1 entry is expected, but () came"),
+        (f"[{EVENT}]", EVENT, "several of 'event', so write [[event]] for each, not [event]"),
+        ("until = 8.0", 'until = 8.0 }, { name = "pump_on_until", time = 1.0', "'pump_on_until' in"),
+        ('trial = "pumping", time', "trials = [], time", "at least 1 entry is expected, but () came"),
     ],
 )  # fmt: skip
 def test_wrong_events_are_refused_in_one_sentence(tmp_path: Path, old: str, new: str, words: str) -> None:
-    toml = TOML.replace(old, new).replace("#\nuntil = 8.0", "")
+    assert old in TOML
     with pytest.raises((CampaignFileError, CampaignDataError), match=re.escape(words)) as caught:
-        read_campaign(folder_of(tmp_path, toml))
+        read_campaign(folder_of(tmp_path, TOML.replace(old, new)))
     assert "\n" not in str(caught.value)
 
 
@@ -164,7 +138,7 @@ def test_wrong_effects_in_time_are_refused(tmp_path: Path, old: str, new: str, w
 
 
 def test_an_effect_without_its_event_says_why(tmp_path: Path) -> None:
-    without = read_campaign(folder_of(tmp_path, TOML[: TOML.index("[[event]]")]))
+    without = read_campaign(folder_of(tmp_path, TRIALS))
     effect = effect_of(tmp_path, example())
     reason = effect.unavailable(Setting(without, MODEL, MODEL.scales(without)))
     assert reason == (

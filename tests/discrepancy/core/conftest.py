@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import (
@@ -78,7 +79,6 @@ class ClosedForm(Model):
             else:
                 values = values + np.outer(force, np.ones(3)) * (conditions.health @ HEALTH_SHAPES)
             return Response(np.asarray(values)[:, columns])
-        assert trial.release is not None
         rate, zero = conditions.clock
         time = (1.0 + rate) * trial.time + zero
         factor = float(np.sqrt(theta[0])) if self.bent else 1.0
@@ -123,7 +123,7 @@ def offset_effect(identifier: str = "offset", deviation: float = 0.3) -> Effect:
     def build(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
         return ModelPatch((RunOffset("A", values["offset"], channel=place, quantity=""),))
 
-    return _effect(identifier, build, ("offset",), deviation, frozenset({TrialKind.STATIC}), OUTPUTS[:1])
+    return _effect(identifier, build, "offset", deviation, frozenset({TrialKind.STATIC}), "y1")
 
 
 def drift_effect(
@@ -134,33 +134,19 @@ def drift_effect(
     def build(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
         return ModelPatch((SensorDrift(place, values["drift"], 100.0, exponent),))
 
-    return _effect(identifier, build, ("drift",), deviation, frozenset(TrialKind), (channel,))
+    return _effect(identifier, build, "drift", deviation, frozenset(TrialKind), channel)
 
 
 def _effect(
-    identifier: str,
-    build: Callable[[Setting, Mapping[str, float], str], ModelPatch],
-    names: tuple[str, ...],
-    deviation: float,
-    acts_on: frozenset[TrialKind],
-    places: tuple[str, ...],
-) -> Effect:
+    identifier: str, build: Callable[[Setting, Mapping[str, float], str], ModelPatch], name: str,
+    deviation: float, acts_on: frozenset[TrialKind], place: str,
+) -> Effect:  # fmt: skip
     ninety = 1.6448536269514722 * deviation
+    size = EffectParameter(name, name, "m", name, Prior("normal", -ninety, ninety), magnitude=True)
     return Effect(
-        identifier=identifier,
-        name=identifier,
-        family=identifier,
-        equation="-",
-        signature="-",
-        reference="-",
-        acts_on=acts_on,
-        parameters=tuple(
-            EffectParameter(name, name, "m", name, Prior("normal", -ninety, ninety), magnitude=True)
-            for name in names
-        ),
-        build=build,
-        places=lambda setting: places,
-    )
+        identifier=identifier, name=identifier, family=identifier, equation="-", signature="-", reference="-",
+        acts_on=acts_on, parameters=(size,), build=build, places=lambda setting: (place,),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -287,6 +273,12 @@ def closed_problem(
     return Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
 
 
+def fitted(problem: Problem, *terms: Term, **given: Any) -> CandidateFit:
+    """Return the fit of some terms, from the start that the problem has for them."""
+    candidate = Candidate(terms)
+    return fit(problem, candidate, problem.start(candidate), **given)
+
+
 def _local_point(problem: Problem, shared: FloatArray, local: FloatArray, number: int) -> Point:
     locals_ = [np.zeros(data.unknowns.size) for data in problem.trials]
     locals_[number] = local
@@ -350,7 +342,6 @@ class Bench:
             drawn = (noise or (lambda g, shape: g.standard_normal(shape)))(generator, values.shape)
             for column, name in enumerate(trial.channels):
                 channel = self.campaign.channels[name]
-                assert channel.noise is not None
                 s0 = channel.noise.standard_deviation * noise_scale
                 values[:, column] = values[:, column] * gains[name] + s0 * drawn[:, column]
                 values[:, column] += channel.offset_deviation * generator.standard_normal()
@@ -416,6 +407,7 @@ class Kit:
     ClosedForm = ClosedForm
     Linear = Linear
     closed_problem = staticmethod(closed_problem)
+    fitted = staticmethod(fitted)
     offset_effect = staticmethod(offset_effect)
     drift_effect = staticmethod(drift_effect)
     chain_bench = staticmethod(chain_bench)

@@ -107,65 +107,48 @@ def test_p_values_are_uniform_where_the_name_is_right(kit, freedom: float) -> No
         assert sum(p < 0.05 for p in values) <= binom.isf(1e-3, 100, 0.05)
 
 
-def test_a_channel_is_tested_where_the_effect_has_one(kit) -> None:  # type: ignore[no-untyped-def]
-    """Drift of y2 named where y2 reads 15 % more under one of two loads, among many samples of motion."""
-    problem = changed(kit.closed_problem(seed=2, samples=1500), size={"y2": 1.15})
-    found = fitted(problem, kit.drift_effect(), "y2")
-    assert absolute_gate(problem, found).passed
-    gate = consistency_gate(problem, found)
-    assert gate.passed is False
-    assert "channel y2" in gate.reason
-    assert "middle" in gate.reason
-    names = [test.name for test in consistency_tests(problem, found)]
-    assert names == ["static loads", "zeros of the static runs", "channel y2"]
+MIDDLE = np.mean(list(STATIONS.values()))
+OFFSET = {"seed": 4, "effect": 0.5}
 
 
-def test_a_load_that_differs_by_place_is_seen(kit) -> None:  # type: ignore[no-untyped-def]
-    """A load 5 % too large at one of two places: the sum of squares of all samples does not show it."""
-    truth = kit.closed_problem(seed=4, effect=0.5, samples=1500)
-    right = changed(truth)
-    assert consistency_gate(right, fitted(right, kit.offset_effect(), "y1")).passed
-    wrong = changed(truth, size=dict.fromkeys(STATIONS, 1.05))
-    found = fitted(wrong, kit.offset_effect(), "y1")
+@pytest.mark.parametrize(
+    ("made", "place", "change", "words"),
+    [
+        # drift of y2 named where y2 reads 15 % more under one of two loads
+        ({"seed": 2}, "y2", {"size": {"y2": 1.15}}, ("channel y2", "middle")),
+        # a load 5 % too large at one of two places
+        (OFFSET, "y1", {"size": dict.fromkeys(STATIONS, 1.05)}, ("static loads",)),
+        # lift 4 % too small inboard and too large outboard, which a size alone does not hold
+        (OFFSET, "y1",
+         {"flight": True, "size": {name: 1.0 + 0.12 * (at - MIDDLE) for name, at in STATIONS.items()}},
+         ("loads of flight", "the slope over the span in flight")),
+        # all displacements of one run off by four deviations, with zeros that are known to be small
+        ({**OFFSET, "offset_deviation": 0.005}, "y1", {"shift": 0.08}, ("zero of displacement in run B",)),
+    ],
+)  # fmt: skip
+def test_what_the_sum_of_squares_does_not_show_is_seen(kit, made, place, change, words) -> None:  # type: ignore[no-untyped-def]
+    """Few wrong readings among many samples of motion."""
+    truth = kit.closed_problem(samples=1500, **made)
+    effect = kit.offset_effect() if place == "y1" else kit.drift_effect()
+    flight = change.get("flight", False)
+    right = changed(truth, flight=flight)
+    assert consistency_gate(right, fitted(right, effect, place)).passed
+    wrong = changed(truth, **change)
+    found = fitted(wrong, effect, place)
     assert absolute_gate(wrong, found).passed
     gate = consistency_gate(wrong, found)
     assert gate.passed is False
     assert gate.statistic < CONSISTENCY_LEVEL
-    assert "static loads" in gate.reason
+    assert all(word in gate.reason for word in words)
+    flights = ["loads of flight"] * flight
+    names = [test.name for test in consistency_tests(wrong, found)]
+    assert names == ["static loads", *flights, "zeros of the static runs", f"channel {place}"]
 
 
-def test_a_slope_of_the_load_over_the_span_is_seen_in_flight(kit) -> None:  # type: ignore[no-untyped-def]
-    """Lift 4 % too small inboard and too large outboard, which a size alone does not hold."""
-    truth = kit.closed_problem(seed=4, effect=0.5, samples=1500)
-    right = changed(truth, flight=True)
-    found = fitted(right, kit.offset_effect(), "y1")
-    names = [test.name for test in consistency_tests(right, found)]
-    assert names == ["static loads", "loads of flight", "zeros of the static runs", "channel y1"]
-    assert consistency_gate(right, found).passed
-    middle = np.mean(list(STATIONS.values()))
-    slope = {name: 1.0 + 0.12 * (station - middle) for name, station in STATIONS.items()}
-    wrong = changed(truth, flight=True, size=slope)
-    found = fitted(wrong, kit.offset_effect(), "y1")
-    assert absolute_gate(wrong, found).passed
-    gate = consistency_gate(wrong, found)
-    assert gate.passed is False
-    assert "loads of flight" in gate.reason
-    assert "the slope over the span in flight" in gate.reason
-
-
-def test_a_run_with_another_zero_is_seen(kit) -> None:  # type: ignore[no-untyped-def]
-    """All three displacements of one run off by four deviations, with zeros that are known to be small."""
-    truth = kit.closed_problem(seed=4, effect=0.5, samples=1500, offset_deviation=0.005)
-    problem = changed(truth, shift=0.08)
-    found = fitted(problem, kit.offset_effect(), "y1")
-    assert absolute_gate(problem, found).passed
-    gate = consistency_gate(problem, found)
-    assert gate.passed is False
-    assert "the zero of displacement in run B" in gate.reason
-    unlabelled = replace(
-        problem.campaign, trials=tuple(replace(trial, run="") for trial in problem.campaign.trials)
-    )
-    whole = Problem(unlabelled, problem.model, problem.setting)
+def test_runs_without_a_label_have_one_zero(kit) -> None:  # type: ignore[no-untyped-def]
+    problem = changed(kit.closed_problem(seed=4, effect=0.5))
+    trials = tuple(replace(trial, run="") for trial in problem.campaign.trials)
+    whole = Problem(replace(problem.campaign, trials=trials), problem.model, problem.setting)
     tests = consistency_tests(whole, fitted(whole, kit.offset_effect(), "y1"))
     (zeros,) = (test for test in tests if test.name == "zeros of the static runs")
     assert zeros.strongest.startswith("the zero of displacement in the runs without a label (")
@@ -209,7 +192,7 @@ def test_what_fails_the_gate_is_not_named(kit) -> None:  # type: ignore[no-untyp
 
 def test_without_loads_the_gate_is_not_applied(kit) -> None:  # type: ignore[no-untyped-def]
     problem = kit.closed_problem(seed=1, kinds=("ringdown",))
-    found = fit(problem, Candidate(), problem.start(Candidate()))
+    found = kit.fitted(problem)
     gate = consistency_gate(problem, found)
     assert gate.passed is None
     assert np.isnan(gate.statistic)

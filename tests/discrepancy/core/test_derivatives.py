@@ -12,7 +12,6 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier
 from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.fitting import fit
 from discrepancy.fits.linearisation import PARAMETER_STEP, Base
 from discrepancy.fits.problem import Problem
 
@@ -76,18 +75,6 @@ def test_all_unknowns_of_the_closed_form(kit, at_rest: bool, coloured: bool) -> 
     check(kit, problem, Candidate(effects))
 
 
-def test_health_of_each_level_moves_its_own_row(kit) -> None:  # type: ignore[no-untyped-def]
-    """Entries come row by row, z1 before z2, in unknowns and derivatives alike."""
-    problem = kit.closed_problem(bent=True, health=True)
-    data = problem.trials[0]
-    candidate = Candidate()
-    point = problem.start(candidate)
-    local, _ = problem.derivatives(0, point, problem.linearise(0, point, candidate), candidate).dense()
-    by_health = local[data.unknowns.size - len(data.unknowns.health_rows) :].reshape(-1, *data.weight.shape)
-    for entry, row in enumerate(data.unknowns.health_rows):
-        assert np.flatnonzero(np.any(by_health[entry] != 0.0, axis=1)).tolist() in ([row], [])
-
-
 EFFECTS = {
     "coulomb_friction": ("joint", 0.1),  # sticking ends at a sample or the next: not smooth
     "quadratic_damping": ("end", TOLERANCE),
@@ -119,7 +106,7 @@ def test_chord_steps_are_exact_at_the_base_and_second_order_away(kit, bench, cat
     """A chord response differs from the true one by the square of the distance from the base."""
     problem = bench.problem(bench.measured(1))
     candidate = Candidate((Term(effect_by_identifier("gauge_gain", catalogue), "g1"),))
-    none = fit(problem, Candidate(), problem.start(Candidate()))
+    none = kit.fitted(problem)
     number = len(problem.trials) - 1
     generator = np.random.default_rng(0)
     away = (

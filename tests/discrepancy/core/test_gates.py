@@ -10,8 +10,7 @@ import pytest
 from scipy.stats import binom
 
 from discrepancy.campaign.records import NoiseRecord
-from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.fitting import fit
+from discrepancy.fits.candidate import Term
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, absolute_tests, shape_gate
 
 DRAWS = 1500
@@ -21,7 +20,7 @@ def null_gates(kit, freedom, kinds, samples, draws=DRAWS, gap=0.0):  # type: ign
     """Return a fit and, at sums drawn under the null (or with a gap), whether the gate passed."""
     noise = NoiseRecord(0.02, freedom)
     problem = kit.closed_problem(seed=1, noise=noise, kinds=kinds, samples=samples)
-    found = fit(problem, Candidate(), problem.start(Candidate()))
+    found = kit.fitted(problem)
     generator = np.random.default_rng(17)
     left = problem.counts - found.spent
     passed = []
@@ -68,28 +67,23 @@ def test_residuals_of_the_truth_pass_and_of_a_gap_fail(kit) -> None:  # type: ig
     shares = []
     for seed in range(40):
         problem = kit.closed_problem(seed=100 + seed, noise=NoiseRecord(0.02, inf), samples=40)
-        found = fit(problem, Candidate(), problem.start(Candidate()))
+        found = kit.fitted(problem)
         assert absolute_gate(problem, found).passed
         shares.append(found.sums.sum() / (problem.counts.sum() - found.spent.sum()))
     assert np.mean(shares) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (40 * 200)))
     problem = kit.closed_problem(seed=1, extra=lambda rows: 0.1 * np.sin(2.0 * rows))
-    found = fit(problem, Candidate(), problem.start(Candidate()))
+    found = kit.fitted(problem)
     gate = absolute_gate(problem, found)
     assert gate.passed is False
     assert gate.statistic < ABSOLUTE_LEVEL
 
 
-def test_without_a_record_nothing_absolute_is_said(kit) -> None:  # type: ignore[no-untyped-def]
-    problem = kit.closed_problem(seed=1, known_noise=False, samples=40)
-    found = fit(problem, Candidate(), problem.start(Candidate()))
+def test_without_a_record_nothing_absolute_is_said_but_of_colour(kit) -> None:  # type: ignore[no-untyped-def]
+    problem = kit.closed_problem(seed=1, known_noise=False, samples=150)
+    found = kit.fitted(problem)
     gate = absolute_gate(problem, found)
     assert gate.passed is None
     assert "No noise record" in gate.reason
-
-
-def test_coloured_rest_fails_without_a_record_too(kit) -> None:  # type: ignore[no-untyped-def]
-    problem = kit.closed_problem(seed=1, known_noise=False, samples=150)
-    found = fit(problem, Candidate(), problem.start(Candidate()))
     wave = 30.0 * np.sin(0.3 * np.arange(150))[:, np.newaxis]
     swung = replace(found, residuals=tuple(r + wave if len(r) == 150 else r for r in found.residuals))
     assert absolute_gate(problem, swung).passed is False
@@ -97,8 +91,7 @@ def test_coloured_rest_fails_without_a_record_too(kit) -> None:  # type: ignore[
 
 def test_shape_gate_compares_evidence(kit) -> None:  # type: ignore[no-untyped-def]
     problem = kit.closed_problem(seed=1)
-    candidate = Candidate((Term(kit.offset_effect(), "y1"),))
-    found = fit(problem, candidate, problem.start(candidate))
+    found = kit.fitted(problem, Term(kit.offset_effect(), "y1"))
     for gain, passes in ((-3.0, True), (SHAPE_GAIN - 0.01, True), (SHAPE_GAIN + 0.01, False)):
         gate = shape_gate(found, replace(found, log_evidence=found.log_evidence + gain))
         assert gate.passed is passes

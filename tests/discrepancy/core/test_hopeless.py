@@ -33,7 +33,7 @@ equation = "x += a exp(1000 t)"
 signature = "none"
 reference = "none"
 acts_on = ["ringdown"]
-
+primitives = [{ kind = "channel_offset", channel = "displacement", offset = "a * exp(1000 * time)" }]
 [[parameters]]
 name = "a"
 symbol = "a"
@@ -41,11 +41,6 @@ unit = "1"
 description = "size"
 prior = { shape = "normal", low = -1.0, high = 1.0 }
 magnitude = true
-
-[[primitives]]
-kind = "channel_offset"
-channel = "displacement"
-offset = "a * exp(1000 * time)"
 """
 
 

@@ -54,7 +54,6 @@ def test_friction_beside_a_remainder_is_named_in_part(rig, effects, seed: int) -
     verdict, found, fit = name(rig.problem(campaign), effects)
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
     assert [effect.identifier for effect in verdict.effects] == ["coulomb_friction"]
-    assert verdict.explained is not None
     assert verdict.explained.trials == "held-out"
     assert 0.5 < verdict.explained.low <= verdict.explained.value <= verdict.explained.high
     assert verdict.explained.left == pytest.approx(4.0, rel=0.5)

@@ -22,12 +22,10 @@ def verdict_on(catalogue, *identifiers: str, kind: VerdictKind = VerdictKind.NAM
 
 def test_declared_likenesses_are_told_from_those_left_out(catalogue) -> None:  # type: ignore[no-untyped-def]
     whole = look_alike_remark(verdict_on(catalogue, "inertia_relief"), catalogue)
-    assert whole is not None
     assert "washout" in whole
     assert "not compared" not in whole
     rest = [effect for effect in catalogue if effect.identifier != "washout"]
     less = look_alike_remark(verdict_on(catalogue, "inertia_relief"), rest)
-    assert less is not None
     assert "washout was not compared" in less
 
 
@@ -50,13 +48,11 @@ def test_likeness_counts_both_ways(catalogue) -> None:  # type: ignore[no-untype
     for effect in catalogue:
         for other in effect.confusable:
             text = look_alike_remark(verdict_on(catalogue, other), catalogue)
-            assert text is not None
             assert effect.identifier in text
 
 
 def test_members_of_a_set_are_no_likenesses_of_each_other(catalogue) -> None:  # type: ignore[no-untyped-def]
     text = look_alike_remark(verdict_on(catalogue, "inertia_relief", "washout"), catalogue)
-    assert text is not None
     assert " do together, within the noise" in text
     compared = text.split("look alike,")[1]
     assert "washout" not in compared

@@ -152,9 +152,8 @@ def test_without_a_record_the_rest_stands_for_the_noise(kit) -> None:  # type: i
     found = []
     for known in (True, False):
         problem = kit.closed_problem(seed=13, effect=0.05, known_noise=known)
-        none = fit(problem, Candidate(), problem.start(Candidate()), iterations=40)
-        candidate = Candidate((Term(kit.offset_effect(), "y1"),))
-        other = fit(problem, candidate, problem.start(candidate), iterations=40)
+        none = kit.fitted(problem, iterations=40)
+        other = kit.fitted(problem, Term(kit.offset_effect(), "y1"), iterations=40)
         proposal = Proposal(problem.campaign.trials[0], "", "", 1.0)
         found.append(mutual_information(problem, proposal, [other, none], np.array([0.5, 0.5])))
     assert 0.0 < found[0] < log(2.0)

@@ -67,20 +67,6 @@ def test_white_records_stay_white() -> None:
     assert np.count_nonzero(orders) <= binom.isf(1e-4, 300, 1e-3)
 
 
-@pytest.mark.long
-def test_whitened_noise_is_white() -> None:
-    """A new record of the process, whitened by the autoregression of the first, is white."""
-    generator = np.random.default_rng(5)
-    values = []
-    for _ in range(300):
-        noise = noise_model(channel(coloured(generator, (0.9, -0.3), 3000)), 1.0)
-        fresh = coloured(generator, (0.9, -0.3), 400)
-        values.append(ljung_box(noise.whiten(fresh, INTERVAL))[1])
-    # coefficients from a record of 3000 are not exact, which costs a little
-    assert np.mean(np.array(values) < 0.05) < 0.10
-    assert np.mean(np.array(values) < 1e-3) < 0.01
-
-
 def test_lines_are_found_where_they_are_and_taken_out() -> None:
     generator = np.random.default_rng(6)
     time = INTERVAL * np.arange(1000)
@@ -123,27 +109,6 @@ def test_records_that_say_little() -> None:
     assert (stated.standard_deviation, stated.degrees_of_freedom) == (2.0, inf)
     short = noise_model(channel(np.random.default_rng(0).standard_normal(30)), 0.7)
     assert not short.autoregression.size
-
-
-@pytest.mark.parametrize("coefficient", [pytest.param(0.9, marks=pytest.mark.long), 0.99])
-@pytest.mark.long
-def test_the_first_whitened_samples_weigh_what_they_are_worth(kit, coefficient: float) -> None:  # type: ignore[no-untyped-def]
-    """Without a history the first sample has the process's variance, 1 / (1 - a^2) of the innovation's: 50 at
-    0.99. Counted as one innovation it would be an outlier in every record."""
-    generator = np.random.default_rng(8)
-    samples = 0.02 * np.sqrt(1.0 - coefficient**2) * coloured(generator, (coefficient,), 20000)
-    record = NoiseRecord(float(samples.std()), 19999.0, samples, 0.01, "pre-trigger")
-    problem = kit.closed_problem(noise=record, kinds=("ringdown",))
-    data = problem.trials[0]
-    first = []
-    for _ in range(400):
-        noise = np.stack(
-            [0.02 * np.sqrt(1.0 - coefficient**2) * coloured(generator, (coefficient,), 8, 500)] * 3, 1
-        )
-        padded = np.zeros(data.weight.shape)
-        padded[:8] = noise
-        first.append(data.standardised(padded)[0, 0])
-    assert np.mean(np.square(first)) < 1.3
 
 
 @pytest.mark.parametrize("coefficients", [(0.9,), (1.2, -0.6), (0.5, 0.0, 0.3)])

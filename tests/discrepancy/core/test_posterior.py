@@ -49,8 +49,7 @@ def test_ensembles_follow_a_bent_ridge() -> None:
 
 def test_the_misfit_rises_by_the_covariance_where_all_is_linear(kit) -> None:  # type: ignore[no-untyped-def]
     problem = kit.closed_problem(seed=3, effect=0.2)
-    candidate = Candidate((Term(kit.offset_effect(), "y1"),))
-    found = fit(problem, candidate, problem.start(candidate), iterations=40)
+    found = kit.fitted(problem, Term(kit.offset_effect(), "y1"), iterations=40)
     screen = Screen(problem, found, record_noise=False)
     (centre,), deviation = found.point.effect, float(np.sqrt(found.effect_covariance[0, 0]))
     for steps in (-2.0, 0.5, 1.0):

@@ -29,7 +29,7 @@ def test_intervals_cover_under_the_right_model(kit) -> None:  # type: ignore[no-
     inside, square, count = 0, 0.0, 0
     for seed in range(60):
         problem = held_out_problem(kit, seed, gain_deviation=0.02)
-        found = fit(problem, Candidate(), problem.start(Candidate()))
+        found = kit.fitted(problem)
         for item in residual_set(problem, found, sensitivities=False).trials:
             if item.trial.held_out:
                 z = item.residual / item.predictive_deviation
@@ -44,7 +44,7 @@ def test_intervals_cover_under_the_right_model(kit) -> None:  # type: ignore[no-
 
 def test_covariance_of_fitted_residuals_is_that_of_the_dense_problem(kit) -> None:  # type: ignore[no-untyped-def]
     problem = held_out_problem(kit, 3)
-    found = fit(problem, Candidate(), problem.start(Candidate()))
+    found = kit.fitted(problem)
     linear = kit.Linear(problem, Candidate())
     _, a = linear.dense()
     covariance = a @ np.linalg.solve(a.T @ a + np.diag(linear.precision), a.T)
@@ -57,7 +57,7 @@ def test_covariance_of_fitted_residuals_is_that_of_the_dense_problem(kit) -> Non
 
 def test_held_out_trials_move_nothing_that_is_shared(kit) -> None:  # type: ignore[no-untyped-def]
     problem = held_out_problem(kit, 5)
-    found = fit(problem, Candidate(), problem.start(Candidate()))
+    found = kit.fitted(problem)
     there = problem.with_trials(problem.campaign.held_out)
     start = Point(found.point.shared, tuple(np.zeros(d.unknowns.size) for d in there.trials), np.empty(0))
     adapted = fit(there, Candidate(), start, local_only=True)
@@ -79,6 +79,6 @@ def test_held_out_readings_do_not_reach_the_fit(kit) -> None:  # type: ignore[no
         for trial in problem.campaign.trials
     )
     other = Problem(replace(problem.campaign, trials=wild), problem.model, problem.setting)
-    first, second = (fit(p, Candidate(), p.start(Candidate())) for p in (problem, other))
+    first, second = (kit.fitted(p) for p in (problem, other))
     np.testing.assert_array_equal(first.point.shared, second.point.shared)
     assert first.log_evidence == second.log_evidence

@@ -41,6 +41,14 @@ def found(laboratory, damped, effects):  # type: ignore[no-untyped-def]
     return investigate(damped, laboratory.model, effects, seed=3)
 
 
+def spoilt(campaign, change):  # type: ignore[no-untyped-def]
+    """Return the campaign with the readings of each trial changed in place."""
+    trials = [replace(trial, values=trial.values.copy()) for trial in campaign.trials]
+    for trial in trials:
+        change(trial)
+    return replace(campaign, trials=tuple(trials))
+
+
 def test_an_effect_is_named_and_proved_on_trials_not_used(found) -> None:  # type: ignore[no-untyped-def]
     assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
     assert found.proof is not None
@@ -69,15 +77,13 @@ def test_draws_of_the_patch_have_the_posteriors_spread(found) -> None:  # type: 
 def test_wrong_readings_at_the_ends_of_records_are_left_out(laboratory, effects) -> None:  # type: ignore[no-untyped-def]
     """A heavily damped line would explain the first one; held-out records are judged as well."""
     campaign = laboratory.measured(21)
-    trials = []
-    for trial in campaign.trials:
-        values = trial.values.copy()
+
+    def change(trial) -> None:  # type: ignore[no-untyped-def]
         if trial.is_dynamic:
-            row = 0 if trial.held_out else len(values) - 1
             noise = campaign.channels[trial.channels[0]].noise.standard_deviation
-            values[row, 0] += 30.0 * noise
-        trials.append(replace(trial, values=values))
-    found = investigate(replace(campaign, trials=tuple(trials)), laboratory.model, effects, thorough=False)
+            trial.values[0 if trial.held_out else -1, 0] += 30.0 * noise
+
+    found = investigate(spoilt(campaign, change), laboratory.model, effects, thorough=False)
     assert found.verdict.kind is VerdictKind.NOTHING_MISSING, found.verdict.sentence
     for trial in found.campaign.trials:
         if trial.is_dynamic:
@@ -111,13 +117,11 @@ def test_nothing_missing_ends_without_proof_or_experiment(laboratory, effects) -
 
 def test_microstrain_for_strain_is_an_error_of_the_data(laboratory, effects) -> None:  # type: ignore[no-untyped-def]
     """Not an effect."""
-    campaign = laboratory.measured(23)
-    trials = []
-    for trial in campaign.trials:
-        values = trial.values.copy()
-        values[:, trial.channels.index("g1")] *= 1e6
-        trials.append(replace(trial, values=values))
-    result = investigate(replace(campaign, trials=tuple(trials)), laboratory.model, effects)
+
+    def change(trial) -> None:  # type: ignore[no-untyped-def]
+        trial.values[:, trial.channels.index("g1")] *= 1e6
+
+    result = investigate(spoilt(laboratory.measured(23), change), laboratory.model, effects)
     assert result.verdict.kind is VerdictKind.DATA_ERROR, result.verdict.sentence
     assert result.search is None
 
@@ -140,13 +144,12 @@ def test_a_parameter_that_the_model_lacks_is_refused(laboratory, effects) -> Non
 def test_a_gain_far_from_its_prior_is_remarked_on(laboratory, effects) -> None:  # type: ignore[no-untyped-def]
     """A displacement sensor with a wrong gain beside gauges has no entry: the nuisance takes it, far out."""
     campaign = laboratory.measured(1)
-    trials = []
-    for trial in campaign.trials:
-        values = trial.values.copy()
+
+    def change(trial) -> None:  # type: ignore[no-untyped-def]
         if "x2" in trial.channels:
-            values[:, trial.channels.index("x2")] *= 1.05
-        trials.append(replace(trial, values=values))
-    wrong = replace(campaign, trials=tuple(trials))
+            trial.values[:, trial.channels.index("x2")] *= 1.05
+
+    wrong = spoilt(campaign, change)
     found = investigate(wrong, laboratory.model, effects[:1], thorough=False)
     assert any("The gain of the channel 'x2'" in remark for remark in found.verdict.remarks)
     plain = investigate(campaign, laboratory.model, effects[:1], thorough=False)

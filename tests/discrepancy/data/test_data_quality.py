@@ -53,6 +53,10 @@ def scaled(campaign: Campaign, name: str, factor: float, **only: object) -> Camp
     return changed(campaign, change, **only)
 
 
+def of_kind(campaign: Campaign, kind: TrialKind) -> Campaign:
+    return replace(campaign, trials=tuple(trial for trial in campaign.trials if trial.kind is kind))
+
+
 def found(faults) -> set[tuple[FaultKind, str]]:
     for fault in faults:
         assert fault.sentence.endswith(".")
@@ -68,18 +72,11 @@ def test_sound_data_have_no_fault(oscillator, seed: int) -> None:
         ModelPatch((SensorGain("*", -0.2, "strain"), HighPass("x", 2.0))),
     ):
         campaign = example_campaign(oscillator, "complete", seed, PLAN, patch)
+        assert campaign.channels["g0"].noise.degrees_of_freedom == 399
         assert check_data(campaign) == ()
         assert check_against_model(campaign, oscillator) == ()
         marked = mark_outliers(campaign)
         assert all(trial.used.mean() > 0.999 for trial in marked.trials)
-
-
-def test_examples_repeat_and_differ(oscillator) -> None:
-    one, same, other = (example_campaign(oscillator, "laboratory", seed, PLAN) for seed in (1, 1, 2))
-    assert np.array_equal(one.trials[0].values, same.trials[0].values)
-    assert not np.array_equal(one.trials[0].values, other.trials[0].values)
-    assert {trial.kind for trial in one.trials} == {TrialKind.STATIC, TrialKind.RINGDOWN}
-    assert one.channels["g0"].noise.degrees_of_freedom == 399
 
 
 # ---------------------------------------------------------------- units, signs, exchanged channels
@@ -115,18 +112,14 @@ def test_unit_slips(oscillator, campaign, name: str, factor: float, guess: str) 
         assert re.search(guess, " ".join(fault.sentence for fault in faults if fault.fatal))
 
 
-def test_no_slip_between_units_that_the_quantity_does_not_have(oscillator, campaign) -> None:
-    """Strain that is 9.81 times too large is no strain in g."""
-    released = [trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN]
-    slipped = scaled(replace(campaign, trials=tuple(released)), "g0", 9.80665)
-    assert not found(check_against_model(slipped, oscillator))
-
-
-@pytest.mark.parametrize("factor", [0.7, 1.4, 3.0, 5.0, 30.0])
+@pytest.mark.parametrize("factor", [0.7, 1.4, 3.0, 5.0, 9.80665, 30.0])
 def test_other_factors_are_no_unit_slips(oscillator, campaign, factor: float) -> None:
-    assert FaultKind.UNIT_SLIP not in {
-        kind for kind, _ in found(check_against_model(scaled(campaign, "g0", factor), oscillator))
-    }
+    """Strain that is 9.81 times too large is no strain in g, and beside ring-downs alone no fault at all."""
+    faults = found(check_against_model(scaled(campaign, "g0", factor), oscillator))
+    assert FaultKind.UNIT_SLIP not in {kind for kind, _ in faults}
+    if factor == 9.80665:
+        released = scaled(of_kind(campaign, TrialKind.RINGDOWN), "g0", factor)
+        assert not found(check_against_model(released, oscillator))
 
 
 def test_input_slips(oscillator, campaign) -> None:
@@ -137,7 +130,8 @@ def test_input_slips(oscillator, campaign) -> None:
     (fault,) = check_against_model(one, oscillator)
     assert (fault.kind, fault.trial) == (FaultKind.INPUT_SLIP, "loading")
     assert "about 1000 times" in fault.sentence
-    static = replace(campaign, trials=tuple(kilo(t) for t in campaign.trials if t.kind is TrialKind.STATIC))
+    loads = of_kind(campaign, TrialKind.STATIC)
+    static = replace(loads, trials=tuple(map(kilo, loads.trials)))
     (fault,) = check_against_model(static, oscillator)
     assert fault.kind is FaultKind.INPUT_SLIP
     assert "check the units of forces" in fault.sentence
@@ -159,7 +153,7 @@ def test_slip_of_a_release(oscillator, campaign) -> None:
 
 def test_signs(oscillator, campaign) -> None:
     assert found(check_against_model(scaled(campaign, "g1", -1.0), oscillator)) == {(FaultKind.SIGN, "g1")}
-    static = replace(campaign, trials=tuple(t for t in campaign.trials if t.kind is TrialKind.STATIC))
+    static = of_kind(campaign, TrialKind.STATIC)
     turned = replace(static, trials=tuple(replace(t, force=-t.force) for t in static.trials))
     (fault,) = check_against_model(turned, oscillator)
     assert "sign of the forces" in fault.sentence
@@ -172,7 +166,7 @@ def test_readings_that_fall_with_the_load_and_keep_its_sign_are_not_reversed(osc
         column = trial.channels.index("g1")
         values[:, column] = 2.0 * np.sum(values[[0, -1], column]) - values[:, column]
 
-    flight = replace(campaign, trials=tuple(t for t in campaign.trials if t.kind is TrialKind.FLIGHT))
+    flight = of_kind(campaign, TrialKind.FLIGHT)
     assert not found(check_against_model(changed(flight, cool), oscillator))
     assert found(check_against_model(scaled(flight, "g1", -1.0), oscillator)) == {(FaultKind.SIGN, "g1")}
 
@@ -181,7 +175,7 @@ def test_readings_that_fall_with_the_load_and_keep_its_sign_are_not_reversed(osc
 @pytest.mark.parametrize("pair", [("g0", "g1"), ("g1", "g2")])
 def test_swapped_channels(oscillator, campaign, kind: TrialKind | None, pair: tuple[str, str]) -> None:
     if kind is not None:
-        campaign = replace(campaign, trials=tuple(t for t in campaign.trials if t.kind is kind))
+        campaign = of_kind(campaign, kind)
 
     def swap(trial: Trial, values: np.ndarray) -> None:
         columns = [trial.channels.index(name) for name in pair]
@@ -198,10 +192,8 @@ def test_outputs_and_lengths(oscillator, campaign) -> None:
         channel = replace(campaign.channels["g0"], output=output, quantity=quantity)
         return replace(campaign, channels={**campaign.channels, "g0": channel})
 
-    assert found(check_against_model(with_output("strain[9]"), oscillator)) == {
-        (FaultKind.MISSING_OUTPUT, "g0")
-    }
-    assert found(check_against_model(with_output("x"), oscillator)) == {(FaultKind.WRONG_QUANTITY, "g0")}
+    for output, kind in (("strain[9]", FaultKind.MISSING_OUTPUT), ("x", FaultKind.WRONG_QUANTITY)):
+        assert found(check_against_model(with_output(output), oscillator)) == {(kind, "g0")}
     release = next(trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN)
 
     def cut(count: int, step: int = 1) -> Campaign:
@@ -315,10 +307,8 @@ def test_one_percent_of_outliers_is_found_and_left_out(campaign) -> None:
     total = sum(len(rows) for rows in places.values())
     assert hit >= 0.9 * total
     assert left_out - hit <= 1
-    assert (
-        f"of {len(campaign.trials[3].time)} readings of 'g0' in the trial 'release 1' are outliers"
-        in " ".join(marked.remarks)
-    )
+    said = f"of {len(campaign.trials[3].time)} readings of 'g0' in the trial 'release 1' are outliers"
+    assert said in " ".join(marked.remarks)
     assert mark_outliers(marked).trials[3].used.sum() >= marked.trials[3].used.sum() - 1
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.records import TrialKind
-from discrepancy.checks.quality import FaultKind, check_against_model, check_data, mark_outliers
+from discrepancy.checks.quality import check_against_model, check_data, mark_outliers
 from discrepancy.errors import CampaignFileError, ModelError
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import example_campaign, plan_for, wing_plan, write_example
@@ -54,17 +54,6 @@ def test_hidden_effects_are_no_faults_of_the_data(chain: LumpedModel, seed: int)
         assert check_against_model(campaign, chain) == ()
         marked = mark_outliers(campaign)
         assert sum(int((~trial.used).sum()) for trial in marked.trials) <= 2
-
-
-def test_exchanged_strains_are_found(chain: LumpedModel) -> None:
-    campaign = example_campaign(chain, "laboratory", 1, plan_for(chain, OUTPUTS, "end"))
-    base, joint = campaign.channels["base_strain"], campaign.channels["joint_strain"]
-    swapped = {
-        "base_strain": replace(base, output=joint.output),
-        "joint_strain": replace(joint, output=base.output),
-    }
-    (fault,) = check_against_model(replace(campaign, channels={**campaign.channels, **swapped}), chain)
-    assert fault.kind is FaultKind.SWAPPED
 
 
 def test_what_cannot_be_an_example(chain: LumpedModel) -> None:

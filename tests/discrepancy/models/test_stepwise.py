@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
@@ -131,27 +130,6 @@ def test_leaving_samples_out_changes_nothing_at_the_others(
         given = {"force": bare[kept]}
     found = shown(chain, trial(kind, time[kept], **given), *laws, refinement=8)
     np.testing.assert_allclose(found, dense[kept], atol=2e-4 * np.abs(dense).max())
-
-
-def test_a_smooth_law_at_uneven_stamps_is_that_of_a_general_integrator(chain: LumpedModel) -> None:
-    time = jittered(120, 0.01, 0.8)
-    system = chain.rig(np.ones(3)).system()
-    row, end = chain._ports["joint"], np.array([0.0, 0.0, 1.0])
-    inverse = np.linalg.inv(system.mass)
-    start = 0.02 * system.flexibility(end) / float(end @ system.flexibility(end))
-
-    def slope(_: float, state: FloatArray) -> FloatArray:
-        u, v = state[:3], state[3:]
-        speed = float(row @ v)
-        law = 2.0 * abs(speed / 0.2) * speed / 0.2
-        return np.r_[v, inverse @ (-system.stiffness @ u - system.damping @ v - row * law)]
-
-    solution = solve_ivp(
-        slope, (0.0, time[-1]), np.r_[start, np.zeros(3)], t_eval=time, rtol=1e-10, atol=1e-13
-    ).y.T
-    measured = shown(chain, trial(TrialKind.RINGDOWN, time, release=Release(0.02)), QUADRATIC, refinement=16)
-    np.testing.assert_allclose(measured[:, 0], solution[:, 0], atol=2e-6)
-    np.testing.assert_allclose(measured[:, 1], solution[:, 5], atol=2e-5)
 
 
 def test_a_high_pass_follows_uneven_stamps() -> None:

@@ -13,7 +13,6 @@ import pytest
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.fmu_runs import Excitation, Run
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.reduced_structure import StructureModel
 from fe.reduction.reduced_basis import reduce_structure
@@ -27,12 +26,10 @@ from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.structures.rig import rig_text
 
 OUTPUTS = (("tip", Quantity.DISPLACEMENT), ("g1", Quantity.STRAIN), ("shake", Quantity.ACCELERATION))
-TRIAL = Trial(
-    name="a trial", kind=TrialKind.STATIC, channels=(), values=np.zeros((40, 0)), used=np.ones((40, 0), bool),
-    time=1e-4 * np.arange(40), force=np.linspace(-100.0, 200.0, 40), load_factor=np.zeros(40),
-    load_place="tip_load", temperature=np.zeros(40), start=0.0, run="A", health=np.zeros((1, 2)),
-    health_deviation=np.zeros((1, 2)),
-)  # fmt: skip
+TRIAL = Trial.plain(
+    "a trial", TrialKind.STATIC, (), 1e-4 * np.arange(40), force=np.linspace(-100.0, 200.0, 40), run="A"
+)
+RELEASED = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4, mode_count=1))
 
 
 @pytest.fixture(scope="module")
@@ -127,34 +124,16 @@ def test_any_region_is_known_by_its_name(pair: tuple[FmuModel, ReducedModel]) ->
         own.respond(named, OUTPUTS[:1], ModelPatch(), Conditions(conditions, health=health[:, ::-1]))
 
 
-def test_systems_of_small_steps_come_from_steps_that_tell_all_modes(
-    pair: tuple[FmuModel, ReducedModel],
-) -> None:
-    """At 10 kHz modes of 5.8 and 8.7 kHz look like slower ones; smaller steps need a finer base."""
-    model, _ = pair
-    motion, step = model.motion, 1e-4
-    for refinement in (1, 2, 4):
-        system = motion.ports.system(motion.nominal, step / refinement, 400, refinement)
-        assert system is not None
-        force = np.random.default_rng(refinement).uniform(-1.0, 1.0, (400, 1))
-        loads = [(Excitation("input", "push", force[:, 0].copy()), 1.0)]
-        wanted = motion.free(Run(motion.nominal, step / refinement, 400, loads))
-        largest = np.abs(wanted).max(axis=0)
-        np.testing.assert_allclose(system.motion(force) / largest, wanted / largest, atol=1e-6)
-    assert motion.ports.parts(step) == 2
-
-
 def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(pair: tuple[FmuModel, ReducedModel]) -> None:
     """A spring of next to no stiffness changes nothing, nor the acceleration that a release begins with."""
     model, _ = pair
-    trial = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4, mode_count=1))
     spring = ModelPatch((PowerStiffness("tip", 1e-9, 1.0, 0, 1e-3),))
     for e in (1.0, 1.03):
         conditions = Conditions(np.array([e, 0.05]))
-        wanted = model.respond(trial, OUTPUTS, ModelPatch(), conditions).values
+        wanted = model.respond(RELEASED, OUTPUTS, ModelPatch(), conditions).values
         for refinement in (8, 16):
             before = model.runs.step_count
-            seen = model.respond(trial, OUTPUTS, spring, replace(conditions, refinement=refinement)).values
+            seen = model.respond(RELEASED, OUTPUTS, spring, replace(conditions, refinement=refinement)).values
             largest = np.abs(wanted).max(axis=0)
             np.testing.assert_allclose(seen / largest, wanted / largest, atol=1e-6)
     assert model.runs.step_count == before  # confirmed at the first parameters
@@ -164,12 +143,11 @@ def test_an_accelerometer_that_nobody_reads_does_not_shorten_the_steps(
     pair: tuple[FmuModel, ReducedModel],
 ) -> None:
     model, _ = pair
-    trial = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4, mode_count=1))
     law = ModelPatch((PowerStiffness("tip", 10.0, 3.0, 0, 1e-4),))
     found, refinements = [], []
     for outputs in (OUTPUTS, OUTPUTS[:2]):
         model.motion._refinements.clear()
-        moved = model.respond(trial, outputs, law, Conditions(np.array([1.0, 0.05])))
+        moved = model.respond(RELEASED, outputs, law, Conditions(np.array([1.0, 0.05])))
         found.append(moved.values[:, :2])
         refinements += [parts for parts, _ in model.motion._refinements.values()]
     largest = np.abs(found[0]).max(axis=0)

@@ -15,8 +15,6 @@ from scipy.integrate import solve_ivp
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
 from discrepancy.models.sensing import observe
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
@@ -32,26 +30,13 @@ from fe.runtime.patch import (
     SensorGain,
     Window,
 )
+from tests.discrepancy.rigs import one_mass
 
 FloatArray = NDArray[np.float64]
 
 MASS, STIFFNESS = 2.0, 200.0
 OMEGA = (STIFFNESS / MASS) ** 0.5
-MODEL = LumpedModel(
-    parse_lumped(
-        {
-            "format": 1,
-            "name": "Mass on a spring",
-            "mass": MASS,
-            "stiffness": STIFFNESS,
-            "damping": {"alpha": 0.0, "beta": 0.0},
-            "input": [{"name": "push", "vector": 1.0}],
-            "output": [{"name": "x", "vector": 1.0}],
-            "port": [{"name": "slide", "vector": 1.0}],
-        },
-        "here",
-    )
-)
+MODEL = one_mass(stiffness=STIFFNESS, damping={"alpha": 0.0, "beta": 0.0})
 TIME = np.linspace(0.0, 6.0, 301)
 FORCE = 4.0 * np.sin(3.0 * TIME) + 2.0 * np.sin(7.7 * TIME)
 OUTPUTS = (("x", Quantity.DISPLACEMENT), ("x", Quantity.ACCELERATION))
