@@ -4,6 +4,7 @@ from threadpoolctl import threadpool_limits
 from fe.reduction.reduced_basis import Reduction, reduce_model
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign, load_design
 from fe.wing.operators import AffineOperators, assemble
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
@@ -45,3 +46,9 @@ def coarse_patch_operators(coarse_operators: AffineOperators) -> PatchOperators:
 @pytest.fixture(scope="session")
 def coarse_patched_wing(coarse_patch_arrays: PatchArrays) -> PatchedWing:
     return PatchedWing(coarse_patch_arrays)
+
+
+@pytest.fixture(scope="session")
+def model(coarse_reduction: Reduction) -> ReducedModel:
+    """The reduced model of the coarse wing."""
+    return coarse_reduction.model

@@ -14,8 +14,7 @@ from fe.full.statics import Factorisation
 from fe.reduction.model_cache import reduced_structure
 from fe.reduction.reduced_basis import Reduction, reduce_structure
 from fe.reduction.structure_errors import measured_errors
-from fe.runtime.errors import MeshError, OutsideModelError, ReducedModelFileError, ReductionError
-from fe.runtime.reduced import ReducedModel
+from fe.runtime.errors import MeshError, OutsideModelError, ReductionError
 from fe.runtime.transient import ModalIntegrator, TransientState
 from fe.structure.operators import Structure, load_and_assemble
 
@@ -45,15 +44,6 @@ def test_a_state_in_all_its_parts(beam: Structure, beam_reduction: Reduction) ->
     np.testing.assert_allclose(modes.frequency, np.sqrt(squares) / (2 * np.pi), rtol=2e-5)
     wanted = np.abs(np.vstack((beam.gauge_output @ shapes, beam.displacement_output @ shapes)))
     np.testing.assert_allclose(np.abs(modes.output[:4]), wanted, atol=2e-3 * wanted.max())
-
-
-def test_many_states_at_once_are_the_same(beam_reduction: Reduction) -> None:
-    model = beam_reduction.model
-    low, high = model.validity_box.T
-    vectors = low + (high - low) * np.random.default_rng(3).random((5, len(low)))
-    for vector, outputs in zip(vectors, model.static_outputs(vectors), strict=True):
-        single = model.static_response(vector)
-        np.testing.assert_allclose(outputs, [*single.strain, *single.displacement], rtol=1e-11, atol=1e-16)
 
 
 def test_a_released_beam_moves_as_the_full_model(beam: Structure, beam_reduction: Reduction) -> None:
@@ -90,17 +80,6 @@ def test_a_released_beam_moves_as_the_full_model(beam: Structure, beam_reduction
     same = ModalIntegrator(model, vector, beam.damping_alpha, beam.damping_beta)
     taken = motion.outputs(same.take_over(state, motion))
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
-
-
-def test_the_file_gives_the_model_back(beam_reduction: Reduction) -> None:
-    content = beam_reduction.model.to_bytes()
-    again = ReducedModel.from_bytes(content)
-    assert again.to_bytes() == content
-    assert np.array_equal(
-        again.static_response(HURT).strain, beam_reduction.model.static_response(HURT).strain
-    )
-    with pytest.raises(ReducedModelFileError):
-        ReducedModel.from_bytes(content[:-100])
 
 
 def test_a_load_that_no_output_sees(write_beam: Callable[..., Path], tmp_path: Path) -> None:

@@ -49,19 +49,13 @@ def test_arithmetic_is_that_of_python(a: float, b: float, c: float) -> None:
         "(a := 1)",
         "a" + "+a" * 400,
         "9" * 5000,
+        # no finite real number
+        *("1/(a - a)", "log(a - a)", "9**9**9**9", "(-a)**0.5", "exp(1e6)", "1e308*10", "sqrt(-a)"),
     ],
 )
 def test_anything_else_is_refused_with_a_sentence(text: str) -> None:
     with pytest.raises(InvalidPatchError, match=r"^Here\b"):
         expression(text).value({"a": 1.0, "b": 1.0, "c": 1.0})
-
-
-@pytest.mark.parametrize(
-    "text", ["1/(a - a)", "log(a - a)", "9**9**9**9", "(-a)**0.5", "exp(1e6)", "1e308*10", "sqrt(-a)"]
-)
-def test_no_value_but_a_finite_real_number(text: str) -> None:
-    with pytest.raises(InvalidPatchError, match="Here"):
-        expression(text).value({"a": 1.0})
 
 
 def test_a_name_without_a_value() -> None:

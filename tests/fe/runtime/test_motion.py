@@ -97,11 +97,7 @@ def test_a_force_that_is_linear_between_samples_is_exact() -> None:
     assert moved.q[-1, 0] == pytest.approx(duhamel, abs=1e-12)
 
 
-@given(
-    w=st.floats(0.0, 500.0),
-    damping=st.floats(0.0, 2000.0),
-    h=st.floats(1e-6, 1.0),
-)
+@given(w=st.floats(0.0, 500.0), damping=st.floats(0.0, 2000.0), h=st.floats(1e-6, 1.0))
 @settings(max_examples=60, deadline=None)
 def test_the_linear_step_of_any_oscillator_is_the_exponential(w: float, damping: float, h: float) -> None:
     step = linear_step(ModalSystem(np.array([w]), np.array([[damping]])), np.ones(1), np.zeros(1), h)
@@ -136,7 +132,7 @@ def test_coulomb_friction_takes_the_same_from_each_half_cycle_and_stops_the_mass
     expected[~done] = rest
     np.testing.assert_allclose(moved.q[:, 0], expected, atol=2e-4)
     stopped = moved.q[time > 0.5 * half_cycles + 0.05, 0]
-    assert np.ptp(stopped) == 0.0 or np.ptp(stopped) < 1e-12
+    assert np.ptp(stopped) < 1e-12
     assert stopped[-1] == pytest.approx(rest, abs=1e-4)
     assert np.all(np.abs(moved.v[time > 0.5 * half_cycles + 0.05, 0]) < 1e-12)
     # at rest friction holds the spring
@@ -146,13 +142,11 @@ def test_coulomb_friction_takes_the_same_from_each_half_cycle_and_stops_the_mass
 def test_a_mass_within_the_friction_never_moves_and_leaves_under_a_larger_force() -> None:
     friction = laws(PowerDamping("mass", 1.0, 0.0, 0.0, 1.0, 1.0))
     force = np.concatenate((np.linspace(0.0, 0.999, 400), np.full(100, 0.999)))
-    held = simulate(ONE, friction, q=np.zeros(1), v=np.zeros(1), force=force, shape=np.ones(1), interval=0.01)
+    rest = {"q": np.zeros(1), "v": np.zeros(1), "shape": np.ones(1), "interval": 0.01}
+    held = simulate(ONE, friction, force=force, **rest)
     assert np.max(np.abs(held.q)) < 1e-12
     np.testing.assert_allclose(held.port_forces[1:, 0], force[1:], atol=1e-9)
-    free = simulate(
-        ONE, friction, q=np.zeros(1), v=np.zeros(1), force=2.0 * force, shape=np.ones(1), interval=0.01
-    )
-    assert free.q[-1, 0] > 0.5 / STIFFNESS
+    assert simulate(ONE, friction, force=2.0 * force, **rest).q[-1, 0] > 0.5 / STIFFNESS
 
 
 @pytest.mark.parametrize("ratio", [0.35, 0.4, 0.49, 0.55, 0.75, 0.9])
@@ -182,11 +176,8 @@ def test_power_damping_takes_the_energy_that_averaging_says(exponent: float) -> 
     energy = 0.5 * (moved.q[:, 0] ** 2 + (moved.v[:, 0] / W) ** 2)
     integral = quad(lambda u: np.sin(u) ** (exponent + 1.0), 0.0, np.pi)[0] / np.pi
     slope = strength * integral
-    final = (
-        np.exp(-slope * 5.0)
-        if exponent == 1.0
-        else (1.0 - (1.0 - exponent) * slope * 5.0) ** (1.0 / (1.0 - exponent))
-    )
+    less = 1.0 - exponent
+    final = np.exp(-slope * 5.0) if exponent == 1.0 else (1.0 - less * slope * 5.0) ** (1.0 / less)
     assert np.sqrt(2.0 * energy[-1]) == pytest.approx(final, rel=3e-3)  # averaging errs by order zeta^2
 
 
@@ -348,15 +339,9 @@ def test_a_bouc_wen_law_that_yields_at_once_is_dry_friction_in_position() -> Non
 
 
 def test_motions_of_almost_nothing_stay_finite() -> None:
-    tiny = simulate(
-        ONE,
-        laws(PowerDamping("mass", 1.0, 2.5, 0.0, 1.0, 1.0), PowerStiffness("mass", 1.0, 3.0, 0, 1.0)),
-        q=np.array([1e-300]),
-        v=np.array([1e-290]),
-        force=np.zeros(5),
-        interval=0.01,
-    )
-    assert np.all(np.isfinite(tiny.q))
+    both = laws(PowerDamping("mass", 1.0, 2.5, 0.0, 1.0, 1.0), PowerStiffness("mass", 1.0, 3.0, 0, 1.0))
+    q, v = np.array([1e-300]), np.array([1e-290])
+    assert np.all(np.isfinite(simulate(ONE, both, q=q, v=v, force=np.zeros(5), interval=0.01).q))
 
 
 def moved_start(law: BoucWen) -> float:
@@ -515,16 +500,8 @@ def test_a_run_can_be_stopped_and_taken_further() -> None:
     force = 0.1 * K1 * A * np.sin(np.arange(101) * 0.3)
     whole = simulate(WING, everything, q=START, v=np.zeros(4), force=force, **common)
     first = simulate(WING, everything, q=START, v=np.zeros(4), force=force[:41], **common)
-    rest = simulate(
-        WING,
-        everything,
-        q=first.q[-1],
-        v=first.v[-1],
-        memory=first.memory,
-        force=force[40:],
-        start=0.2,
-        **common,
-    )
+    common |= {"q": first.q[-1], "v": first.v[-1], "memory": first.memory, "start": 0.2}
+    rest = simulate(WING, everything, force=force[40:], **common)
     np.testing.assert_allclose(rest.q, whole.q[40:], atol=1e-13)
 
 
@@ -548,12 +525,8 @@ def test_damping_never_feeds_energy(seed: int) -> None:
 
 
 def test_laws_without_magnitude_leave_the_linear_structure() -> None:
-    nothing = laws(
-        PowerDamping("tip", 0.0, 0, 0, 1, 1),
-        FreePlay("tip", 10.0, 0.0),
-        StiffnessDrift(0.0),
-        PointMass(1.0, 0.5),
-    )
+    damping, play = PowerDamping("tip", 0.0, 0, 0, 1, 1), FreePlay("tip", 10.0, 0.0)
+    nothing = laws(damping, play, StiffnessDrift(0.0), PointMass(1.0, 0.5))
     assert nothing is NO_LAWS
     assert substeps_for(WING.angular_frequency, nothing, 0.005) == 1
 
@@ -561,10 +534,7 @@ def test_laws_without_magnitude_leave_the_linear_structure() -> None:
 @pytest.mark.parametrize(
     ("law", "sentence"),
     [
-        (
-            PowerDamping("nose", 1, 0, 0, 1, 1),
-            "port 'nose', which this model does not have; it has mass, tip",
-        ),
+        (PowerDamping("nose", 1, 0, 0, 1, 1), "port 'nose', which this model does not have; it has mass"),
         (PowerDamping("tip", -1, 0, 0, 1, 1), "coefficient of 'power_damping' must not be negative"),
         (PowerDamping("tip", 1, 0, 0, 0, 1), "reference_velocity of 'power_damping' must be positive"),
         (PowerStiffness("tip", 1, 0, 0, 1), "exponent of 'power_stiffness' must be positive"),

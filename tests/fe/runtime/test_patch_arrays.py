@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,35 +29,22 @@ def test_a_file_gives_the_arrays_back(coarse_patch_arrays: PatchArrays, tmp_path
     assert again.to_bytes() == coarse_patch_arrays.to_bytes()
 
 
-def test_a_damaged_file_is_refused(coarse_patch_arrays: PatchArrays) -> None:
-    content = coarse_patch_arrays.to_bytes()
-    with pytest.raises(ReducedModelFileError, match="not a sound archive"):
-        PatchArrays.from_bytes(content[: len(content) // 2])
-
-
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("name", "change", "message"),
     [
-        ({"load_tip": np.full(3, np.nan)}, "array"),
-        ({"flap_spring": 0.0}, "flap_spring"),
-        ({"straight_chord_line": 2.0}, "straight_chord_line"),
-        ({"weight": np.zeros(2)}, "weight"),
+        ("load_tip", lambda _: np.full(3, np.nan), "array"),
+        ("flap_spring", lambda _: 0.0, "flap_spring"),
+        ("straight_chord_line", lambda _: 2.0, "straight_chord_line"),
+        ("weight", lambda _: np.zeros(2), "weight"),
+        ("strip_of", lambda strips: np.array([99, *strips[1:]]), "strips"),
+        ("stations", lambda stations: stations[::-1].copy(), "must rise"),
     ],
 )
 def test_wrong_arrays_are_refused(
-    coarse_patch_arrays: PatchArrays, changes: dict[str, object], message: str
+    coarse_patch_arrays: PatchArrays, name: str, change: Callable[[Any], object], message: str
 ) -> None:
     with pytest.raises(ReducedModelFileError, match=message):
-        replace(coarse_patch_arrays, **changes)  # type: ignore[arg-type]
-
-
-def test_strips_that_do_not_fit_are_refused(coarse_patch_arrays: PatchArrays) -> None:
-    wrong = coarse_patch_arrays.strip_of.copy()
-    wrong[0] = 99
-    with pytest.raises(ReducedModelFileError, match="strips"):
-        replace(coarse_patch_arrays, strip_of=wrong)
-    with pytest.raises(ReducedModelFileError, match="must rise"):
-        replace(coarse_patch_arrays, stations=coarse_patch_arrays.stations[::-1].copy())
+        replace(coarse_patch_arrays, **{name: change(getattr(coarse_patch_arrays, name))})
 
 
 def test_strip_edges_are_mesh_lines_ends_included() -> None:

@@ -1,11 +1,9 @@
 """The reduced model against the full one, on a coarse mesh of the shipped wing."""
 
 import ast
-import io
 import shutil
 import subprocess
 import sys
-import zipfile
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -16,7 +14,6 @@ from hypothesis import strategies as st
 
 import fe.runtime.kept_arrays
 from fe.full.statics import Factorisation
-from fe.reduction.reduced_basis import Reduction
 from fe.runtime.errors import OutsideModelError, ReducedModelFileError
 from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.reduced import ReducedModel
@@ -24,6 +21,8 @@ from fe.wing.operators import AffineOperators
 from fe.wing.responses import eigenmodes, static_outputs, tip_stiffness
 
 PACKAGE = Path(fe.runtime.kept_arrays.__file__).parent
+
+Losses = tuple[float, float]
 
 # The corners and edges of the box count most; the rest is anywhere inside.
 young_modulus_factors = st.sampled_from((0.9, 1.0, 1.1)) | st.floats(0.9, 1.1)
@@ -33,11 +32,6 @@ load_factors = st.sampled_from((-4.0, 0.0, 3.0, 6.0)) | st.floats(1e-9, 6.0)
 tip_forces = st.sampled_from((-100.0, 0.0, 100.0)) | st.floats(-100.0, -1e-9)
 
 
-@pytest.fixture(scope="module")
-def model(coarse_reduction: Reduction) -> ReducedModel:
-    return coarse_reduction.model
-
-
 def test_bound_holds_and_error_is_small(coarse_operators: AffineOperators, model: ReducedModel) -> None:
     @settings(max_examples=15, deadline=None)
     @given(e=young_modulus_factors, z1=losses, z2=losses, load_factor=load_factors, tip_force=tip_forces)
@@ -45,14 +39,14 @@ def test_bound_holds_and_error_is_small(coarse_operators: AffineOperators, model
         factors = Factorisation(coarse_operators.stiffness({"young_modulus_factor": e}, (z1, z2)))
         loads = np.stack((coarse_operators.load_lift, coarse_operators.load_tip), axis=1)
         unit_solutions = factors.solve(loads)
-        full = static_outputs(coarse_operators, unit_solutions @ np.array((load_factor, tip_force)))
+        # of both loads at once: where they nearly cancel, a sum of two solutions has lost its digits
+        full = static_outputs(coarse_operators, factors.solve(loads @ np.array((load_factor, tip_force))))
         reduced = model.static_response(
             young_modulus_factor=e, stiffness_loss=(z1, z2), load_factor=load_factor, tip_force=tip_force
         )
 
         assert np.abs(reduced.strain - full.strain).max() <= reduced.strain_error_bound
-        tip_error = abs(reduced.displacement[0] - full.tip_displacement)
-        assert tip_error <= reduced.displacement_error_bound
+        assert abs(reduced.displacement[0] - full.tip_displacement) <= reduced.displacement_error_bound
 
         # combined loads may nearly cancel, so the scale is that of each load alone
         strains = np.abs(coarse_operators.gauge_output @ unit_solutions).max(axis=0)
@@ -73,30 +67,6 @@ def test_tip_stiffness_is_that_of_the_full_model(
     assert model.tip_stiffness(e, z) == pytest.approx(tip_stiffness(coarse_operators, e, z), rel=1e-5)
 
 
-@given(e=young_modulus_factors, z1=st.floats(0.0, 0.7), z2=st.floats(0.0, 0.7), more=st.floats(0.02, 0.1))
-def test_wing_is_softer_with_more_damage_and_less_skin(
-    model: ReducedModel, e: float, z1: float, z2: float, more: float
-) -> None:
-    stiffness = model.tip_stiffness(e, (z1, z2))
-    assert model.tip_stiffness(e, (z1 + more, z2)) < stiffness
-    assert model.tip_stiffness(e, (z1, z2 + more)) < stiffness
-    assert model.tip_stiffness(max(e - more, 0.9), (z1, z2)) <= stiffness
-
-
-@given(e=young_modulus_factors, z1=losses, z2=losses, load_factor=load_factors, tip_force=tip_forces)
-def test_response_is_linear_in_the_loads(
-    model: ReducedModel, e: float, z1: float, z2: float, load_factor: float, tip_force: float
-) -> None:
-    lift = model.static_response(young_modulus_factor=e, stiffness_loss=(z1, z2), load_factor=1.0).strain
-    tip = model.static_response(
-        young_modulus_factor=e, stiffness_loss=(z1, z2), load_factor=0.0, tip_force=1.0
-    ).strain
-    both = model.static_response(
-        young_modulus_factor=e, stiffness_loss=(z1, z2), load_factor=load_factor, tip_force=tip_force
-    ).strain
-    np.testing.assert_allclose(both, load_factor * lift + tip_force * tip, rtol=0.0, atol=1e-14)
-
-
 def test_no_load_gives_no_strain_and_no_bound(model: ReducedModel) -> None:
     response = model.static_response(young_modulus_factor=1.0, stiffness_loss=(0.2, 0.3), load_factor=0.0)
     assert not response.strain.any()
@@ -106,21 +76,20 @@ def test_no_load_gives_no_strain_and_no_bound(model: ReducedModel) -> None:
 
 def test_many_states_at_once_equal_one_by_one(model: ReducedModel) -> None:
     random = np.random.default_rng(3)
-    e, z, n, f = (
-        random.uniform(0.9, 1.1, 40),
-        random.uniform(0, 0.8, (40, 2)),
-        np.full(40, 3.0),
-        np.arange(40.0),
-    )
-    one_by_one = [
-        model.static_response(young_modulus_factor=a, stiffness_loss=b, load_factor=c, tip_force=d).strain
-        for a, b, c, d in zip(e, z, n, f, strict=True)
-    ]
-    columns = {"young_modulus_factor": e, "z1": z[:, 0], "z2": z[:, 1], "load_factor": n, "tip_force": f}
+    e, z = random.uniform(0.9, 1.1, 40), random.uniform(0, 0.8, (40, 2))
+    losses = {"z1": z[:, 0], "z2": z[:, 1]}
+    columns = {
+        "young_modulus_factor": e,
+        **losses,
+        "load_factor": np.full(40, 3.0),
+        "tip_force": np.arange(40.0),
+    }
+    rows = (dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True))
     outputs = model.static_outputs(model.vectors(columns))
+    one_by_one = [model.static_response(row).strain for row in rows]
     np.testing.assert_allclose(outputs[:, :-1], one_by_one, rtol=1e-11, atol=1e-16)
     np.testing.assert_array_equal(
-        model.static_outputs(model.vectors({"z1": z[:, 0], "z2": z[:, 1], "load_factor": 3.0})),
+        model.static_outputs(model.vectors({**losses, "load_factor": 3.0})),
         model.static_outputs(
             model.vectors({**columns, "young_modulus_factor": np.ones(40), "tip_force": np.zeros(40)})
         ),
@@ -128,36 +97,25 @@ def test_many_states_at_once_equal_one_by_one(model: ReducedModel) -> None:
     assert model.static_outputs(model.vectors({"z1": 0.1})).shape == (1, model.gauge_count + 1)
 
 
+SHARED, LOADS, MASSES = (
+    ("young_modulus_factor", "z1", "z2"),
+    ("load_factor", "tip_force"),
+    ("servo_mass", "pitot_mass"),
+)
+
+
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e9, -1e9])
-@pytest.mark.parametrize("name", ["young_modulus_factor", "z1", "z2", "load_factor", "tip_force"])
-def test_statics_outside_validity_are_refused_by_name(model: ReducedModel, name: str, bad: float) -> None:
-    values = {
-        "young_modulus_factor": 1.0,
-        "z1": 0.1,
-        "z2": 0.1,
-        "load_factor": 3.0,
-        "tip_force": 0.0,
-        name: bad,
-    }
-    with pytest.raises(OutsideModelError, match=rf"^{name} must lie between"):
-        model.static_response(values)
-    with pytest.raises(OutsideModelError, match=rf"^{name} must lie between"):
-        model.static_outputs(np.stack((model.nominal, model.vector(values))))
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1.0])
-@pytest.mark.parametrize("name", ["young_modulus_factor", "z1", "z2", "servo_mass", "pitot_mass"])
-def test_modes_outside_validity_are_refused_by_name(model: ReducedModel, name: str, bad: float) -> None:
-    values = {
-        "young_modulus_factor": 1.0,
-        "z1": 0.1,
-        "z2": 0.1,
-        "servo_mass": 0.17,
-        "pitot_mass": 0.13,
-        name: bad,
-    }
-    with pytest.raises(OutsideModelError, match=rf"^{name} must lie between"):
-        model.modes(values)
+@pytest.mark.parametrize("name", SHARED + LOADS + MASSES)
+def test_values_outside_validity_are_refused_by_name(model: ReducedModel, name: str, bad: float) -> None:
+    vector = model.vector({name: bad})
+    asked = []
+    if name not in MASSES:
+        asked += [(model.static_response, vector), (model.static_outputs, np.stack((model.nominal, vector)))]
+    if name not in LOADS:
+        asked.append((model.modes, vector))
+    for ask, values in asked:
+        with pytest.raises(OutsideModelError, match=rf"^{name} must lie between"):
+            ask(values)
 
 
 def test_all_corners_of_the_box_are_inside(model: ReducedModel) -> None:
@@ -179,15 +137,9 @@ def test_the_bound_allows_for_rounding(model: ReducedModel, state: tuple[float, 
     chosen = model.vector({"load_factor": 3.0, "tip_force": 5.0}, loss, young_modulus_factor=e)
     response = model.static_response(chosen)
     without = replace(model, rounding_allowance=0.0).static_response(chosen)
-    strain, tip = np.linalg.norm(response.strain), abs(response.displacement[0])
-    assert response.strain_error_bound >= 5e-6 * strain
-    assert response.displacement_error_bound >= 5e-6 * tip
-    assert response.strain_error_bound - without.strain_error_bound == pytest.approx(
-        model.rounding_allowance * strain, rel=1e-9
-    )
-    assert response.displacement_error_bound - without.displacement_error_bound == pytest.approx(
-        model.rounding_allowance * tip, rel=1e-9
-    )
+    for kind, seen in (("strain", response.strain), ("displacement", response.displacement[:1])):
+        added = getattr(response, f"{kind}_error_bound") - getattr(without, f"{kind}_error_bound")
+        assert added == pytest.approx(model.rounding_allowance * np.linalg.norm(seen), rel=1e-9)
 
 
 STATES = [
@@ -199,22 +151,16 @@ STATES = [
 ]
 
 
-def _masses(
-    model: ReducedModel, e: float, loss: tuple[float, float], servo: float, pitot: float
-) -> np.ndarray:
-    return model.vector(
-        {"young_modulus_factor": e, "servo_mass": servo, "pitot_mass": pitot}, stiffness_loss=loss
-    )
+def vector_of(model: ReducedModel, e: float, loss: Losses, servo: float, pitot: float) -> np.ndarray:
+    return model.vector({"young_modulus_factor": e, "servo_mass": servo, "pitot_mass": pitot}, loss)
 
 
 @pytest.mark.parametrize("state", STATES)
 def test_modes_are_those_of_the_full_model(
-    coarse_operators: AffineOperators,
-    model: ReducedModel,
-    state: tuple[float, tuple[float, float], float, float],
+    coarse_operators: AffineOperators, model: ReducedModel, state: tuple[float, Losses, float, float]
 ) -> None:
     full = eigenmodes(coarse_operators, *state)
-    reduced = model.modes(_masses(model, *state))
+    reduced = model.modes(vector_of(model, *state))
     relative = reduced.frequency / full.frequency[: model.mode_count] - 1.0
     assert np.all(relative > -1e-6)  # a projection can only be stiffer
     assert np.all(relative < 1e-4)
@@ -222,19 +168,15 @@ def test_modes_are_those_of_the_full_model(
     assert min(reduced.followed_mac) > 0.8  # far more than any other mode could have
     for index in reduced.followed:
         np.testing.assert_allclose(reduced.output[-1, index], full.tip_displacement[index], rtol=3e-3)
+        strain, moved = full.strain[:, index], full.load_point_displacement[index]
         np.testing.assert_allclose(
-            reduced.output[:-1, index],
-            full.strain[:, index],
-            rtol=0,
-            atol=1e-2 * np.abs(full.strain[:, index]).max(),
+            reduced.output[:-1, index], strain, rtol=0, atol=1e-2 * np.abs(strain).max()
         )
-        np.testing.assert_allclose(
-            reduced.participation[1, index], full.load_point_displacement[index], rtol=3e-3
-        )
+        np.testing.assert_allclose(reduced.participation[1, index], moved, rtol=3e-3)
 
 
 def test_modes_are_orthonormal_in_the_mass(model: ReducedModel) -> None:
-    modes = model.modes(young_modulus_factor=0.95, stiffness_loss=(0.3, 0.6), servo_mass=0.2, pitot_mass=0.1)
+    modes = model.modes(vector_of(model, 0.95, (0.3, 0.6), 0.2, 0.1))
     np.testing.assert_allclose(modes.shape.T @ modes.mass @ modes.shape, np.eye(model.mode_count), atol=1e-11)
     assert np.all(np.diff(modes.frequency) > 0)
     assert np.all(modes.output[-1] >= 0)
@@ -256,16 +198,14 @@ def test_low_modes_keep_their_digits(model: ReducedModel) -> None:
         terms = getattr(model, name)
         np.testing.assert_array_equal(terms, terms.transpose(0, 2, 1))
     for state in ((1.0, (0.0, 0.0), 0.169, 0.134), (0.9, (0.8, 0.3), 0.05, 0.0), (1.1, (0.5, 0.8), 0.3, 0.3)):
-        one, other = model.modes(_masses(model, *state)), turned.modes(_masses(model, *state))
+        one, other = (which.modes(vector_of(model, *state)) for which in (model, turned))
         np.testing.assert_allclose(other.frequency, one.frequency, rtol=2e-13)
         np.testing.assert_allclose(other.followed_mac, one.followed_mac, rtol=1e-11)
         assert other.followed == one.followed
 
 
 def test_modal_compliance_adds_up_to_the_static_one(model: ReducedModel) -> None:
-    modes = model.modes(
-        young_modulus_factor=1.0, stiffness_loss=(0.2, 0.2), servo_mass=0.169, pitot_mass=0.134
-    )
+    modes = model.modes(vector_of(model, 1.0, (0.2, 0.2), 0.169, 0.134))
     terms = modes.participation[1] ** 2 / (2 * np.pi * modes.frequency) ** 2
     assert 0.97 < terms.sum() * model.tip_stiffness(1.0, (0.2, 0.2)) < 1.0
 
@@ -279,50 +219,27 @@ def test_saved_model_comes_back_to_the_last_bit(model: ReducedModel, tmp_path: P
             np.testing.assert_array_equal(getattr(again, item.name), getattr(model, item.name))
     assert again.to_bytes() == model.to_bytes() == path.read_bytes()
     assert [p.name for p in tmp_path.iterdir()] == ["wing.npz"]
-    one, two = (
-        model.static_response(young_modulus_factor=1.0, stiffness_loss=(0.1, 0.2), load_factor=3.0),
-        again.static_response(young_modulus_factor=1.0, stiffness_loss=(0.1, 0.2), load_factor=3.0),
-    )
-    np.testing.assert_array_equal(one.strain, two.strain)
-    assert one.strain_error_bound == two.strain_error_bound
 
 
-def test_file_is_plain_and_bears_no_date(model: ReducedModel) -> None:
-    with zipfile.ZipFile(io.BytesIO(model.to_bytes())) as archive:
-        assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
-    with np.load(io.BytesIO(model.to_bytes()), allow_pickle=False) as arrays:
-        assert str(arrays["design_hash"]) == model.design_hash
-
-
-def test_damaged_files_are_refused_with_one_sentence(model: ReducedModel, tmp_path: Path) -> None:
-    good = model.to_bytes()
+def test_incomplete_damaged_or_foreign_files_are_refused(model: ReducedModel, tmp_path: Path) -> None:
     path = tmp_path / "wing.npz"
-    spoilt = bytearray(good)
-    spoilt[len(good) // 2] ^= 0xFF
-    for content in (b"", b"not a zip", good[: len(good) // 2], bytes(spoilt), good[100:]):
-        path.write_bytes(content)
-        with pytest.raises(ReducedModelFileError, match=r"wing\.npz is not a sound archive"):
-            ReducedModel.load(path)
     with pytest.raises(FileNotFoundError):
-        ReducedModel.load(tmp_path / "absent.npz")
-
-
-def test_incomplete_or_foreign_files_are_refused(model: ReducedModel) -> None:
+        ReducedModel.load(path)
+    path.write_bytes(model.to_bytes()[:1000])
+    with pytest.raises(ReducedModelFileError, match=r"wing\.npz is not a sound archive"):
+        ReducedModel.load(path)
     arrays = arrays_from_bytes(model.to_bytes(), "the model")
-    with pytest.raises(ReducedModelFileError, match="lacks cross_mass"):
-        ReducedModel.from_bytes(
-            arrays_to_bytes({name: array for name, array in arrays.items() if name != "cross_mass"})
-        )
-    with pytest.raises(ReducedModelFileError, match=r"has the format 99"):
-        ReducedModel.from_bytes(arrays_to_bytes({**arrays, "format": np.array(99)}))
-    with pytest.raises(ReducedModelFileError, match="static_load"):
-        ReducedModel.from_bytes(arrays_to_bytes({**arrays, "static_load": np.zeros((2, 1))}))
-    with pytest.raises(ReducedModelFileError, match="finite"):
-        ReducedModel.from_bytes(arrays_to_bytes({**arrays, "static_load": arrays["static_load"] * np.nan}))
-    with pytest.raises(ReducedModelFileError, match="modes"):
-        replace(model, mode_count=0)
-    with pytest.raises(ReducedModelFileError, match="rounding_allowance"):
-        replace(model, rounding_allowance=-1.0)
+    for changes, sentence in (
+        ({"cross_mass": None}, "lacks cross_mass"),
+        ({"format": np.array(99)}, "has the format 99"),
+        ({"static_load": np.zeros((2, 1))}, "static_load"),
+        ({"static_load": arrays["static_load"] * np.nan}, "finite"),
+        ({"mode_count": np.array(0)}, "modes"),
+        ({"rounding_allowance": np.array(-1.0)}, "rounding_allowance"),
+    ):
+        wrong = {name: array for name, array in {**arrays, **changes}.items() if array is not None}
+        with pytest.raises(ReducedModelFileError, match=sentence):
+            ReducedModel.from_bytes(arrays_to_bytes(wrong))
 
 
 @pytest.mark.parametrize(
@@ -336,15 +253,6 @@ def test_arrays_of_a_wrong_kind_are_refused(model: ReducedModel, value: np.ndarr
             continue
         with pytest.raises(ReducedModelFileError):
             ReducedModel.from_bytes(arrays_to_bytes({**arrays, name: value}))
-
-
-def test_pickles_are_never_read() -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, format=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(ReducedModelFileError):
-        ReducedModel.from_bytes(buffer.getvalue())
-    with pytest.raises(ValueError, match=r"[Oo]bject"):
-        arrays_to_bytes({"a": np.array([{"a": 1}], dtype=object)})
 
 
 def test_failed_write_leaves_the_old_file(
@@ -368,17 +276,13 @@ def test_runtime_files_import_only_numpy_the_standard_library_and_each_other() -
     assert len(files) > 15
     for name in files:
         for node in ast.walk(ast.parse(name.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-                continue
+            modules = []
             if isinstance(node, ast.Import):
                 modules = [alias.name.split(".")[0] for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and node.level == 0:
                 modules = [str(node.module).split(".")[0]]
             elif isinstance(node, ast.ImportFrom):
                 assert node.level <= len(name.relative_to(PACKAGE).parts), name
-                continue
-            else:
-                continue
             assert set(modules) <= {"numpy", *sys.stdlib_module_names}, name
 
 
@@ -398,8 +302,5 @@ def test_copied_runtime_evaluates_the_same_without_this_package(model: ReducedMo
         [sys.executable, "-I", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     strain = [float.fromhex(word) for word in result.stdout.split()]
-    np.testing.assert_allclose(
-        strain,
-        model.static_response(young_modulus_factor=1.0, stiffness_loss=(0.1, 0.2), load_factor=3.0).strain,
-        rtol=1e-12,
-    )
+    here = model.static_response({"z1": 0.1, "z2": 0.2, "load_factor": 3.0})
+    np.testing.assert_allclose(strain, here.strain, rtol=1e-12)

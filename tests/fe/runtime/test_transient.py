@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from fe.full.statics import Factorisation
-from fe.reduction.reduced_basis import Reduction
 from fe.runtime.errors import InvalidStateError, OutsideModelError
 from fe.runtime.modal_system import exact_step, rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
@@ -27,11 +26,6 @@ HEALTHY = {
     "damping_alpha": ALPHA,
     "damping_beta": BETA,
 }
-
-
-@pytest.fixture(scope="module")
-def model(coarse_reduction: Reduction) -> ReducedModel:
-    return coarse_reduction.model
 
 
 @pytest.fixture(scope="module")
@@ -91,21 +85,9 @@ def test_loads_that_are_held_are_integrated_exactly(model: ReducedModel, beta: f
         np.testing.assert_allclose(found, y[:-1], atol=1e-9 * np.abs(y[:-1]).max())
 
 
-@given(cut=st.floats(0.05, 0.95), duration=st.floats(1e-3, 2.0))
-def test_a_step_may_be_cut_anywhere(integrator: ModalIntegrator, cut: float, duration: float) -> None:
-    load = np.array([3.0, 10.0])
-    state = integrator.released(0.05, (1.0, 0.0), TIP_FORCE)
-    whole = integrator.advance(state, duration, load)
-    parts = integrator.advance(integrator.advance(state, cut * duration, load), (1 - cut) * duration, load)
-    np.testing.assert_allclose(parts.displacement, whole.displacement, atol=1e-10)
-    np.testing.assert_allclose(parts.velocity, whole.velocity, atol=1e-8)
-
-
 def test_rest_is_the_static_response_and_stays(integrator: ModalIntegrator, model: ReducedModel) -> None:
     state = integrator.at_rest((3.0, 5.0))
-    static = model.static_response(
-        young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), load_factor=3.0, tip_force=5.0
-    )
+    static = model.static_response({"load_factor": 3.0, "tip_force": 5.0})
     for _ in range(5):
         outputs = integrator.outputs(state)
         np.testing.assert_allclose(outputs, np.append(static.strain, static.displacement), rtol=1e-9)
@@ -122,12 +104,6 @@ def test_the_load_point_rests_where_its_compliance_puts_it(
     # 5 cm inboard of the tip, it moves less than the tip and in time with it
     released = integrator.released(0.03, (0.0, 0.0), TIP_FORCE)
     assert 0.9 * 0.03 < integrator.point_displacement(released, TIP_FORCE) < 0.03
-
-
-def test_slow_load_is_followed_quasi_statically(integrator: ModalIntegrator, model: ReducedModel) -> None:
-    state = integrator.advance(integrator.at_rest((2.0, 0.0)), 500.0, (3.0, 0.0))
-    static = model.static_response(young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), load_factor=3.0)
-    np.testing.assert_allclose(integrator.outputs(state)[:-1], static.strain, rtol=1e-4)
 
 
 def test_released_tip_starts_where_it_was_held_and_rings_down(integrator: ModalIntegrator) -> None:
@@ -156,19 +132,6 @@ def test_released_under_load_returns_to_the_static_shape(integrator: ModalIntegr
     assert integrator.outputs(state)[-1] == pytest.approx(rest[-1] - 0.01, rel=5e-3)
     later = integrator.outputs(integrator.advance(state, 60.0, (2.0, 0.0)))
     np.testing.assert_allclose(later[:-1], rest[:-1], rtol=1e-6)
-
-
-def test_step_in_load_overshoots_as_in_closed_form(integrator: ModalIntegrator) -> None:
-    first = integrator.modes.followed[0]
-    zeta, omega = integrator.damping_ratio[first], 2 * np.pi * integrator.modes.frequency[first]
-    state = integrator.at_rest((2.0, 0.0))
-    half_period = np.pi / (omega * np.sqrt(1 - zeta**2))
-    peak = integrator.advance(state, half_period, (3.0, 0.0)).displacement[first]
-    before, after = state.displacement[first], integrator.at_rest((3.0, 0.0)).displacement[first]
-    overshoot = np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2))
-    assert (peak - after) / (after - before) == pytest.approx(overshoot, rel=1e-9)
-    tip = integrator.outputs(integrator.advance(state, half_period, (3.0, 0.0)))[-1]
-    assert tip > 1.2 * integrator.outputs(integrator.at_rest((3.0, 0.0)))[-1]
 
 
 def energy_of(integrator: ModalIntegrator, state: TransientState) -> float:
@@ -254,11 +217,10 @@ def test_state_that_cannot_be_is_refused(values: list[float]) -> None:
 def test_taking_over_an_unchanged_wing_changes_nothing(
     model: ReducedModel, integrator: ModalIntegrator
 ) -> None:
-    same = wing_integrator(model, **HEALTHY)
     state = integrator.advance(integrator.released(0.03, (2.0, 0.0), TIP_FORCE), 0.013, (2.7, 1.0))
-    taken = same.take_over(state, integrator)
-    scale = np.abs(state.displacement).max()
-    np.testing.assert_allclose(taken.displacement, state.displacement, atol=1e-4 * scale)
+    taken = wing_integrator(model, **HEALTHY).take_over(state, integrator)
+    moved = state.displacement
+    np.testing.assert_allclose(taken.displacement, moved, atol=1e-4 * np.abs(moved).max())
     np.testing.assert_allclose(taken.velocity, state.velocity, rtol=1e-9)
     assert taken.load is state.load
 
@@ -276,7 +238,7 @@ def test_damage_in_flight_keeps_motion_and_changes_strain(
         assert damaged.modes.output[-1] @ after.velocity == pytest.approx(was, abs=2e-2 * 1.0)
     # long after, it rests where the damaged wing rests
     late = damaged.advance(after, 60.0, (3.0, 0.0))
-    static = model.static_response(young_modulus_factor=1.0, stiffness_loss=(0.4, 0.2), load_factor=3.0)
+    static = model.static_response({"z1": 0.4, "z2": 0.2, "load_factor": 3.0})
     np.testing.assert_allclose(damaged.outputs(late)[:-1], static.strain, rtol=1e-6)
     # from rest, damage sets the wing moving about its new, lower-stiffness equilibrium
     jolted = damaged.take_over(integrator.at_rest((3.0, 0.0)), integrator)
@@ -293,14 +255,17 @@ def test_no_change_of_health_creates_energy_in_free_vibration(
 
 def test_bad_input_is_refused(model: ReducedModel, integrator: ModalIntegrator) -> None:
     rest = integrator.at_rest((1.0, 0.0))
-    for duration in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(InvalidStateError, match="positive duration"):
-            integrator.advance(rest, duration, (1.0, 0.0))
-    with pytest.raises(InvalidStateError, match="finite load"):
-        integrator.advance(rest, 0.1, (float("nan"), 0.0))
-    with pytest.raises(InvalidStateError, match="damping_alpha"):
-        wing_integrator(model, **{**HEALTHY, "damping_alpha": -1.0})
-    with pytest.raises(InvalidStateError, match="damping_beta"):
-        wing_integrator(model, **{**HEALTHY, "damping_beta": float("nan")})
-    with pytest.raises(OutsideModelError, match="servo_mass"):
-        wing_integrator(model, **{**HEALTHY, "servo_mass": 5.0})
+    nan, inf = float("nan"), float("inf")
+    for duration, load, sentence in (
+        *((duration, 1.0, "positive duration") for duration in (0.0, -1.0, nan, inf)),
+        (0.1, nan, "finite load"),
+    ):
+        with pytest.raises(InvalidStateError, match=sentence):
+            integrator.advance(rest, duration, (load, 0.0))
+    for name, value, kind in (
+        ("damping_alpha", -1.0, InvalidStateError),
+        ("damping_beta", nan, InvalidStateError),
+        ("servo_mass", 5.0, OutsideModelError),
+    ):
+        with pytest.raises(kind, match=name):
+            wing_integrator(model, **{**HEALTHY, name: value})

@@ -26,13 +26,9 @@ def coordinates(points: Any, kind: str) -> Any:
     """Coordinates (n, 3) of points in the system at ORIGIN that TURN turned: what a reader undoes."""
     x, y, z = TURN.inv().apply(points - ORIGIN).T
     flat = np.hypot(x, y)
-    return {
-        "R": np.column_stack((x, y, z)),
-        "C": np.column_stack((flat, np.rad2deg(np.arctan2(y, x)), z)),
-        "S": np.column_stack(
-            (np.hypot(flat, z), np.rad2deg(np.arctan2(flat, z)), np.rad2deg(np.arctan2(y, x)))
-        ),
-    }[kind]
+    around, down = np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arctan2(flat, z))
+    found = {"R": (x, y, z), "C": (flat, around, z), "S": (np.hypot(flat, z), down, around)}
+    return np.column_stack(found[kind])
 
 
 def written(path: Path, *lines: str) -> StructureMesh:
@@ -109,24 +105,12 @@ BULK = ["GRID,1,,0.,0.,0.", "GRID,2,,1.,0.,0.", "GRID,3,,0.,1.,0.", "GRID,4,,0.,
         ("GRID,2,,", "GRID,2,5,", "line 2: the coordinate system 5 is not there"),
         ("GRID,2,,", "CORD1R,5,1,2,3\nGRID,2,5,", "the coordinate system 5 rests on itself, or on too many"),
         ("GRID,2,,", "CORD2R,5,5,0.,0.,0.,0.,0.,1.\n,1.\nGRID,2,5,", "coordinate system 5 rests on itself"),
-        (
-            "GRID,2,,",
-            "CORD2C,5,,0.,0.,0.,0.,0.,1.\n,0.,0.,2.\nGRID,2,5,",
-            "line 2: the three points .* on a line",
-        ),
+        ("GRID,2,,", "CORD2C,5,,0.,0.,0.,0.,0.,1.\n,0.,0.,2.\nGRID,2,5,", "line 2: the three points .* line"),
         ("GRID,2,,", "CORD1C,5,1,3,77\nGRID,2,5,", "line 2: the grid point 77 is not there"),
         ("GRID,2,,1.", "GRID,2,,1.x", "line 2: a real number is expected, but '1.x' came"),
-        (
-            "CTETRA,8,1,1,2,3,4",
-            "CTETRA,8,1,1,2,3,4,5",
-            "line 5: CTETRA 8 must have 4 or 10 nodes, but 5 came",
-        ),
+        ("1,1,2,3,4", "1,1,2,3,4,5", "line 5: CTETRA 8 must have 4 or 10 nodes, but 5 came"),
         ("CTETRA,8,1", "CTRIA3,7,1,1,2,3\nPSHELL,1,1,.1\nCTETRA,8,2", "line 6: 1 bars, membranes or shells"),
-        (
-            "CTETRA,8,1",
-            "CPYRAM,9,1,1,2,3,4,1\nCTETRA,8,1",
-            "line 5: CPYRAM makes pyramids, which are not read",
-        ),
+        ("CTETRA,8,1", "CPYRAM,9,1,1,2,3,4,1\nCTETRA,8,1", "line 5: CPYRAM makes pyramids, which are not"),
         ("GRID,1", ",5.\nGRID,1", "line 1: the continuation '' stands behind no line that it continues"),
         ("2,3,4", "2,3,4,+A\n+B", r"line 6: the continuation '\+B' stands behind no line that it continues"),
         ("2,3,4", "2,3,4,,,,9", "line 5: a line of at most 10 fields is expected, but 11 came"),
@@ -143,15 +127,8 @@ def test_a_fault_of_a_nastran_deck_is_said_with_its_line(
         written(tmp_path / "m.bdf", text.replace(old, new, 1))
 
 
-SOLID = [
-    "*NODE",
-    "1, 0, 0, 0",
-    "2, 1, 0, 0",
-    "3, 0, 1, 0",
-    "4, 0, 0, 1",
-    "*ELEMENT, TYPE=C3D4",
-    "8, 1, 2, 3, 4",
-]
+NODES = ["*NODE", "1, 0, 0, 0", "2, 1, 0, 0", "3, 0, 1, 0", "4, 0, 0, 1"]
+SOLID = [*NODES, "*ELEMENT, TYPE=C3D4", "8, 1, 2, 3, 4"]
 
 
 @pytest.mark.parametrize(

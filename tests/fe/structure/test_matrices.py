@@ -25,7 +25,7 @@ from tests.calculix_decks import (
     solved,
     stiffened_skin,
     write_structure,
-)
+)  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 
@@ -218,19 +218,9 @@ def as_dmig(folder: Path, name: str, matrix: FloatArray) -> str:
     return f"all.pch:{title}"
 
 
-@pytest.mark.parametrize(
-    ("write", "names_nodes"),
-    [
-        (as_npz, False),
-        (as_arrays, False),
-        (as_table, False),
-        (as_symmetric_market, False),
-        (as_abaqus, True),
-        (as_dmig, True),
-    ],
-)
+@pytest.mark.parametrize("write", [as_npz, as_arrays, as_table, as_symmetric_market, as_abaqus, as_dmig])
 def test_every_format_is_the_same_structure(
-    write: Callable[[Path, str, FloatArray], str], names_nodes: bool, tmp_path: Path
+    write: Callable[[Path, str, FloatArray], str], tmp_path: Path
 ) -> None:
     """Those that name nodes need no file of unknowns, and a part may name fewer of them."""
     wanted = load_any(write_chain(tmp_path))
@@ -238,7 +228,9 @@ def test_every_format_is_the_same_structure(
         f'"{name}.mtx"': f'"{write(tmp_path, name, matrix)}"'
         for name, matrix in (("k", STIFFNESS), ("m", MASS), ("middle", MIDDLE))
     }
-    found = load_any(write_chain(tmp_path, changes | ({'unknowns = "rows.dof"': ""} if names_nodes else {})))
+    if write in (as_abaqus, as_dmig):
+        changes['unknowns = "rows.dof"'] = ""
+    found = load_any(write_chain(tmp_path, changes))
     for values in ({}, {"e": 2.2, "z1": 0.5, "push": 3.0}):
         for ours, theirs in zip(found.at(values), wanted.at(values), strict=True):
             assert np.abs(ours - theirs).max() <= 1e-9 * np.abs(theirs).max()
@@ -289,9 +281,8 @@ def test_a_support_holds_what_the_matrices_leave_free(tmp_path: Path) -> None:
     wide[:3, :3] = free
     file = write_chain(tmp_path)
     io.mmwrite(tmp_path / "k.mtx", sparse.coo_array(free))
-    with pytest.raises(
-        FiniteElementError, match=r"leaves free, or nearly: 1; in one node \d, component 1 moves most\. Hold"
-    ):
+    words = r"leaves free, or nearly: 1; in one node \d, component 1 moves most\. Hold"
+    with pytest.raises(FiniteElementError, match=words):
         load_any(file)
     held = file.read_text(encoding="utf-8") + '[[support]]\nnodes = [4]\nhold = ["x"]\n'
     file.write_text(held, encoding="utf-8")
@@ -314,19 +305,14 @@ def changed(matrix: FloatArray, **entries: float) -> FloatArray:
     return new
 
 
+HEADER = "%%MatrixMarket matrix coordinate real general\n3 3 1\n"
 REFUSED = [
     # what stands in which file, or what is exchanged in the structure file, and the sentence
-    (
-        {"k.mtx": changed(STIFFNESS, a12=-90.0)},
-        r"not symmetric: .* node (4|7), component 1 .* differ by 10; friction",
-    ),
+    ({"k.mtx": changed(STIFFNESS, a12=-90.0)}, r"not symmetric: .* node (4|7), component 1 .* 10; friction"),
     ({"k.mtx": changed(STIFFNESS, a33=np.nan)}, "holds a number that is not finite"),
     ({"k.mtx": changed(STIFFNESS, a33=-1.0)}, "node 9, component 1 has a negative stiffness"),
     ({"k.mtx": changed(STIFFNESS, a33=10.0)}, "the stiffness is indefinite"),
-    (
-        {"k.mtx": changed(STIFFNESS, a23=0.0, a32=0.0, a33=0.0)},
-        "node 9, component 1 has mass but no stiffness: hold",
-    ),
+    ({"k.mtx": STIFFNESS * np.outer((1, 1, 0), (1, 1, 0))}, "node 9, component 1 has mass but no stiffness"),
     ({"k.mtx": 1j * STIFFNESS}, "of real numbers is expected, but complex128"),
     ({"k.mtx": 0.0 * STIFFNESS, "m.mtx": 0.0 * MASS}, "no row that is free and has stiffness or mass"),
     ({"middle.mtx": ""}, "it is empty"),
@@ -334,23 +320,14 @@ REFUSED = [
     ({"m.mtx": MASS[:2, :2]}, r"m\.mtx has 2 rows, but there are 3 unknowns; .* same run"),
     ({"m.mtx": changed(MASS, a22=-1e-3)}, "node 7, component 1 has a negative mass"),
     ({"m.mtx": changed(MASS, a12=9e-3, a21=9e-3)}, "mass matrix is indefinite"),
-    (
-        {"middle.mtx": 2.0 * STIFFNESS},
-        "the parts are together stiffer than the whole; two parts must not overlap",
-    ),
+    ({"middle.mtx": 2.0 * STIFFNESS}, "the parts are together stiffer than the whole; two parts must"),
     ({"middle.mtx": -MIDDLE}, r"part\[1\] takes stiffness away somewhere"),
     ({"middle.mtx": 0.0 * MIDDLE}, r"part\[1\] has no stiffness"),
-    (
-        {"middle.mtx": "%%MatrixMarket matrix coordinate real general\n3 3 1\n"},
-        r"middle\.mtx: the file cannot be read",
-    ),
+    ({"middle.mtx": HEADER}, r"middle\.mtx: the file cannot be read"),
     ({"middle.mtx": "1 2\n3 4\n"}, r"lines of row, column and value.* but 2 lines of 2 numbers came"),
     ({"middle.mtx": "4,1,8,1,5.0\n"}, r"part\[1\].*node 8 has no component 1 .* no such node"),
     ({"middle.mtx": "DMIG    K       0       6       3       0               3\n"}, "K is complex"),
-    (
-        {"rows.dof": "4.1\n7.1\n9.7\n"},
-        r"rows\.dof, line 3: a node and its component from 1 to 6 .* '9\.7' came",
-    ),
+    ({"rows.dof": "4.1\n7.1\n9.7\n"}, r"rows\.dof, line 3: a node and its component .* 6 .* '9\.7' came"),
     ({"rows.dof": "4.1\n7.1\n9.2\n"}, r"node 9 has no component 1 .* its components 2;"),
     ({"rows.dof": "4.1\n7.1\n7.1\n"}, r"node 9 has no component 1 .* no such node"),
     ({'unknowns = "rows.dof"': ""}, "does not say which node and component each row is; name a file"),
@@ -359,30 +336,15 @@ REFUSED = [
     ({"node = 9\nforce": "node = 5\nforce"}, r"load\[1\]: node 5 has no component 1 .* no such node"),
     ({"force = [1, 0, 0]": "force = [1, 1, 0]"}, r"load\[1\]: node 9 has no component 2"),
     ({"force = [1, 0, 0]": "force = [0, 0, 0]"}, r"load\[1\]\.force: it must point somewhere"),
-    (
-        {"node = 9\nforce = [1, 0, 0]": 'vector = "k.mtx"'},
-        r"a vector of 3 numbers, .* array of shape \(3, 3\) came",
-    ),
-    (
-        {"acceleration = [10, 0, 0]": "node = 9"},
-        r"load\[2\]: either vector, or node and force, or acceleration",
-    ),
+    ({"node = 9\nforce = [1, 0, 0]": 'vector = "k.mtx"'}, r"a vector of 3 numbers, .* shape \(3, 3\) came"),
+    ({"acceleration = [10, 0, 0]": "node = 9"}, r"load\[2\]: either vector, or node and force, or"),
     ({"length = 20": ""}, r"gauge\[1\]: either vector, or nodes and direction and length is expected"),
     ({"direction = [-3, 0, 0]": ""}, r"displacement\[1\]: either vector, or node and direction"),
     ({"node = 7\nmass": "mass"}, r"mass\[1\]: either node, or matrix"),
     ({'matrix = "middle.mtx"': 'changed = "m.mtx"'}, r"part\[1\]: either matrix, or changed and times"),
-    (
-        {'matrix = "middle.mtx"': 'changed = "m.mtx"\ntimes = 1'},
-        r"part\[1\]\.times: input should be less than 1",
-    ),
-    (
-        {'damage = "z1"': 'damage = "z2"'},
-        r"part\[1\] is of the region 'z2', but no \[\[damage\]\] has that name",
-    ),
-    (
-        {'[[damage]]\nname = "z1"': '[[damage]]\nname = "z1"\n[[damage]]\nname = "z2"'},
-        "'z2' has no stiffness: no part",
-    ),
+    ({'matrix = "middle.mtx"': 'changed = "m.mtx"\ntimes = 1'}, r"part\[1\]\.times: input should be less"),
+    ({'damage = "z1"': 'damage = "z2"'}, r"part\[1\] is of the region 'z2', but no \[\[damage\]\] has that"),
+    ({'name = "z1"': 'name = "z1"\n[[damage]]\nname = "z2"'}, "'z2' has no stiffness: no part"),
     ({'scaled_by = "e"\n': ""}, "the parameter 'e' scales no part"),
     ({'"mm"\n': '"mm"\nmesh = "a.inp"\n'}, "mesh"),
 ]
@@ -392,17 +354,13 @@ REFUSED = [
 def test_what_is_no_structure_is_refused_in_a_sentence(
     changes: dict[str, FloatArray | str], sentence: str, tmp_path: Path
 ) -> None:
-    texts = {
-        old: new
-        for old, new in changes.items()
-        if isinstance(new, str) and old not in ("middle.mtx", "rows.dof")
-    }
-    file = write_chain(tmp_path, texts)
-    for name, content in changes.items():
-        if isinstance(content, np.ndarray):
-            io.mmwrite(tmp_path / name, sparse.coo_array(content), symmetry="general")
-        elif name not in texts:
-            (tmp_path / name).write_text(content)
+    files = ("k.mtx", "m.mtx", "middle.mtx", "rows.dof")
+    file = write_chain(tmp_path, {old: new for old, new in changes.items() if old not in files})
+    for name in changes.keys() & set(files):
+        if isinstance(changes[name], str):
+            (tmp_path / name).write_text(changes[name])
+        else:
+            io.mmwrite(tmp_path / name, sparse.coo_array(changes[name]), symmetry="general")
     with pytest.raises(FiniteElementError, match=sentence) as found:
         load_any(file)
     assert "\n" not in str(found.value)
@@ -410,14 +368,10 @@ def test_what_is_no_structure_is_refused_in_a_sentence(
 
 def test_rows_that_share_a_name_have_no_weight(tmp_path: Path) -> None:
     """Rows that turn look like rows that shift there; nor is it known how five rows share a force."""
-    file = write_chain(tmp_path)
+    file = write_chain(tmp_path, {"nodes = [4, 7]": "nodes = [9, 7]"})
     (tmp_path / "rows.dof").write_text("9.1\n7.1\n9.1\n")
-    file.write_text(
-        file.read_text(encoding="utf-8").replace("nodes = [4, 7]", "nodes = [9, 7]"), encoding="utf-8"
-    )
-    with pytest.raises(
-        FiniteElementError, match=r"load\[2\]: several rows of the matrices carry one name.* as a vector"
-    ):
+    words = r"load\[2\]: several rows of the matrices carry one name.* as a vector"
+    with pytest.raises(FiniteElementError, match=words):
         load_any(file)
 
 

@@ -191,37 +191,37 @@ def test_a_fault_of_a_deck_is_said_with_its_line(old: str, new: str, sentence: s
 def test_other_files_that_cannot_be_read_are_refused(
     box: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def sentence(name: str) -> str:
+    def check(name: str, words: str) -> None:
         with pytest.raises(MeshError) as caught:
             read_mesh(tmp_path / name, 1.0, "m")
-        return str(caught.value)
+        assert words in str(caught.value)
 
-    assert "is not there" in sentence("none.msh")
-    assert "is a folder; `mesh` must name a mesh file" in sentence(".")
-    for name in ("e.msh", "e.inp"):
-        (tmp_path / name).touch()
-        assert f"{name} is empty" in sentence(name)
-    (tmp_path / "c.inp").write_text("*NODE\n1, 0, 0, 0\n")
-    assert "no whole block of solid elements: was it cut off?" in sentence("c.inp")
-    (tmp_path / "m.msh").write_text("nonsense")
-    assert "cannot be read" in sentence("m.msh")
-    (tmp_path / "m.xyz").write_text("nonsense")
-    assert "cannot be read" in sentence("m.xyz")
-    (tmp_path / "m.vtu").write_text("<nonsense/>")
-    assert "m.vtu cannot be read as .vtu: Couldn't read file" in sentence("m.vtu")
+    check("none.msh", "is not there")
+    check(".", "is a folder; `mesh` must name a mesh file")
+    for name, content, words in (
+        ("e.msh", "", "e.msh is empty"),
+        ("e.inp", "", "e.inp is empty"),
+        ("c.inp", "*NODE\n1, 0, 0, 0\n", "no whole block of solid elements: was it cut off?"),
+        ("m.msh", "nonsense", "cannot be read"),
+        ("m.xyz", "nonsense", "cannot be read"),
+        ("m.vtu", "<nonsense/>", "m.vtu cannot be read as .vtu: Couldn't read file"),
+    ):
+        (tmp_path / name).write_text(content)
+        check(name, words)
     assert capsys.readouterr() == ("", "")
     points, cells = box("hexahedron", (1, 1, 1))
+    finer, tetrahedra = box("tetra10", (1, 1, 1))
     kinds = (("hexahedron", 8), ("wedge", 6), ("hexahedron", 8))
-    meshio.write(tmp_path / "p.vtu", meshio.Mesh(points, [(k, cells[:, :n]) for k, n in kinds]))
-    assert "one kind of elements is expected, but 2 8-node hexahedra, 1 6-node wedges" in sentence("p.vtu")
-    meshio.write(tmp_path / "q.vtu", meshio.Mesh(points, [("pyramid", cells[:, :5])]))
-    assert "is expected, but 1 pyramid came" in sentence("q.vtu")
-    meshio.write(tmp_path / "s.vtu", meshio.Mesh(points, [("quad", cells[:, :4])]))
-    assert "but none that is solid came" in sentence("s.vtu")
-    points, cells = box("tetra10", (1, 1, 1))
-    swapped = cells[:, [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]]
-    meshio.write(tmp_path / "t.vtu", meshio.Mesh(points, [("tetra10", swapped)]))
-    assert "lies far from the middle of its edge" in sentence("t.vtu")
+    two_kinds = "one kind of elements is expected, but 2 8-node hexahedra, 1 6-node wedges"
+    swapped = tetrahedra[:, [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]]
+    for places, blocks, words in (
+        (points, [(kind, cells[:, :count]) for kind, count in kinds], two_kinds),
+        (points, [("pyramid", cells[:, :5])], "is expected, but 1 pyramid came"),
+        (points, [("quad", cells[:, :4])], "but none that is solid came"),
+        (finer, [("tetra10", swapped)], "lies far from the middle of its edge"),
+    ):
+        meshio.write(tmp_path / "p.vtu", meshio.Mesh(places, blocks))
+        check("p.vtu", words)
 
 
 @pytest.mark.skipif(not DECKS.is_dir(), reason="Debian's calculix-ccx-test is not installed")
@@ -245,13 +245,9 @@ def test_decks_of_calculix_give_its_published_results(name: str, tmp_path: Path)
     total = sum(found.displacement for found in static_responses(structure).values())
     field = 1e3 * structure.full_displacement(np.asarray(total))
     raw = (DECKS / f"{name}.dat.ref.gz").read_bytes()
-    rows = np.array(
-        [
-            [float(value) for value in line.split()]
-            for line in gzip.decompress(raw).decode().split("displacements")[1].splitlines()[2:]
-            if len(line.split()) == 4
-        ]
-    )[: len(given.points)]
+    printed = gzip.decompress(raw).decode().split("displacements")[1].splitlines()[2:]
+    of_nodes = [line.split() for line in printed if len(line.split()) == 4][: len(given.points)]
+    rows = np.array(of_nodes, dtype=float)
     assert rows[:, 0].tolist() == given.node_numbers.tolist()
     assert np.abs(rows[:, 1:] - field).max() < 1e-6 * np.abs(field).max()
 

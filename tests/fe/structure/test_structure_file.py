@@ -63,11 +63,14 @@ name = "w"
 point = [20, 5, 5]
 direction = [0, 0, 1]
 """
-ROOT = 'set = "root"\nhold = ["x", "y", "z"]'
-ORTHOTROPIC = (
-    "young_moduli = [1e11, 1e10, 1e10]\npoisson_ratios = [{}]\nshear_moduli = [5e9, 5e9, 5e9]\naxes = [{}]"
-)
+HOLD, GAUGE, ALONG = 'set = "root"\nhold = ["x", "y", "z"]', "point = [10, 5, 10]", "direction = [1, 0, 0]"
 ISOTROPIC = "young_modulus = 7e10\npoisson_ratio = 0.3"
+
+
+def orthotropic(last_ratio: float, second_axis: str) -> str:
+    ratios, axes = f"[0.3, 0.3, {last_ratio}]", f"[[1, 0, 0], {second_axis}]"
+    moduli = "young_moduli = [1e11, 1e10, 1e10]\nshear_moduli = [5e9, 5e9, 5e9]"
+    return f"{moduli}\npoisson_ratios = {ratios}\naxes = {axes}"
 
 
 @pytest.fixture
@@ -97,79 +100,31 @@ def test_the_file_without_a_fault_is_taken(make: Callable[[str], Path]) -> None:
         ("density = 2700\n", "", r"'material\[1\]\.density' is missing"),
         ("[[gauge]]", "[gauge]", r"there can be several of 'gauge', so write \[\[gauge\]\]"),
         ("[[gauge]]", "[[gauge]", "is not valid TOML"),
-        (
-            ISOTROPIC,
-            "young_modulus = 7e10",
-            r"material\[1\]: either young_modulus and poisson_ratio, or young_moduli",
-        ),
-        (
-            ISOTROPIC,
-            ORTHOTROPIC.format("0.3, 0.3, 0.3", "[1, 0, 0], [-2, 0, 0]"),
-            "axes must not be parallel",
-        ),
-        (
-            ISOTROPIC,
-            ORTHOTROPIC.format("0.3, 0.3, 0.3", "[1, 0, 0], [0, 0, 0]"),
-            r"material\[1\]\.axes\[2\]: it must point somewhere",
-        ),
-        (
-            ISOTROPIC,
-            ORTHOTROPIC.format("0.3, 0.3, 1.2", "[1, 0, 0], [0, 1, 0]"),
-            "belong to no stable material",
-        ),
+        (ISOTROPIC, "young_modulus = 7e10", r"material\[1\]: either young_modulus and poisson_ratio, or"),
+        (ISOTROPIC, orthotropic(0.3, "[-2, 0, 0]"), "axes must not be parallel"),
+        (ISOTROPIC, orthotropic(0.3, "[0, 0, 0]"), r"material\[1\]\.axes\[2\]: it must point somewhere"),
+        (ISOTROPIC, orthotropic(1.2, "[0, 1, 0]"), "belong to no stable material"),
         ('scaled_by = "e"', 'scaled_by = "f"', r"material\[1\] is scaled by 'f', but no \[\[parameter\]\]"),
         ('scaled_by = "e"\n', "", "the parameter 'e' scales no material"),
         ('control = "g"', 'control = "h"', r"load\[1\] is tied to the control 'h', but no \[\[control\]\]"),
         ('control = "g"\n', "", "the control 'g' commands no load"),
-        (
-            'name = "g"',
-            'name = "g"\nnominal = 0',
-            r"control\[1\]: with its nominal value 0 it would be 0 always",
-        ),
+        ('name = "g"', 'name = "g"\nnominal = 0', r"control\[1\]: with its nominal value 0 it would be 0"),
         ('name = "z1"', 'name = "e"', r"parameter\[1\] and damage\[1\] are both named 'e'"),
         ('name = "w"', 'name = "a"', r"gauge\[1\] and displacement\[1\] are both named 'a'"),
         ('hold = ["x", "y", "z"]', 'hold = ["u"]', r"support\[1\]\.hold\[1\]: .* but 'u' came"),
         ('hold = ["x", "y", "z"]', "", r"support\[1\]: either hold = .* or springs = .* is expected"),
         ("pressure = 1e5", "", r"load\[2\]: either force and set, or force and point, or pressure and set"),
         ("pressure = 1e5", "force = [0, 0, 0]", r"load\[2\]\.force: it must point somewhere"),
-        (
-            'set = "tip"\npressure',
-            "pressure",
-            r"load\[2\]: either .*, or pressure and set, or acceler",
-        ),
-        (
-            'control = "g"\n',
-            'control = "g"\nset = "tip"\n',
-            r"load\[1\]: either .*, or acceleration is exp",
-        ),
-        (
-            "box = [[0, 0, 0], [0, 10, 10]]",
-            "box = [[0, 0, 0], [-1, 10, 10]]",
-            r"set\[1\]: box must give its lower",
-        ),
-        ("direction = [1, 0, 0]", "direction = [0, 0, 0]", r"gauge\[1\]\.direction: it must point somewhere"),
-        (
-            ROOT,
-            ROOT.replace("root", "rot"),
-            r"support\[1\]: .* no set of nodes or faces named 'rot'; there are .*tip",
-        ),
+        ('set = "tip"\npressure', "pressure", r"load\[2\]: either .*, or pressure and set, or acceler"),
+        ('control = "g"\n', 'control = "g"\nset = "tip"\n', r"load\[1\]: either .*, or acceleration is exp"),
+        ("box = [[0, 0, 0], [0,", "box = [[0, 0, 0], [-1,", r"set\[1\]: box must give its lower"),
+        (ALONG, "direction = [0, 0, 0]", r"gauge\[1\]\.direction: it must point somewhere"),
+        (HOLD, HOLD.replace("root", "rot"), r"support\[1\]: .* no set of nodes or faces named 'rot'; .*tip"),
         ('set = "inner"', 'set = "outer"', r"damage\[1\]: .* no set of cells named 'outer'; .* inner, all"),
-        (
-            "box = [[20, 0, 0], [20, 10",
-            "box = [[21, 0, 0], [22, 10",
-            r"load\[2\]: the set 'tip' .* holds no node",
-        ),
-        (
-            "box = [[0, 0, 0], [10, 10, 10]]",
-            "box = [[0, 0, 0], [1, 1, 1]]",
-            r"damage\[1\]: the set 'inner' .* no cell",
-        ),
+        ("[[20, 0, 0], [20, 10", "[[21, 0, 0], [22, 10", r"load\[2\]: the set 'tip' .* holds no node"),
+        ("[0, 0, 0], [10, 10, 10]", "[0, 0, 0], [1, 1, 1]", r"damage\[1\]: the set 'inner' .* no cell"),
         ('set = "tip"', 'set = "line=1"', r"load\[2\]: no face of the surface lies in the set 'line=1'"),
-        (
-            ISOTROPIC,
-            f'set = "inner"\n{ISOTROPIC}',
-            r"1 of 2 elements have no material, among them 2 at \(15, 5, 5\) mm",
-        ),
+        (ISOTROPIC, f'set = "inner"\n{ISOTROPIC}', r"1 of 2 elements have no .* them 2 at \(15, 5, 5\) mm"),
         (
             "[[support]]",
             f'[[material]]\nname = "b"\nset = "inner"\ndensity = 1\n{ISOTROPIC}\n[[support]]',
@@ -180,46 +135,14 @@ def test_the_file_without_a_fault_is_taken(make: Callable[[str], Path]) -> None:
             '[[damage]]\nname = "z2"\nset = "all"\n[[mass]]',
             r"damage\[2\]: the damage regions 'z2' and 'z1' share 1 elements",
         ),
-        (
-            ROOT,
-            ROOT.replace('"y", ', ""),
-            r"leave 1 of the six rigid motions free, .* a shift along \(0, 1, 0\)",
-        ),
-        (
-            ROOT,
-            ROOT.replace("root", "line=1"),
-            r"leave 1 of the six .* a turn about the axis along \(0, 0, -?1\) through \(0, 0, ",
-        ),
-        (
-            "point = [10, 5, 10]",
-            "point = [10, 5, 9]",
-            r"gauge\[1\] \(a\): the point \(10, 5, 9\) mm lies 1 mm off .* inside",
-        ),
-        (
-            "point = [10, 5, 10]",
-            "point = [10, 5, 13]",
-            r"lies 3 mm off .* nearest point of the surface is \(10, 5, 10\) mm",
-        ),
-        (
-            "direction = [1, 0, 0]",
-            "direction = [0, 1, 4]",
-            r"gauge\[1\] \(a\): its direction points 76 degrees out of",
-        ),
-        (
-            "direction = [1, 0, 0]",
-            "direction = [1, 0, 0]\nlength = 25",
-            r"gauge\[1\] \(a\): 25 mm long, .* over the edge",
-        ),
-        (
-            "point = [20, 5, 5]\nmass",
-            "point = [25, 5, 5]\nmass",
-            r"mass\[1\]: the point \(25, 5, 5\) mm lies 5 mm off",
-        ),
-        (
-            "point = [20, 5, 5]\ndirection",
-            "point = [0, -9, 5]\ndirection",
-            r"displacement\[1\]: the point .* lies 9 mm off",
-        ),
+        (HOLD, HOLD.replace('"y", ', ""), r"leave 1 of the six rigid motions .* a shift along \(0, 1, 0\)"),
+        (HOLD, HOLD.replace("root", "line=1"), r"leave 1 .* a turn about .* \(0, 0, -?1\) through \(0, 0, "),
+        (GAUGE, GAUGE.replace("10]", "9]"), r"\(a\): the point \(10, 5, 9\) mm lies 1 mm off .* inside"),
+        (GAUGE, GAUGE.replace("10]", "13]"), r"3 mm off .* nearest point of the surface is \(10, 5, 10\) mm"),
+        (ALONG, "direction = [0, 1, 4]", r"gauge\[1\] \(a\): its direction points 76 degrees out of"),
+        (ALONG, f"{ALONG}\nlength = 25", r"gauge\[1\] \(a\): 25 mm long, .* over the edge"),
+        ("[20, 5, 5]\nmass", "[25, 5, 5]\nmass", r"mass\[1\]: the point \(25, 5, 5\) mm lies 5 mm off"),
+        ("[20, 5, 5]\ndirection", "[0, -9, 5]\ndirection", r"displacement\[1\]: the point .* lies 9 mm off"),
         ('"mesh.vtu"', '"nothing.vtu"', r"The mesh file .*nothing\.vtu is not there"),
     ],
 )

@@ -18,36 +18,14 @@ from fe.structure.operators import Structure, load_and_assemble
 INNER, OUTER = 1.0, 2.0
 RING = """
 length_unit = "m"
-[[set]]
-name = "x"
-of = "nodes"
-box = [[0, -1, -1], [0, 3, 3]]
-[[set]]
-name = "y"
-of = "nodes"
-box = [[-1, 0, -1], [3, 0, 3]]
-[[material]]
-name = "rubber"
-density = 1000
-young_modulus = 1e9
-poisson_ratio = 0.3
-[[support]]
-set = "x"
-hold = ["x"]
-[[support]]
-set = "y"
-hold = ["y"]
-[[support]]
-set = "all=1"
-hold = ["z"]
-[[load]]
-name = "p"
-set = "bore=1"
-pressure = 1e6
-[[gauge]]
-name = "hoop"
-point = [0.7071067811865476, 0.7071067811865476, 0.05]
-direction = [-1, 1, 0]
+set = [
+  {name = "x", of = "nodes", box = [[0, -1, -1], [0, 3, 3]]},
+  {name = "y", of = "nodes", box = [[-1, 0, -1], [3, 0, 3]]},
+]
+material = [{name = "rubber", density = 1000, young_modulus = 1e9, poisson_ratio = 0.3}]
+support = [{set = "x", hold = ["x"]}, {set = "y", hold = ["y"]}, {set = "all=1", hold = ["z"]}]
+load = [{name = "p", set = "bore=1", pressure = 1e6}]
+gauge = [{name = "hoop", point = [0.7071067811865476, 0.7071067811865476, 0.05], direction = [-1, 1, 0]}]
 """
 
 
@@ -106,11 +84,16 @@ def test_the_field_of_every_kind_is_written(
 
 BEAM = """
 length_unit = "mm"
-[[parameter]]
-name = "e"
-[[control]]
-name = "load_factor"
-nominal = 3.0
+parameter = [{name = "e"}]
+control = [{name = "load_factor", nominal = 3.0}]
+damage = [{name = "z1", set = "inner"}]
+mass = [{name = "m", point = [500, 30, 5], mass = 0.4, free = true}]
+gauge = [
+  {name = "top", point = [500, 30, 10], direction = [1, 0, 0]},
+  {name = "bottom", point = [500, 30, 0], direction = [1, 0, 0], length = 40},
+]
+displacement = [{name = "w", point = [1000, 30, 5], direction = [0, 0, 2]}]
+acceleration = [{name = "a", point = [1000, 30, 5], direction = [0, 0, 1]}]
 [[set]]
 name = "root"
 of = "nodes"
@@ -141,37 +124,12 @@ name = "weight"
 control = "load_factor"
 acceleration = [0, 0, -9.81]
 [[load]]
-name = "at a point"
+name = "at_a_point"
 point = [1000, 30, 10]
 force = [0, 0, 2]
-[[damage]]
-name = "z1"
-set = "inner"
-[[mass]]
-name = "m"
-point = [500, 30, 5]
-mass = 0.4
-free = true
-[[gauge]]
-name = "top"
-point = [500, 30, 10]
-direction = [1, 0, 0]
-[[gauge]]
-name = "bottom"
-point = [500, 30, 0]
-direction = [1, 0, 0]
-length = 40
-[[displacement]]
-name = "w"
-point = [1000, 30, 5]
-direction = [0, 0, 2]
-[[acceleration]]
-name = "a"
-point = [1000, 30, 5]
-direction = [0, 0, 1]
 [damping]
 alpha = 0.1
-""".replace('"at a point"', '"at_a_point"')
+"""
 
 
 @pytest.fixture
@@ -207,19 +165,13 @@ def test_a_cantilever_has_the_figures_of_a_beam(beam: Callable[..., Structure]) 
     np.testing.assert_allclose(centre, [0.5, 0.03, 0.005], atol=1e-12)
     bare = beam(("mass = 0.4", "mass = 0.0"))
     frequency, _ = natural_frequencies(bare, 3)
-    first, second = (
-        np.array([1.8751040687, 4.6940911330]) ** 2 / (2.0 * np.pi) * np.sqrt(stiffness / area_mass)
-    )
+    roots = np.array([1.8751040687, 4.6940911330])
+    first, second = roots**2 / (2.0 * np.pi) * np.sqrt(stiffness / area_mass)
     np.testing.assert_allclose(frequency, [first, 6.0 * first, second], rtol=3e-3)  # the second one sideways
     assert (structure.damping_alpha, structure.damping_beta) == (0.1, 0.0)
-    assert (structure.gauges, structure.displacements, structure.accelerations) == (
-        ("top", "bottom"),
-        ("w",),
-        ("a",),
-    )
-    np.testing.assert_array_equal(
-        structure.acceleration_output.toarray(), structure.displacement_output.toarray()
-    )
+    names = structure.gauges, structure.displacements, structure.accelerations
+    assert names == (("top", "bottom"), ("w",), ("a",))
+    assert abs(structure.acceleration_output - structure.displacement_output).max() == 0.0
 
 
 def test_terms_make_what_a_changed_file_makes(beam: Callable[..., Structure]) -> None:
@@ -303,42 +255,23 @@ def test_a_gauge_reads_the_mean_over_its_area(box: Callable[..., Any], write: Ca
     points, cells = box("hexahedron20", (1, 1, 1))
     text = """
 length_unit = "m"
-[[material]]
-name = "ply"
-density = 1500
-young_modulus = 1e9
-poisson_ratio = 0.3
-[[support]]
-set = "all=1"
-hold = ["y"]
-[[support]]
-set = "x"
-hold = ["x", "z"]
-[[set]]
-name = "x"
-of = "nodes"
-box = [[0, 0, 0], [0, 0, 1]]
-[[gauge]]
-name = "g"
-point = [0.5, 0.4, 1]
-direction = [1, 0, 0]
-length = 0.2
-width = 0.6
+material = [{name = "ply", density = 1500, young_modulus = 1e9, poisson_ratio = 0.3}]
+support = [{set = "all=1", hold = ["y"]}, {set = "x", hold = ["x", "z"]}]
+set = [{name = "x", of = "nodes", box = [[0, 0, 0], [0, 0, 1]]}]
+gauge = [{name = "g", point = [0.5, 0.4, 1], direction = [1, 0, 0], length = 0.2, width = 0.6}]
 """
-    structure = load_and_assemble(
-        write(points, "hexahedron20", cells, text, point_data={"all": np.ones(len(points), dtype=np.int64)})
-    )
+
+    def made(text: str) -> Structure:
+        data = {"all": np.ones(len(points), dtype=np.int64)}
+        return load_and_assemble(write(points, "hexahedron20", cells, text, point_data=data))
+
+    structure = made(text)
     field = np.zeros_like(structure.mesh.points)
     field[:, 0] = structure.mesh.points[:, 0] * structure.mesh.points[:, 1] ** 2
     moved = structure.expansion.T @ field.ravel()
     assert structure.gauge_output @ moved == pytest.approx([0.4**2 + 0.6**2 / 12.0 * (1.0 - 1.0 / 100.0)])
     with pytest.raises(InvalidDesignError, match=r"0\.2 m long and 1\.2 m wide, the gauge reaches over"):
-        load_and_assemble(
-            write(
-                points, "hexahedron20", cells, text.replace("width = 0.6", "width = 1.2"),
-                point_data={"all": np.ones(len(points), dtype=np.int64)},
-            )
-        )  # fmt: skip
+        made(text.replace("width = 0.6", "width = 1.2"))
 
 
 def test_an_orthotropic_material_follows_its_axes(
@@ -347,6 +280,13 @@ def test_an_orthotropic_material_follows_its_axes(
     points, cells = box("hexahedron20", (1, 1, 1))
     text = """
 length_unit = "m"
+support = [{set = "x=1", hold = ["x"]}, {set = "y=1", hold = ["y"]}, {set = "z=1", hold = ["z"]}]
+load = [{name = "p", set = "top=1", pressure = -1e6}]
+gauge = [
+  {name = "a", point = [0, 0.5, 0.5], direction = [0, 0, 1]},
+  {name = "b", point = [0.5, 0, 0.5], direction = [1, 0, 0]},
+  {name = "c", point = [0, 0.5, 0.5], direction = [0, 1, 0]},
+]
 [[material]]
 name = "ply"
 density = 1500
@@ -354,41 +294,13 @@ young_moduli = [1.3e11, 9e9, 8e9]
 poisson_ratios = [0.3, 0.25, 0.4]
 shear_moduli = [5e9, 4e9, 3e9]
 axes = [[0, 0, 1], [1, 0, 1]]
-[[support]]
-set = "x=1"
-hold = ["x"]
-[[support]]
-set = "y=1"
-hold = ["y"]
-[[support]]
-set = "z=1"
-hold = ["z"]
-[[load]]
-name = "p"
-set = "top=1"
-pressure = -1e6
-[[gauge]]
-name = "a"
-point = [0, 0.5, 0.5]
-direction = [0, 0, 1]
-[[gauge]]
-name = "b"
-point = [0.5, 0, 0.5]
-direction = [1, 0, 0]
-[[gauge]]
-name = "c"
-point = [0, 0.5, 0.5]
-direction = [0, 1, 0]
 """
     data = {name: (points[:, axis] == 0.0).astype(int) for axis, name in enumerate("xyz")}
     data["top"] = (points[:, 2] == 1.0).astype(int)
     structure = load_and_assemble(write(points, "hexahedron20", cells, text, point_data=data))
     # Axis 1 along z, axis 2 along x, axis 3 along y.
-    np.testing.assert_allclose(
-        static_responses(structure)["p"].strain,
-        1e6 * np.array([1.0, -0.3, -0.25]) / 1.3e11,
-        rtol=1e-9,
-    )
+    wanted = 1e6 * np.array([1.0, -0.3, -0.25]) / 1.3e11
+    np.testing.assert_allclose(static_responses(structure)["p"].strain, wanted, rtol=1e-9)
 
 
 def test_memory_is_estimated_before_it_is_taken(beam: Callable[..., Structure]) -> None:
@@ -397,4 +309,3 @@ def test_memory_is_estimated_before_it_is_taken(beam: Callable[..., Structure]) 
     check_memory(mesh)
     with pytest.raises(MeshError, match=r"744 unknowns would take about 0\.\d GiB, but 0\.1 GiB are allowed"):
         check_memory(mesh, 0.1 * 2**30)
-    assert set(KINDS) == {"tetra", "tetra10", "hexahedron", "hexahedron20", "wedge", "wedge15"}

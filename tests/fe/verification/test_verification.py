@@ -10,7 +10,6 @@ from fe.verification.known_answers import (
     rigid_body_residual,
     wing_balance,
 )
-from fe.wing.design import WingDesign
 
 
 def test_a_constant_strain_passes_through_distorted_cells():
@@ -60,14 +59,9 @@ def test_the_structure_weighs_what_it_should(shipped_operators):
     assert wing_balance(shipped_operators).structural_mass == pytest.approx(0.947, rel=0.002)
 
 
-@pytest.fixture(scope="module")
-def convergence(shipped_design: WingDesign):
-    return mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
-
-
 @pytest.mark.long
-def test_the_mesh_converges(convergence):
-    coarse, half, one = convergence
+def test_the_mesh_converges(shipped_design):
+    coarse, half, one = mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
     assert coarse.unknowns < half.unknowns < one.unknowns
     for name in ("tip_stiffness", "first_bending", "second_bending"):
         assert getattr(one, name) == pytest.approx(getattr(half, name), rel=0.025)

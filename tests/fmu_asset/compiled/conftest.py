@@ -6,6 +6,7 @@ import ctypes
 import itertools
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -20,10 +21,12 @@ from fmpy.fmi2 import (
 )
 from fmpy.logging import addLoggerProxy
 
+from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.packing.structure_fmu import build_fmu
 from tests.kept import compiled_wing
 
 OK, DISCARD, ERROR = 0, 2, 3
@@ -144,22 +147,29 @@ def open_slave() -> type[Slave]:
     return Slave
 
 
+def opened(path: Path) -> Iterator[Slave]:
+    with closing(Slave(path)) as made:
+        yield made
+
+
 @pytest.fixture
 def slave(compiled_fmu: Path) -> Iterator[Slave]:
-    made = Slave(compiled_fmu)
-    yield made
-    made.close()
+    yield from opened(compiled_fmu)
 
 
 @pytest.fixture
 def other_slave(compiled_fmu: Path) -> Iterator[Slave]:
-    made = Slave(compiled_fmu)
-    yield made
-    made.close()
+    yield from opened(compiled_fmu)
 
 
 @pytest.fixture
 def python_slave(fmu: Path) -> Iterator[Slave]:
-    made = Slave(fmu)
-    yield made
-    made.close()
+    yield from opened(fmu)
+
+
+@pytest.fixture(scope="session")
+def compiled_beam(
+    compiler: list[str], beam_reduction: Reduction, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A structure from a mesh, compiled."""
+    return build_fmu(beam_reduction.model, tmp_path_factory.mktemp("beam") / "beam.fmu", kind="compiled").path

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,28 +25,20 @@ def beam_model(beam_reduction: Reduction) -> ReducedModel:
 
 @pytest.fixture(scope="module")
 def pair(
-    compiler: list[str], beam_model: ReducedModel, tmp_path_factory: pytest.TempPathFactory
+    compiled_beam: Path, beam_model: ReducedModel, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path]:
     """The beam as a compiled FMU, and as one that runs in Python."""
-    folder = tmp_path_factory.mktemp("pair")
-    compiled = build_fmu(beam_model, folder / "compiled.fmu", kind="compiled").path
-    return compiled, build_fmu(beam_model, folder / "python.fmu").path
+    return compiled_beam, build_fmu(beam_model, tmp_path_factory.mktemp("pair") / "python.fmu").path
 
 
 def _fly(slave: Any, model: ReducedModel, seed: int, response: int) -> list[list[float]]:
     """Parameters, inputs and steps at random: health mostly stays, a load is often none at all."""
     rng = np.random.default_rng(seed)
     inputs = [v for v in slave.description.variables if v.causality == "input"]
-    start = {name: float(rng.uniform(*model.validity[name])) for name in ("e", "push")}
-    overdamped = float(rng.choice([0.0, 5.0, 2e4]))
+    start = {name: float(rng.uniform(*model.validity[name])) for name in ("e", "push", "pump")}
+    start |= {"mass__pump": start.pop("pump"), "damping__alpha": float(rng.choice([0.0, 5.0, 2e4]))}
     slave.fmu.reset()
-    status = slave.start(
-        response=response,
-        mass__pump=float(rng.uniform(*model.validity["pump"])),
-        damping__alpha=overdamped,
-        **start,
-    )
-    assert status == OK, slave.log
+    assert slave.start(response=response, **start) == OK, slave.log
     seen, time, values = [slave.everything()], 0.0, [0.0] * len(inputs)
     for _ in range(20):
         for number, variable in enumerate(inputs):
@@ -78,13 +67,10 @@ def test_outputs_equal_those_of_the_python_fmu(
             strain = max(size for name, size in zip(names, scale, strict=True) if name.startswith("strain."))
             for number, name in enumerate(names):
                 # a bound is made of outputs that cancel: its digits end where theirs do
-                limit = {
-                    "strain_error_bound": strain,
-                    "displacement_error_bound": scale[names.index("displacement.tip")],
-                }.get(name, scale[number])
-                np.testing.assert_allclose(
-                    ours[:, number], expected[:, number], rtol=0.0, atol=1e-12 * limit, err_msg=name
-                )
+                moved = scale[names.index("displacement.tip")]
+                limits = {"strain_error_bound": strain, "displacement_error_bound": moved}
+                apart = np.abs(ours[:, number] - expected[:, number]).max()
+                assert apart <= 1e-12 * limits.get(name, scale[number]), name
             assert (np.abs(ours[1:, names.index("acceleration.shake")]).max() > 0.0) == (response == 2)
     for slave in slaves:
         slave.close()
@@ -110,65 +96,9 @@ def test_a_compiled_fmu_bounds_as_python_does(
     slave.close()
 
 
-def test_refusals_and_states_are_those_of_the_python_fmu(
-    pair: tuple[Path, Path], open_slave: Callable[..., Any]
-) -> None:
-    slaves = [open_slave(path) for path in pair]
-    after = []
-    for slave in slaves:
-        place = slave.reference
-        assert slave.start(response=2) == OK
-        assert slave.status_of(slave.fmu.doStep, 0.0, 0.01) == OK
-        kept = slave.saved()
-        before = slave.everything()
-        slave.fmu.setReal([place["health.z1"]], [0.95])
-        assert slave.status_of(slave.fmu.doStep, 0.01, 0.01) == DISCARD
-        assert slave.log[-1][1].startswith("health.z1 = 0.9")
-        slave.fmu.setReal([place["health.z1"]], [0.0])
-        assert slave.everything() == before
-        ahead = []
-        for _ in range(2):
-            assert slave.restore(kept) == OK
-            slave.fmu.setReal([place["push"], place["health.z2"]], [400.0, 0.3])
-            assert slave.status_of(slave.fmu.doStep, 0.01, 0.01) == OK
-            ahead.append(slave.everything())
-        assert ahead[0] == ahead[1]
-        after.append(ahead[0])
-        slave.close()
-    np.testing.assert_allclose(after[0], after[1], rtol=1e-9, atol=1e-15)
-
-
-def test_no_check_finds_anything(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    compiled = pair[0]
-    check = check_fmu(compiled)
+def test_no_check_finds_anything(compiled_beam: Path) -> None:
+    check = check_fmu(compiled_beam)
     assert check.passed, check.problems
     assert not check.warnings
-    declared, actual = recorded_content_hash(compiled)
+    declared, actual = recorded_content_hash(compiled_beam)
     assert declared == actual
-    changed = tmp_path / "changed.fmu"
-    with zipfile.ZipFile(compiled) as archive, zipfile.ZipFile(changed, "w") as target:
-        for name in archive.namelist():
-            target.writestr(name, archive.read(name) + b" " * (name == "sources/structure_modes.c"))
-    assert any("GUID" in problem for problem in check_fmu(changed).problems)
-
-
-@pytest.mark.long  # the wing's sources are driven under sanitizers, and the beam flies beside its Python FMU
-def test_driven_in_c_without_a_lost_byte(
-    compiler: list[str], pair: tuple[Path, Path], tmp_path: Path
-) -> None:
-    """The driver of the wing drives the beam, too; valgrind watches, where it is installed."""
-    with zipfile.ZipFile(pair[0]) as archive:
-        archive.extractall(tmp_path)
-    sources = sorted((tmp_path / "sources").glob("*.c"))
-    driver = tmp_path / "driver"
-    subprocess.run(
-        [*compiler, "-std=c11", "-O2", "-g", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Wcast-qual",
-         "-Werror", f"-I{tmp_path / 'sources'}", *sources, DRIVER, "-o", driver, "-lm"],
-        check=True,
-    )  # fmt: skip
-    valgrind = shutil.which("valgrind")
-    watched = [] if valgrind is None else [valgrind, "--error-exitcode=9", "--leak-check=full", "--quiet"]
-    run = subprocess.run(
-        [*watched, driver, (tmp_path / "resources").as_uri()], capture_output=True, text=True, check=False
-    )
-    assert run.returncode == 0, run.stdout + run.stderr

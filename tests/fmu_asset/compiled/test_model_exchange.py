@@ -29,7 +29,8 @@ from tests.kept import compiled_wing
 
 STATES = 16
 HALF = STATES // 2
-DISCARD, ERROR = 2, 3
+DISCARD = 2
+MOVING = {"damping_alpha": 2.0, "damping_beta": 2e-4, "initial_tip_displacement": 0.05, "response": 2.0}
 
 
 @pytest.fixture(scope="module")
@@ -130,15 +131,9 @@ def test_fmi_3_gives_the_numbers_of_fmi_2(exchange3: Path, wing: tuple[FMU2Model
 def test_cvode_moves_it_as_the_co_simulation_moves(exchange: Path, compiled_fmu: Path) -> None:
     """Loads jump and health grows on the way; compared where nothing jumps."""
     start = {"load_factor": 1.0, "initial_tip_displacement": 0.05, "damping.alpha": 1.0, "damping.beta": 1e-4}
-    rows = [
-        (0.0, 0.0, 1.0),
-        (0.1, 0.0, 1.0),
-        (0.1, 0.0, 2.0),
-        (0.2, 0.0, 2.0),
-        (0.2, 0.4, 2.0),
-        (1.0, 0.4, 2.0),
-    ]
-    course = np.array(rows, dtype=[(name, float) for name in ("time", "health.z1", "load_factor")])
+    times, losses, factors = (0.0, 0.1, 0.1, 0.2, 0.2, 1.0), (0, 0, 0, 0, 0.4, 0.4), (1, 1, 2, 2, 2, 2)
+    columns = [(name, float) for name in ("time", "health.z1", "load_factor")]
+    course = np.array([*zip(times, losses, factors, strict=True)], dtype=columns)
     names = ["strain[1]", "strain[20]", "tip_displacement", "load_point_displacement"]
     flown = {
         path: simulate_fmu(path, stop_time=0.4, output_interval=0.005, output=names, input=course, **options)
@@ -172,16 +167,10 @@ def test_our_door_flies_all_alike(
     rng = np.random.default_rng(2)
     settings = binding.binding.model_copy(update={"step_size": 0.01, "tolerance": 1e-9})
     slow = binding.model_copy(update={"binding": settings})
-    parameters = {
-        "damping_alpha": 2.0,
-        "damping_beta": 2e-4,
-        "initial_tip_displacement": 0.05,
-        "response": 2.0,
-    }
     with (
-        FmiAsset(exchange, slow, parameters=parameters, isolated=False) as one,
-        FmiAsset(exchange3, elementwise(slow), parameters=parameters, isolated=False) as three,
-        FmiAsset(compiled_fmu, slow, parameters=parameters, isolated=False) as two,
+        FmiAsset(exchange, slow, parameters=MOVING, isolated=False) as one,
+        FmiAsset(exchange3, elementwise(slow), parameters=MOVING, isolated=False) as three,
+        FmiAsset(compiled_fmu, slow, parameters=MOVING, isolated=False) as two,
     ):
         for index in range(20):
             control = {"load_factor": float(rng.uniform(-1, 4))}
@@ -198,9 +187,8 @@ def test_rates_and_outputs_are_linear_with_the_derivatives_that_it_gives(
     modes = range(1, STATES // 2 + 1)
     states = [reference[f"modal_{what}[{i}]"] for what in ("displacement", "velocity") for i in modes]
     rates = [reference[f"der(modal_{what}[{i}])"] for what in ("displacement", "velocity") for i in modes]
-    outputs = [
-        reference[name] for name in ("strain[1]", "strain[13]", "tip_displacement", "load_point_displacement")
-    ]
+    names = ("strain[1]", "strain[13]", "tip_displacement", "load_point_displacement")
+    outputs = [reference[name] for name in names]
     inputs = [reference["load_factor"], reference["tip_force"]]
     unknowns, knowns = [*rates, *outputs], [*states, *inputs]
     columns = [fmu.getDirectionalDerivative(unknowns, [known], [1.0]) for known in knowns]
@@ -231,7 +219,8 @@ def test_loads_in_straight_lines_are_those_of_the_linear_system(
     modes = range(1, HALF + 1)
     states = [reference[f"{name}[{i}]"] for name in STATE_NAMES for i in modes]
     rates = [reference[f"der({name}[{i}])"] for name in STATE_NAMES for i in modes]
-    outputs = [reference[name] for name in ("strain[1]", "strain[13]", "tip_displacement")]
+    names = ("strain[1]", "strain[13]", "tip_displacement")
+    outputs = [reference[name] for name in names]
     inputs = [reference["load_factor"], reference["tip_force"]]
     known = [*states, *inputs]
     unknowns = [*rates, *outputs]
@@ -255,24 +244,13 @@ def test_loads_in_straight_lines_are_those_of_the_linear_system(
         assert slave.status_of(slave.fmu.doStep, time, size) == 0
         assert slave.everything() == once  # the slopes are part of the state
         time, load = time + size, load + size * np.array(slope)
-        seen = slave.fmu.getReal(
-            [slave.reference[n] for n in ("strain[1]", "strain[13]", "tip_displacement")]
-        )
+        seen = slave.fmu.getReal([slave.reference[name] for name in names])
         expected = shown @ [*x, *load]
         np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
         np.testing.assert_allclose(slave.fmu.getReal(places), load, rtol=1e-14)
     slow = binding.model_copy(update={"binding": binding.binding.model_copy(update={"step_size": 0.02})})
-    with FmiAsset(
-        compiled_fmu,
-        slow.with_interpolation("linear"),
-        parameters={
-            "response": 2.0,
-            "damping_alpha": 1.5,
-            "damping_beta": 3e-4,
-            "initial_tip_displacement": 0.05,
-        },
-        isolated=False,
-    ) as asset:
+    linear = slow.with_interpolation("linear")
+    with FmiAsset(compiled_fmu, linear, parameters=MOVING, isolated=False) as asset:
         asset.reset(health={"z1": 0.3})
         low, high = asset.input_range("control", "load_factor")
         assert asset.step({"load_factor": high}).time == 0.02  # to the edge of the range
@@ -308,10 +286,7 @@ def test_health_is_discrete_and_wrong_calls_are_refused(wing: tuple[FMU2Model, d
     assert not fmu.newDiscreteStates()[3]
 
 
-def test_what_it_cannot_be_is_refused(model: ReducedModel, tmp_path: Path, compiled_fmu: Path) -> None:
-    for options, sentence in (
-        ({"kind": "python"}, "build the kind 'compiled'"),
-        ({"kind": "python", "fmi": 3}, "build the kind 'compiled'"),
-    ):
-        with pytest.raises(FmuBuildError, match=sentence):
-            build_fmu(model, tmp_path / "wing.fmu", interface="model-exchange", **options)
+@pytest.mark.parametrize("options", [{}, {"fmi": 3}])
+def test_what_it_cannot_be_is_refused(model: ReducedModel, tmp_path: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(FmuBuildError, match="build the kind 'compiled'"):
+        build_fmu(model, tmp_path / "wing.fmu", kind="python", interface="model-exchange", **options)

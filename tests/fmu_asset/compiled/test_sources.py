@@ -6,7 +6,6 @@ import os
 import shutil
 import struct
 import subprocess
-import zipfile
 import zlib
 from pathlib import Path
 
@@ -26,8 +25,7 @@ WARNINGS = (
 @pytest.fixture(scope="module")
 def extracted(compiled_fmu: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sources")
-    with zipfile.ZipFile(compiled_fmu) as archive:
-        archive.extractall(folder)
+    shutil.unpack_archive(compiled_fmu, folder, "zip")
     return folder
 
 
@@ -35,12 +33,8 @@ def compile_driver(
     compiler: list[str], extracted: Path, target: Path, *flags: str
 ) -> subprocess.CompletedProcess[str]:
     sources = sorted((extracted / "sources").glob("*.c"))
-    return subprocess.run(
-        [*compiler, "-std=c11", *flags, f"-I{extracted / 'sources'}", *sources, DRIVER, "-o", target, "-lm"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = ["-std=c11", *flags, f"-I{extracted / 'sources'}", *sources, DRIVER, "-o", target, "-lm"]
+    return subprocess.run([*compiler, *words], capture_output=True, text=True, check=False)
 
 
 def arrays_of(content: bytes) -> dict[str, np.ndarray]:
@@ -68,13 +62,7 @@ def test_the_data_file_holds_the_arrays_of_the_model(model: ReducedModel) -> Non
     content = data_file_bytes(model)
     assert data_file_bytes(ReducedModel.from_bytes(model.to_bytes())) == content
     arrays = arrays_of(content)
-    for name in (
-        "static_stiffness",
-        "dual_correction",
-        "cross_mass",
-        "dual_split",
-        "dual_counts",
-    ):
+    for name in ("static_stiffness", "dual_correction", "cross_mass", "dual_split", "dual_counts"):
         np.testing.assert_array_equal(arrays[name], getattr(model, name))
     assert arrays["mode_count"] == model.mode_count
     assert pack_arrays(arrays) == content
@@ -145,38 +133,26 @@ def test_driven_in_c_under_sanitizers(
         folder.mkdir()
         (folder / "reduced_model.bin").write_bytes(content)
         folders.append(folder.as_uri())
-    run = subprocess.run(
-        [driver, (extracted / "resources").as_uri(), *folders],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "ASAN_OPTIONS": "detect_leaks=1:allocator_may_return_null=1"},
-    )
+    words = [driver, (extracted / "resources").as_uri(), *folders]
+    options = {**os.environ, "ASAN_OPTIONS": "detect_leaks=1:allocator_may_return_null=1"}
+    run = subprocess.run(words, capture_output=True, text=True, check=False, env=options)
     assert run.returncode == 0, run.stdout + run.stderr
 
 
 @pytest.mark.long
-def test_driven_in_c_without_a_lost_byte(compiler: list[str], extracted: Path, tmp_path: Path) -> None:
-    """The same, optimised and warned of as much as the compiler can, under valgrind."""
+@pytest.mark.parametrize("which", ["compiled_fmu", "compiled_beam"])
+def test_driven_in_c_without_a_lost_byte(
+    compiler: list[str], which: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    """Optimised and warned of as much as the compiler can; valgrind watches, where it is installed."""
+    shutil.unpack_archive(request.getfixturevalue(which), tmp_path, "zip")
     driver = tmp_path / "driver"
-    done = compile_driver(compiler, extracted, driver, "-O2", "-g", *WARNINGS)
+    done = compile_driver(compiler, tmp_path, driver, "-O2", "-g", *WARNINGS)
     assert done.returncode == 0, done.stderr
     valgrind = shutil.which("valgrind")
-    if valgrind is None:
-        pytest.skip("valgrind is not installed")
-    run = subprocess.run(
-        [
-            valgrind,
-            "--error-exitcode=9",
-            "--leak-check=full",
-            "--quiet",
-            driver,
-            (extracted / "resources").as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    watched = [] if valgrind is None else [valgrind, "--error-exitcode=9", "--leak-check=full", "--quiet"]
+    words = [*watched, driver, (tmp_path / "resources").as_uri()]
+    run = subprocess.run(words, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stdout + run.stderr
 
 

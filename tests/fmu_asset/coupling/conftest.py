@@ -30,13 +30,8 @@ def linear_fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The linear system as pythonfmu exports it: it declares no dependencies, so all outputs have all."""
     folder = tmp_path_factory.mktemp("linear")
     shutil.copy(Path(__file__).with_name("linear_system.py"), folder / "LinearSystem.py")
-    subprocess.run(
-        [
-            sys.executable, "-m", "pythonfmu", "build", "-f", "LinearSystem.py",
-            "--handle-state", "--serialize-state",
-        ],
-        cwd=folder, check=True, capture_output=True,
-    )  # fmt: skip
+    words = ["pythonfmu", "build", "-f", "LinearSystem.py", "--handle-state", "--serialize-state"]
+    subprocess.run([sys.executable, "-m", *words], cwd=folder, check=True, capture_output=True)
     return folder / "LinearSystem.fmu"
 
 
@@ -118,7 +113,5 @@ def watch(*names: str, step_size: float = 1.0, inputs: Sequence[str] = ()) -> Bi
 def companions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The companion FMUs."""
     folder = tmp_path_factory.mktemp("companions")
-    return {
-        name: build_companion(name, folder / f"{name}.fmu").path
-        for name in ("damage_growth", "strain_gauges")
-    }
+    names = ("damage_growth", "strain_gauges")
+    return {name: build_companion(name, folder / f"{name}.fmu").path for name in names}

@@ -131,7 +131,7 @@ def test_a_refused_value_names_its_component(three: SystemStructure, readings: B
 
 
 def test_what_an_fmu_does_wrong_names_its_component(spring_mass: Path, linear_fmu: Path) -> None:
-    law = linear("law", linear_fmu, d=[[1.0, 0.0], [0.0, 1.0]])
+    law = linear("law", linear_fmu, d=np.eye(2))
     joined = system([Component("spring", spring_mass), law], [("spring.position", "law.u1")])
     binding = parse_binding(
         {

@@ -68,9 +68,8 @@ def test_the_error_falls_with_the_square_of_the_step(
 
 def test_iterations_make_lines_between_both_ends(foreign_fmu: Any) -> None:
     """Settled, each input is the line between the other's states: no extrapolation is left in it."""
-    with CoupledAsset(
-        circle(foreign_fmu("follow2")), watched(0.1, "linear"), isolated=False, iterations=50, tolerance=1e-13
-    ) as asset:
+    options = {"isolated": False, "iterations": 50, "tolerance": 1e-13}
+    with CoupledAsset(circle(foreign_fmu("follow2")), watched(0.1, "linear"), **options) as asset:
         seen = [asset.observe().values, *(asset.step().values for _ in range(3))]
     lost = 1.0 - np.exp(-0.1)
     for before, after in pairwise(seen):

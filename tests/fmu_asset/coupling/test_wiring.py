@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure
+from fmu_asset.coupling.structure import Component, Connection, Connector, Setting, SystemStructure
 from fmu_asset.coupling.structure import expand_connection as expand
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.door.binding import parse_binding
+from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.errors import CouplingError, FmuFileError
 
 from .conftest import watch
@@ -44,26 +44,17 @@ def link(source: str, target: str, **options: object) -> Connection:
         ([("pull", "wing.load_factor")], "no connector 'pull'; it has push, seen, percent"),
         ([("seen", "wing.load_factor")], "connector 'seen' of the system is of the kind output"),
         ([("push", "seen")], "joins two connectors of the system"),
-        (
-            [("wing.load_factor", "damage.load_factor")],
-            "wing.load_factor cannot be the source.*declared as input",
-        ),
+        ([("wing.load_factor", "damage.load_factor")], "factor cannot be the source.*declared as input"),
         ([("damage.z1", "wing.strain[1]")], r"wing.strain\[1\] cannot be the target.*declared as output"),
-        (
-            [("push", "wing.young_modulus_factor")],
-            "declared as parameter.*a single number is needed as input",
-        ),
+        ([("push", "wing.young_modulus_factor")], "as parameter.*a single number is needed as input"),
         (
             [("damage.z1", "wing.health.z1"), ("damage.z2", "wing.health.z1")],
             "wing.health.z1 has two sources, damage.z1 and damage.z2",
         ),
-        (
-            [("gauges.received[1]", "wing.load_factor")],
-            "of the type Boolean and cannot feed.*of the type Real",
-        ),
+        ([("gauges.received[1]", "wing.load_factor")], "type Boolean and cannot feed.*of the type Real"),
         (
             [("wing.tip_displacement", "wing.load_factor")],
-            "is in 'm' and wing.load_factor in '1'.*no conversion",
+            "in 'm' and wing.load_factor in '1'.*no conversion",
         ),
         ([("damage.status", "wing.load_factor")], "of the type Enumeration and cannot feed.*Real"),
     ],
@@ -82,34 +73,25 @@ def test_enumerations_and_integers_feed_each_other(base: SystemStructure) -> Non
 
 
 def test_ends_and_patterns_that_cannot_be_read() -> None:
-    with pytest.raises(
-        CouplingError, match=r"'wnig\.strain' begins with no component; the components are a, b"
+    for source, target, sentence in (
+        ("wnig.strain", "a.x", r"'wnig\.strain' begins with no component; the components are a, b"),
+        ("a.x[{1..3}]", "b.y[{1..2}]", "joins 3 ends to 2"),
+        ("a.x[{3..1}]", "b.y[{1..2}]", "is empty or longer"),
     ):
-        expand("wnig.strain", "a.x", ["a", "b"])
-    with pytest.raises(CouplingError, match="joins 3 ends to 2"):
-        expand("a.x[{1..3}]", "b.y[{1..2}]", ["a", "b"])
-    with pytest.raises(CouplingError, match="is empty or longer"):
-        expand("a.x[{3..1}]", "b.y[{1..2}]", ["a", "b"])
+        with pytest.raises(CouplingError, match=sentence):
+            expand(source, target, ["a", "b"])
 
 
 def test_components_that_do_not_fit(base: SystemStructure, tmp_path: Path) -> None:
-    twice = replace(base, components=base.components + base.components[:1])
-    for structure, kind, words in (
-        (replace(base, components=()), CouplingError, "has no component"),
-        (twice, CouplingError, "two components named 'damage'"),
-        (
-            replace(base, components=(Component("a", tmp_path / "none.fmu"),)),
-            FmuFileError,
-            r"There is no FMU .*none\.fmu",
-        ),
-        (
-            replace(base, components=(replace(base.components[0], substeps=0),)),
-            CouplingError,
-            "at least one step",
-        ),
+    first = base.components[0]
+    for components, kind, words in (
+        ((), CouplingError, "has no component"),
+        ((*base.components, first), CouplingError, "two components named 'damage'"),
+        ((Component("a", tmp_path / "none.fmu"),), FmuFileError, r"There is no FMU .*none\.fmu"),
+        ((replace(first, substeps=0),), CouplingError, "at least one step"),
     ):
         with pytest.raises(kind, match=words):
-            Wiring(structure)
+            Wiring(replace(base, components=components))
 
 
 @pytest.mark.parametrize(
@@ -134,34 +116,24 @@ def test_settings_that_do_not_fit(
 
 
 def test_settings_are_converted(base: SystemStructure) -> None:
-    wing = replace(
-        base.component("wing"),
-        settings={
-            "mass.servo": Setting(150.0, "g"),
-            "response": Setting("transient"),
-            "health.z1": Setting(0.2),
-        },
-    )
-    wiring = Wiring(replace(base, components=(wing,)))
+    given = {"mass.servo": Setting(150.0, "g"), "response": Setting("transient"), "health.z1": Setting(0.2)}
+    wiring = Wiring(replace(base, components=(replace(base.component("wing"), settings=given),)))
     assert wiring.settings["wing"] == {"mass.servo": pytest.approx(0.15), "response": 2.0, "health.z1": 0.2}
 
 
 def test_units_of_connections_are_converted(base: SystemStructure) -> None:
-    connections = (
-        link("damage.z1", "percent"),
-        link("damage.z1", "wing.health.z1"),
-        link("wing.tip_displacement", "seen", factor=2.0, offset=0.5),
-    )
-    wiring = Wiring(replace(base, connections=connections))
-    assert wiring.outward["percent"].conversion == (100.0, 0.0)
-    assert next(iter(wiring.feeds.values())).conversion == (1.0, 0.0)
-    assert wiring.outward["seen"].conversion == (2.0, 0.5)
-    assert wiring.units["seen"] == "m"
-    # The value is converted first, and transformed in the unit of the target.
-    scaled = Wiring(replace(base, connections=(link("damage.z1", "percent", factor=0.5, offset=0.1),)))
-    assert scaled.outward["percent"].conversion == (50.0, 0.1)
-    plain = Wiring(replace(base, connections=(link("damage.z1", "percent", convert_units=False),)))
-    assert plain.outward["percent"].conversion == (1.0, 0.0)
+    """The value is converted first, and transformed in the unit of the target."""
+    seen = link("wing.tip_displacement", "seen", factor=2.0, offset=0.5)
+    for options, conversion in (
+        ({}, (100.0, 0.0)),
+        ({"factor": 0.5, "offset": 0.1}, (50.0, 0.1)),
+        ({"convert_units": False}, (1.0, 0.0)),
+    ):
+        joined = (link("damage.z1", "percent", **options), link("damage.z1", "wing.health.z1"), seen)
+        wiring = Wiring(replace(base, connections=joined))
+        assert wiring.outward["percent"].conversion == conversion
+        assert next(iter(wiring.feeds.values())).conversion == (1.0, 0.0)
+        assert (wiring.outward["seen"].conversion, wiring.units["seen"]) == ((2.0, 0.5), "m")
 
 
 def test_an_input_that_is_only_set_keeps_its_value(base: SystemStructure) -> None:
@@ -180,26 +152,15 @@ def test_an_input_that_is_only_set_keeps_its_value(base: SystemStructure) -> Non
 
 
 def test_bindings_that_do_not_fit(base: SystemStructure) -> None:
-    structure = replace(
-        base,
-        connections=(
-            link("push", "wing.load_factor"),
-            link("damage.z1", "wing.health.z1"),
-            link("damage.z1", "percent"),
-        ),
-    )
-    wiring = Wiring(structure)
+    ends = ("push", "wing.load_factor"), ("damage.z1", "wing.health.z1"), ("damage.z1", "percent")
+    wiring = Wiring(replace(base, connections=tuple(link(*pair) for pair in ends)))
 
-    def bound(role: str, variable: str, unit: str = "1") -> dict[str, object]:
-        table: dict[str, object] = {
-            "binding": {"name": "b", "step_size": 1.0},
-            "observation": {"x": {"variables": ["damage.z1"], "unit": "1"}},
-        }
-        if role == "observation":
-            table["observation"] = {"x": {"variables": [variable], "unit": unit}}
-        else:
-            table[role] = {"x": {"variable": variable, "unit": unit}}
-        return table
+    def bound(role: str, variable: str, unit: str = "1") -> Binding:
+        table = {"observation": {"x": {"variables": ["damage.z1"], "unit": "1"}}}
+        key = "variables" if role == "observation" else "variable"
+        return parse_binding(
+            {"binding": {"name": "b", "step_size": 1.0}, **table, role: {"x": {key: variable, "unit": unit}}}
+        )
 
     for role, variable, unit, words in (
         ("control", "pull", "1", "'pull', which is not a variable of the system base"),
@@ -211,32 +172,18 @@ def test_bindings_that_do_not_fit(base: SystemStructure) -> None:
         ("observation", "wing.load_factor", "1", "declared as input"),
         ("observation", "percent", "s", "and there is no conversion"),
         ("parameter", "push", "1", "of causality parameter, but 'push' is declared as input"),
-        (
-            "parameter",
-            "wing.load_factor",
-            "1",
-            "parameter, but 'wing.load_factor' is declared as input",
-        ),
-        (
-            "monitor",
-            "wing.load",
-            "1",
-            "which is not a variable of the system base; did you mean",
-        ),
+        ("parameter", "wing.load_factor", "1", "parameter, but 'wing.load_factor' is declared as input"),
+        ("monitor", "wing.load", "1", "which is not a variable of the system base; did you mean"),
     ):
         with pytest.raises(ValueError, match=words):
-            CoupledAsset(wiring, parse_binding(bound(role, variable, unit)))
+            CoupledAsset(wiring, bound(role, variable, unit))
+    right = bound("control", "push")
     with pytest.raises(ValueError, match="has no parameter 'q'"):
-        CoupledAsset(wiring, parse_binding(bound("control", "push")), parameters={"q": 1.0})
+        CoupledAsset(wiring, right, parameters={"q": 1.0})
     with pytest.raises(ValueError, match="algorithm must be one of gauss_seidel, jacobi"):
-        CoupledAsset(wiring, parse_binding(bound("control", "push")), algorithm="newton")  # type: ignore[arg-type]
+        CoupledAsset(wiring, right, algorithm="newton")  # type: ignore[arg-type]
     with (
-        CoupledAsset(wiring, parse_binding(bound("control", "push")), isolated=False) as asset,
+        CoupledAsset(wiring, right, isolated=False) as asset,
         pytest.raises(ValueError, match="has no control 'pull'; it has x"),
     ):
         asset.step({"pull": 1.0})
-
-
-def test_an_end_prints_as_it_is_written() -> None:
-    assert str(Endpoint("wing", "health.z1")) == "wing.health.z1"
-    assert str(Endpoint("", "push")) == "push"

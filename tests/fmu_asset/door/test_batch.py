@@ -11,21 +11,17 @@ import pytest
 
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.door import placement
-from fmu_asset.door.binding import Binding, parse_binding
+from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuStateError
+
+from .conftest import bound
 
 BOTH = pytest.mark.parametrize("isolated", [True, False], ids=["worker", "in process"])
 
 
 def described(state: str = "auto") -> Binding:
-    return parse_binding(
-        {
-            "binding": {"name": "member", "step_size": 1.0, "state": state},
-            "control": {"u": {"variable": "u", "unit": "m/s"}},
-            "observation": {"y": {"variables": "y", "unit": "m"}},
-        }
-    )
+    return bound(1.0, {"y": ("y", "m")}, control={"u": ("u", "m/s")}, header={"state": state})
 
 
 @pytest.fixture
@@ -68,37 +64,9 @@ def test_a_fork_goes_its_own_way(
     assert not extractions[0].exists()
 
 
-@BOTH
-def test_an_ensemble_in_one_instance(foreign_fmu: Any, extractions: list[Path], isolated: bool) -> None:
-    """Members are states; one instance makes the steps of all of them."""
-    rng = np.random.default_rng(5)
-    inputs = rng.uniform(-5.0, 5.0, (8, 20))
-    with FmiAsset(foreign_fmu("hostile2"), described(), isolated=isolated) as asset:
-        members = [asset.save_state()] * 20
-        process = asset.worker_process_id
-        for row in inputs:
-            for member, u in enumerate(row):
-                asset.restore_state(members[member])
-                asset.step({"u": float(u)})
-                members[member] = asset.save_state()
-        assert asset.worker_process_id == process
-        outputs = []
-        for member in members:
-            asset.restore_state(member)
-            outputs.append(asset.observe().values[0])
-    np.testing.assert_allclose(outputs, inputs.sum(axis=0), rtol=1e-12, atol=1e-12)
-    assert len(extractions) == 1
-
-
 def test_siblings_have_parameters_of_their_own(foreign_fmu: Any, extractions: list[Path]) -> None:
-    binding = parse_binding(
-        {
-            "binding": {"name": "lag", "step_size": 0.5},
-            "control": {"u": {"variable": "In1 (rad/s)", "unit": "1"}},
-            "parameter": {"gain": {"variable": "Lag/Gain [K]", "unit": "1"}},
-            "observation": {"y": {"variables": "Out1", "unit": "1"}},
-        }
-    )
+    roles = {"control": {"u": ("In1 (rad/s)", "1")}, "parameter": {"gain": ("Lag/Gain [K]", "1")}}
+    binding = bound(0.5, {"y": ("Out1", "1")}, **roles)
     with FmiAsset(foreign_fmu("lag1"), binding, parameters={"gain": 1.0}) as first:
         others = [first.sibling({"gain": float(gain)}) for gain in (2, 3)]
         values = [asset.step({"u": 1.0}).values[0] for asset in (first, *others)]

@@ -54,10 +54,8 @@ def test_roles_units_and_step_size_come_from_the_description(foreign_fmu: Any) -
     assert "# 0 to 5000; start 0.0" in text
     assert "the FMU does not say one, choose it" in draft_binding(read_fmu(foreign_fmu("lag1")))
     assert "takes this step size only" in draft_binding(read_fmu(foreign_fmu("fixed2")))
-    assert (
-        parse_binding(tomllib.loads(draft_binding(read_fmu(foreign_fmu("lag1")), step_size=0.3))).step_size
-        == 0.3
-    )
+    chosen = draft_binding(read_fmu(foreign_fmu("lag1")), step_size=0.3)
+    assert parse_binding(tomllib.loads(chosen)).step_size == 0.3
 
 
 def description(*variables: VariableInfo) -> FmuDescription:
@@ -113,10 +111,12 @@ def test_a_draft_takes_twice_as_long_for_twice_as_many_variables() -> None:
 
 
 def test_other_units_are_another_observation() -> None:
-    fmu = description(variable("s1", "output", unit="m"), variable("s2", "output", unit="K"))
-    assert len(parse_binding(tomllib.loads(draft_binding(fmu))).observation) == 2
-    fmu = description(dataclasses.replace(variable("s1", "output"), shape=(3,)), variable("s2", "output"))
-    assert len(parse_binding(tomllib.loads(draft_binding(fmu))).observation) == 2
+    for first, second in (
+        (variable("s1", "output", unit="m"), variable("s2", "output", unit="K")),
+        (dataclasses.replace(variable("s1", "output"), shape=(3,)), variable("s2", "output")),
+    ):
+        drafted = parse_binding(tomllib.loads(draft_binding(description(first, second))))
+        assert len(drafted.observation) == 2
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, float("nan")])

@@ -13,21 +13,18 @@ from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuInputError
 
+from .conftest import bound
+
 STEP = 0.25
 COURSE = np.array([0.5, 2.0, -1.0, -1.0, 3.0, 3.5, 0.0])
+QUARTERS = {"step_size": STEP / 4, "decimation": 4}
+EXCHANGED = {"interface": "model-exchange", "tolerance": 1e-11}
 
 
 def followed(**header: object) -> Binding:
     """Return a binding of x' = u - x with linear inputs."""
-    given = {"name": "follow", "step_size": STEP, "interpolation": "linear", **header}
-    return parse_binding(
-        {
-            "binding": given,
-            "control": {"u": {"variable": "u", "unit": "1"}},
-            "observation": {"x": {"variables": "x", "unit": "1"}},
-            "monitor": {"seen": {"variable": "seen", "unit": "1"}},
-        }
-    )
+    roles = {"control": {"u": ("u", "1")}, "monitor": {"seen": ("seen", "1")}}
+    return bound(STEP, {"x": ("x", "1")}, header={"interpolation": "linear", **header}, **roles)
 
 
 def exact(course: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -44,13 +41,9 @@ def exact(course: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     [
         ("follow1", {}, 1e-13),
         ("follow2", {}, 1e-13),
-        ("follow2", {"step_size": STEP / 4, "decimation": 4}, 1e-13),
-        ("follow2", {"interface": "model-exchange", "tolerance": 1e-11}, 1e-8),
-        (
-            "follow2",
-            {"interface": "model-exchange", "tolerance": 1e-11, "step_size": STEP / 4, "decimation": 4},
-            1e-8,
-        ),
+        ("follow2", QUARTERS, 1e-13),
+        ("follow2", EXCHANGED, 1e-8),
+        ("follow2", EXCHANGED | QUARTERS, 1e-8),
     ],
 )
 def test_straight_lines_are_followed(
@@ -89,11 +82,7 @@ def test_a_restored_state_goes_on_along_the_same_lines(foreign_fmu: Any, state: 
 def test_an_input_that_stays_is_held_to_the_bit(foreign_fmu: Any, interface: str) -> None:
     binding, seen = followed(interface=interface, step_size=0.1, decimation=3), []
     for kind in ("zero-order", "linear"):
-        with FmiAsset(
-            foreign_fmu("follow2"),
-            binding.with_interpolation(kind),  # type: ignore[arg-type]
-            isolated=False,
-        ) as asset:
+        with FmiAsset(foreign_fmu("follow2"), binding.with_interpolation(kind), isolated=False) as asset:
             asset.reset(control={"u": 0.7})
             seen.append(asset.simulate(steps=5).values.tobytes())
     assert seen[0] == seen[1]
@@ -111,26 +100,17 @@ def test_a_line_that_goes_on_is_no_event(foreign_fmu: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "inputs", "sentence"),
+    ("model", "taken", "given", "sentence"),
     [
-        ("spring2", {"force": "N"}, "takes no derivatives of inputs: it does not declare `canInterpolate"),
-        ("array3", {"u": "1"}, "takes no derivatives of inputs: FMI 3.0 has no"),
-        ("follow2", {"mode": "1"}, "none of them is a continuous real number"),
+        ("spring2", ("force", "N"), ("position", "m"), "of inputs: it does not declare `canInterpolate"),
+        ("array3", ("u", "1"), ("y", "mm"), "takes no derivatives of inputs: FMI 3.0 has no"),
+        ("follow2", ("mode", "1"), ("x", "1"), "none of them is a continuous real number"),
     ],
 )
 def test_what_cannot_follow_is_refused(
-    foreign_fmu: Any, model: str, inputs: dict[str, str], sentence: str
+    foreign_fmu: Any, model: str, taken: tuple[str, str], given: tuple[str, str], sentence: str
 ) -> None:
-    output = {"spring2": "position", "array3": "y", "follow2": "x"}[model]
-    binding = parse_binding(
-        {
-            "binding": {"name": "b", "step_size": 1.0, "interpolation": "linear"},
-            "load": {name: {"variable": name, "unit": unit} for name, unit in inputs.items()},
-            "observation": {
-                "y": {"variables": output, "unit": {"spring2": "m", "array3": "mm"}.get(model, "1")}
-            },
-        }
-    )
+    binding = bound(1.0, {"y": given}, load={"u": taken}, header={"interpolation": "linear"})
     with pytest.raises(BindingError, match=sentence):
         FmiAsset(foreign_fmu(model), binding)
 

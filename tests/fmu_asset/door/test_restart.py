@@ -12,21 +12,14 @@ import pytest
 from fmu_asset.check import check_fmu
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, SystemStructure
-from fmu_asset.door.binding import parse_binding
 from fmu_asset.door.session import FmiAsset
 from twin_master.library.grid import GridSampler, SamplingGrid
 
+from .conftest import bound
+
 BOTH = pytest.mark.parametrize("isolated", [True, False], ids=["worker", "in process"])
-SPRING: dict[str, Any] = {
-    "binding": {"name": "spring", "step_size": 0.1},
-    "control": {"push": {"variable": "force", "unit": "N"}},
-    "observation": {"motion": {"variables": ["position", "velocity"], "unit": ["m", "m/s"]}},
-}
-HOSTILE: dict[str, Any] = {
-    "binding": {"name": "hostile", "step_size": 1.0},
-    "control": {"u": {"variable": "u", "unit": "m/s"}},
-    "observation": {"y": {"variables": "y", "unit": "m"}},
-}
+SPRING = bound(0.1, {"motion": (["position", "velocity"], ["m", "m/s"])}, control={"push": ("force", "N")})
+HOSTILE = bound(1.0, {"y": ("y", "m")}, control={"u": ("u", "m/s")})
 BINDING = """
 [binding]
 name = "spring"
@@ -60,7 +53,7 @@ def test_every_start_is_the_same(
 ) -> None:
     # A file of its own for each case: what is wrong with a file is said once in a process.
     fmu = foreign_fmu("spring2", *what, f"CASE={int(isolated)}")
-    with caplog.at_level(logging.WARNING), FmiAsset(fmu, parse_binding(SPRING), isolated=isolated) as asset:
+    with caplog.at_level(logging.WARNING), FmiAsset(fmu, SPRING, isolated=isolated) as asset:
         process = asset.worker_process_id
         for push in (1.0, -2.0, 3.0):
             asset.reset()
@@ -81,15 +74,8 @@ def test_every_start_is_the_same(
 
 def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu: Any) -> None:
     """The first flight stays where it began; the second one moves, and what follows it starts anew."""
-    lying = foreign_fmu("lag1")
-    described = parse_binding(
-        {
-            "binding": {"name": "lag", "step_size": 1.0},
-            "control": {"u": {"variable": "In1 (rad/s)", "unit": "1"}},
-            "observation": {"y": {"variables": "Out1", "unit": "1"}},
-        }
-    )
-    with FmiAsset(lying, described) as asset:
+    lag = bound(1.0, {"y": ("Out1", "1")}, control={"u": ("In1 (rad/s)", "1")})
+    with FmiAsset(foreign_fmu("lag1"), lag) as asset:
         for u in (0.0, 0.0, 1.0):
             asset.reset()
             seen = asset.step({"u": u}).values[0]
@@ -122,7 +108,7 @@ def test_a_hidden_clock_shows_at_no_start(
             return asset.simulate({"u": push}, steps=steps).values[:, 0].tolist()
         return [asset.step({"u": push}).values[0] for _ in range(steps)]
 
-    with caplog.at_level(logging.WARNING), FmiAsset(fmu, parse_binding(HOSTILE), isolated=isolated) as asset:
+    with caplog.at_level(logging.WARNING), FmiAsset(fmu, HOSTILE, isolated=isolated) as asset:
         assert [flown(asset, 0.1, length)[0] for length in lengths] == [0.1] * len(lengths)
         # A start whose first step is another one has those that are known for its proof.
         flown(asset, 0.3, 7)
@@ -135,7 +121,7 @@ def test_a_hidden_clock_shows_at_no_start(
 
 def test_what_never_starts_alike_is_not_started_in_ever_new_processes(foreign_fmu: Any) -> None:
     fmu = foreign_fmu("hostile2", "NOT_DETERMINISTIC", "STAYS_LOADED", "CLOCK=process_clock")
-    with FmiAsset(fmu, parse_binding(HOSTILE)) as asset:
+    with FmiAsset(fmu, HOSTILE) as asset:
         for _ in range(8):
             asset.reset()
             asset.step()
@@ -166,13 +152,7 @@ def test_a_library_is_sampled_from_fresh_starts(foreign_fmu: Any, tmp_path: Path
 def test_components_of_a_coupled_asset_start_anew(foreign_fmu: Any) -> None:
     fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING")
     structure = SystemStructure(name="one", components=(Component("spring", fmu),))
-    described = parse_binding(
-        {
-            "binding": {"name": "one", "step_size": 0.1},
-            "control": {"push": {"variable": "spring.force", "unit": "N"}},
-            "observation": {"x": {"variables": "spring.position", "unit": "m"}},
-        }
-    )
+    described = bound(0.1, {"x": ("spring.position", "m")}, control={"push": ("spring.force", "N")})
     with CoupledAsset(structure, described) as asset:
         for push in (1.0, 2.0):
             asset.reset()
@@ -182,22 +162,16 @@ def test_components_of_a_coupled_asset_start_anew(foreign_fmu: Any) -> None:
 
 
 def test_the_check_names_it(foreign_fmu: Any) -> None:
-    found = check_fmu(foreign_fmu("spring2", "RESET_DOES_NOTHING"), step_size=0.1)
-    assert len(found.problems) == 1, found.problems
-    assert found.problems[0].startswith("Its reset returns OK and does not bring it back to its start")
-
-
-def test_negative_zero_is_no_traceback(foreign_fmu: Any) -> None:
-    found = check_fmu(foreign_fmu("hostile2", "NEGATIVE_ZERO_AFTER_RESET"))
-    assert found.passed, found.problems
+    (problem,) = check_fmu(foreign_fmu("spring2", "RESET_DOES_NOTHING"), step_size=0.1).problems
+    assert problem.startswith("Its reset returns OK and does not bring it back to its start")
+    assert check_fmu(foreign_fmu("hostile2", "NEGATIVE_ZERO_AFTER_RESET")).passed
 
 
 @BOTH
 def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(
     foreign_fmu: Any, isolated: bool
 ) -> None:
-    described = {**SPRING, "observation": {"tolerance": {"variables": "tolerance", "unit": "1"}}}
     for header, expected in (({}, 1e-4), ({"tolerance": 1e-7}, 1e-7)):
-        chosen = parse_binding({**described, "binding": {**SPRING["binding"], **header}})
+        chosen = bound(0.1, {"tolerance": ("tolerance", "1")}, header=header)
         with FmiAsset(foreign_fmu("spring2"), chosen, isolated=isolated) as asset:
             assert asset.observe().values[0] == expected

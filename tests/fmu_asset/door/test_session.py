@@ -38,9 +38,7 @@ def test_quasi_static_step_is_the_static_response(
             [(3.0, 0.0, 0.0, 0.0), (2.0, 0.4, 0.2, 0.0), (-1.0, 0.8, 0.8, 5.0)]
         ):
             observation = asset.step({"load_factor": n}, {"z1": z1, "z2": z2}, {"tip_force": force})
-            expected = model.static_response(
-                young_modulus_factor=1.0, stiffness_loss=(z1, z2), load_factor=n, tip_force=force
-            )
+            expected = model.static_response({"z1": z1, "z2": z2, "load_factor": n, "tip_force": force})
             np.testing.assert_array_equal(observation.values, expected.strain)
             assert observation.extra["tip_displacement"] == expected.displacement[0]
             assert observation.extra["strain_error_bound"] == expected.strain_error_bound
@@ -50,22 +48,12 @@ def test_quasi_static_step_is_the_static_response(
 @BOTH
 def test_parameters_reach_the_fmu(model: ReducedModel, fmu: Path, binding: Binding, isolated: bool) -> None:
     with FmiAsset(fmu, binding, isolated=isolated, parameters={"young_modulus_factor": 1.05}) as asset:
-        first = asset.step({"load_factor": 3.0}).values
-        np.testing.assert_array_equal(
-            first,
-            model.static_response(
-                young_modulus_factor=1.05, stiffness_loss=(0.0, 0.0), load_factor=3.0
-            ).strain,
-        )
-        asset.reset({"young_modulus_factor": 0.95})
-        assert asset.time == 0.0
-        second = asset.step({"load_factor": 3.0}).values
-        np.testing.assert_array_equal(
-            second,
-            model.static_response(
-                young_modulus_factor=0.95, stiffness_loss=(0.0, 0.0), load_factor=3.0
-            ).strain,
-        )
+        for factor in (1.05, 0.95):
+            expected = model.static_response({"young_modulus_factor": factor, "load_factor": 3.0})
+            seen = asset.step({"load_factor": 3.0})
+            assert seen.time == 1.0
+            np.testing.assert_array_equal(seen.values, expected.strain)
+            asset.reset({"young_modulus_factor": 0.95})
 
 
 def test_time_is_never_accumulated(fmu: Path, binding: Binding) -> None:
@@ -76,59 +64,22 @@ def test_time_is_never_accumulated(fmu: Path, binding: Binding) -> None:
 
 
 def test_transient_follows_the_modal_integrator(model: ReducedModel, fmu: Path, binding: Binding) -> None:
+    """A release, a step in load and a loss of stiffness, to the bit."""
     changed = bind(binding, binding={"name": "wing", "step_size": 0.005})
-    parameters = {
-        "response": 2.0,
-        "initial_tip_displacement": 0.03,
-        "damping_alpha": 1.0,
-        "damping_beta": 1e-4,
-    }
-    integrator = wing_integrator(
-        model,
-        young_modulus_factor=1.0,
-        stiffness_loss=(0.0, 0.0),
-        servo_mass=0.169,
-        pitot_mass=0.134,
-        damping_alpha=1.0,
-        damping_beta=1e-4,
-    )
+    damping = {"damping_alpha": 1.0, "damping_beta": 1e-4}
+    parameters = {"response": 2.0, "initial_tip_displacement": 0.03, **damping}
+    integrator, damaged = (wing_integrator(model, stiffness_loss=(z1, 0.0), **damping) for z1 in (0.0, 0.4))
     state = integrator.released(0.03, (1.0, 0.0), TIP_FORCE)
     with FmiAsset(fmu, changed, parameters=parameters) as asset:
         np.testing.assert_array_equal(asset.observe().values, integrator.outputs(state)[:-1])
-        for load_factor in (1.0, 1.0, 3.0, 3.0):
-            values = asset.step({"load_factor": load_factor}).values
+        for load_factor, z1 in ((1.0, 0.0), (1.0, 0.0), (3.0, 0.0), (3.0, 0.4), (2.0, 0.4)):
+            if z1 and integrator is not damaged:
+                state, integrator = damaged.take_over(state, integrator), damaged
+            seen = asset.step({"load_factor": load_factor}, {"z1": z1})
             state = integrator.advance(state, 0.005, (load_factor, 0.0))
-            np.testing.assert_array_equal(values, integrator.outputs(state)[:-1])
-
-
-def test_released_tip_rings_down_and_a_step_in_load_overshoots(fmu: Path, binding: Binding) -> None:
-    changed = bind(binding, binding={"name": "wing", "step_size": 0.005})
-    with FmiAsset(fmu, changed, parameters={"response": 2.0, "initial_tip_displacement": 0.03}) as asset:
-        rest = asset.step().extra["tip_displacement"]
-        asset.reset(control={"load_factor": 0.0})
-        ring = np.array([asset.step().extra["tip_displacement"] for _ in range(1200)])
-        assert ring.min() < -0.015
-        assert np.abs(ring[-200:]).max() < 0.5 * np.abs(ring[:200]).max()
-        asset.reset({"response": 2.0}, control={"load_factor": 1.0})
-        tip = np.array([asset.step({"load_factor": 3.0}).extra["tip_displacement"] for _ in range(4000)])
-        steady = tip[-1]
-        assert tip.max() > 1.3 * steady
-        assert steady == pytest.approx(3.0 * asset_rest(asset), rel=1e-3)
-    assert np.isfinite(rest)
-
-
-def asset_rest(asset: FmiAsset) -> float:
-    """Return the tip displacement at rest under load factor 1."""
-    asset.reset({"response": 1.0}, control={"load_factor": 1.0})
-    return asset.observe().extra["tip_displacement"]
-
-
-def test_damage_in_flight_keeps_the_motion(fmu: Path, binding: Binding) -> None:
-    changed = bind(binding, binding={"name": "wing", "step_size": 1e-6})
-    with FmiAsset(fmu, changed, parameters={"response": 2.0, "initial_tip_displacement": 0.03}) as asset:
-        before = asset.step(health={"z1": 0.0}).extra["tip_displacement"]
-        after = asset.step(health={"z1": 0.4}).extra["tip_displacement"]
-    assert after == pytest.approx(before, rel=0.02)
+            expected = integrator.outputs(state)
+            np.testing.assert_array_equal(seen.values, expected[:-1])
+            assert seen.extra["tip_displacement"] == expected[-1]
 
 
 @BOTH
@@ -138,17 +89,22 @@ def test_state_is_restored_to_the_bit_in_a_new_process(
 ) -> None:
     changed = bind(binding, binding={"name": "wing", "step_size": 0.01})
     parameters = {"response": response, "initial_tip_displacement": 0.02, "young_modulus_factor": 1.01}
+
+    def further(asset: FmiAsset) -> list[str]:
+        seen = (asset.step({"load_factor": 2.5}, {"z1": z1}) for z1 in (0.2, 0.6))
+        return [
+            f"{o.values.tobytes().hex()} {o.time.hex()} {o.extra['tip_displacement'].hex()}" for o in seen
+        ]
+
     with FmiAsset(fmu, changed, isolated=isolated, parameters=parameters) as asset:
         asset.step({"load_factor": 2.0}, {"z1": 0.1, "z2": 0.3})
         asset.step({"load_factor": 3.0}, {"z1": 0.2, "z2": 0.3})
         saved = asset.save_state()
-        later = [asset.step({"load_factor": 2.5}, {"z1": z1}) for z1 in (0.2, 0.6)]
+        later = further(asset)
         asset.restore_state(saved)
-        again = [asset.step({"load_factor": 2.5}, {"z1": z1}) for z1 in (0.2, 0.6)]
+        assert further(asset) == later
     (tmp_path / "state").write_bytes(saved)
-    (tmp_path / "binding.json").write_text(
-        json.dumps(json.loads(changed.model_dump_json(exclude_none=True))), encoding="utf-8"
-    )
+    (tmp_path / "binding.json").write_text(changed.model_dump_json(exclude_none=True), encoding="utf-8")
     program = (
         "import json, sys\n"
         "from pathlib import Path\n"
@@ -162,18 +118,9 @@ def test_state_is_restored_to_the_bit_in_a_new_process(
         "        seen = asset.step({'load_factor': 2.5}, {'z1': z1})\n"
         "        print(seen.values.tobytes().hex(), seen.time.hex(), seen.extra['tip_displacement'].hex())\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program, fmu, tmp_path, str(isolated)],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    expected = [
-        f"{o.values.tobytes().hex()} {o.time.hex()} {o.extra['tip_displacement'].hex()}" for o in later
-    ]
-    assert done.stdout.split("\n")[:2] == expected
-    assert [o.values.tobytes() for o in again] == [o.values.tobytes() for o in later]
+    words = [sys.executable, "-c", program, fmu, tmp_path, str(isolated)]
+    done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True)
+    assert done.stdout.split("\n")[:2] == later
 
 
 def test_state_of_another_fmu_or_nonsense_is_refused(
@@ -204,10 +151,7 @@ def test_state_of_another_fmu_or_nonsense_is_refused(
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (
-            ({"load_factor": 9.0},),
-            r"control\.load_factor = 9\.0 lies outside the range of 'load_factor', -1 to 4;",
-        ),
+        (({"load_factor": 9.0},), r"control\.load_factor = 9\.0 lies outside .* 'load_factor', -1 to 4;"),
         (({"load_factor": float("nan")},), r"control\.load_factor must be finite, but is nan"),
         (({"load_factor": float("inf")},), r"must be finite, but is inf"),
         (({}, {"z1": -0.1}), r"health\.z1 = -0\.1 lies outside"),
@@ -227,12 +171,17 @@ def test_inputs_out_of_range_are_refused_before_they_are_sent(
 
 
 def test_parameters_are_checked(fmu: Path, binding: Binding) -> None:
-    with pytest.raises(FmuInputError, match=r"parameter\.young_modulus_factor = 3\.0 lies outside"):
-        FmiAsset(fmu, binding, parameters={"young_modulus_factor": 3.0})
-    with pytest.raises(FmuInputError, match="whole number"):
-        FmiAsset(fmu, binding, parameters={"response": 1.5})
-    with pytest.raises(BindingError, match="no parameter 'e'"):
-        FmiAsset(fmu, binding, parameters={"e": 1.0})
+    for parameters, kind, sentence in (
+        (
+            {"young_modulus_factor": 3.0},
+            FmuInputError,
+            r"parameter\.young_modulus_factor = 3\.0 lies",
+        ),
+        ({"response": 1.5}, FmuInputError, "whole number"),
+        ({"e": 1.0}, BindingError, "no parameter 'e'"),
+    ):
+        with pytest.raises(kind, match=sentence):
+            FmiAsset(fmu, binding, parameters=parameters)
     with FmiAsset(fmu, binding, isolated=False) as asset, pytest.raises(BindingError, match="no control 'n'"):
         asset.step({"n": 1.0})
 
@@ -242,20 +191,11 @@ def test_parameters_are_checked(fmu: Path, binding: Binding) -> None:
     [
         ({"control": {"n": {"variable": "load_facto", "unit": "1"}}}, r"did you mean 'load_factor'"),
         ({"control": {"n": {"variable": "load_factor", "unit": "N"}}}, r"is in 'N', but the FMU has"),
-        (
-            {"control": {"n": {"variable": "load_factor", "unit": "furlong"}}},
-            r"no conversion between the two",
-        ),
+        ({"control": {"n": {"variable": "load_factor", "unit": "furlong"}}}, "no conversion between the two"),
         ({"control": {"n": {"variable": "strain[1]", "unit": "1"}}}, r"must be of causality input"),
-        (
-            {"parameter": {"a": {"variable": "load_factor", "unit": "1"}}, "control": {}},
-            r"causality parameter",
-        ),
+        ({"parameter": {"a": {"variable": "load_factor", "unit": "1"}}, "control": {}}, "ity parameter"),
         ({"monitor": {"a": {"variable": "load_factor", "unit": "1"}}}, r"must be of causality output"),
-        (
-            {"observation": {"s": {"variables": "strain[{1..25}]", "unit": "1"}}},
-            r"'strain\[25\]', which is not",
-        ),
+        ({"observation": {"s": {"variables": "strain[{1..25}]", "unit": "1"}}}, r"'strain\[25\]', which is"),
     ],
 )
 def test_a_binding_that_does_not_fit_is_one_sentence(
@@ -280,9 +220,7 @@ def test_units_are_converted(model: ReducedModel, fmu: Path, binding: Binding) -
         seen = asset.step({"load_factor": 3.0}, {"z1": 85.0, "z2": 20.0}, {"tip_force": 0.005})
         with pytest.raises(FmuInputError, match=r"0 to 0\.85"):
             asset.step({}, {"z1": 85.1})
-    expected = model.static_response(
-        young_modulus_factor=1.0, stiffness_loss=(0.85, 0.2), load_factor=3.0, tip_force=5.0
-    )
+    expected = model.static_response({"z1": 0.85, "z2": 0.2, "load_factor": 3.0, "tip_force": 5.0})
     np.testing.assert_allclose(seen.values, 1e6 * expected.strain, rtol=1e-12)
     assert seen.extra["tip"] == pytest.approx(1e3 * expected.displacement[0], rel=1e-12)
 
@@ -295,9 +233,8 @@ def test_the_fmu_itself_refuses_and_says_why(
     with FmiAsset(fmu, binding) as asset:
         before = asset.step({"load_factor": 3.0})
         for value, sentence in ((99, "lies outside its range"), (float("nan"), "not finite")):
-            with pytest.raises(
-                FmuCallError, match=rf"(?s)step 1 from t = 1 s.*Discard.*load_factor.*{sentence}"
-            ):
+            said = rf"(?s)step 1 from t = 1 s.*Discard.*load_factor.*{sentence}"
+            with pytest.raises(FmuCallError, match=said):
                 asset.step({"load_factor": value})
         after = asset.step()
         np.testing.assert_array_equal(before.values, after.values)
