@@ -105,9 +105,7 @@ def log_posterior(unknown: FloatArray, prior: Priors, modal: tuple[Reading, ...]
     for mode, (error, tau) in enumerate(zip(errors, MODEL_ERROR, strict=True)):
         total += stats.norm.logpdf(error, 0.0, tau)
         total += stats.norm.logpdf(
-            modal[mode].value,
-            frequency[:, mode] * (1.0 + error),
-            modal[mode].deviation,
+            modal[mode].value, frequency[:, mode] * (1.0 + error), modal[mode].deviation
         )
         ratio = 0.5 * (alpha / omega[:, mode] + beta * omega[:, mode])
         total += stats.norm.logpdf(modal[2 + mode].value, ratio, modal[2 + mode].deviation)
@@ -197,9 +195,7 @@ def test_enumeration_finds_mean_deviation_and_evidence(tables: WingTable) -> Non
     omega = 2.0 * math.pi * frequency
     for mode, tau in enumerate(MODEL_ERROR):
         log_density += stats.norm.logpdf(
-            MODAL[mode].value,
-            frequency[:, mode],
-            np.hypot(MODAL[mode].deviation, tau * frequency[:, mode]),
+            MODAL[mode].value, frequency[:, mode], np.hypot(MODAL[mode].deviation, tau * frequency[:, mode])
         )
     design = np.stack([0.5 / omega, 0.5 * omega], axis=2)
     ratios, deviations = np.array([(item.value, item.deviation) for item in MODAL[2:]]).T

@@ -103,10 +103,7 @@ def test_the_grid_does_not_matter():
     assert coarse.standard_deviation == pytest.approx(fine.standard_deviation, rel=1e-7)
 
 
-@given(
-    load_scale=st.floats(1e-4, 1e4),
-    displacement_scale=st.floats(1e-4, 1e4),
-)
+@given(load_scale=st.floats(1e-4, 1e4), displacement_scale=st.floats(1e-4, 1e4))
 @settings(max_examples=30, deadline=None)
 def test_units_do_not_matter(load_scale, displacement_scale):
     data = LoadDisplacementData(

@@ -303,10 +303,7 @@ def test_two_wings_in_one_process_do_not_mix(
     make_model: Callable[[float], ReducedModel], fmu: Path, binding: Binding, tmp_path: Path
 ) -> None:
     other = build_fmu(make_model(1.8e5), tmp_path / "stiff.fmu").path
-    with (
-        FmiAsset(fmu, binding, isolated=False) as first,
-        FmiAsset(other, binding, isolated=False) as second,
-    ):
+    with FmiAsset(fmu, binding, isolated=False) as first, FmiAsset(other, binding, isolated=False) as second:
         for _ in range(2):
             one, two = first.step({"load_factor": 3.0}), second.step({"load_factor": 3.0})
             np.testing.assert_allclose(one.values, 2.0 * two.values, rtol=1e-9)
