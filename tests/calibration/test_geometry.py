@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import MeasuredLength, published_lengths, read_lengths
 
-REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference" / "uav_experimental_calibration"
-
 
 def test_the_published_lengths() -> None:
     result = published_lengths()
@@ -55,10 +53,8 @@ def test_posterior_lies_between_and_is_narrower(
     assert length.posterior.standard_deviation <= length.prior.deviation
 
 
-def test_the_published_file_gives_the_published_figures() -> None:
-    if not REFERENCE.is_dir():
-        pytest.skip("the reference data are not beside the project")
-    for read, published in zip(read_lengths(REFERENCE), published_lengths(), strict=True):
+def test_the_published_file_gives_the_published_figures(reference: Path) -> None:
+    for read, published in zip(read_lengths(reference), published_lengths(), strict=True):
         assert read.designed == pytest.approx(published.designed, rel=1e-12)
         assert read.measured == pytest.approx(published.measured, rel=1e-12)
 

@@ -9,7 +9,6 @@ import pytest
 from calibration.errors import ExperimentDataError
 from calibration.geometry import (
     Lengths,
-    MeasuredLength,
     published_lengths,
     tailored_design,
     tailored_geometry,
@@ -95,8 +94,3 @@ def test_a_skin_too_thick_for_the_measured_chord_is_refused() -> None:
     thick = crowded(skin={"thickness": 0.0023})
     with pytest.raises(InvalidDesignError, match=r"the skin of 0\.0023 m does not fit"):
         tailored_design(thick, lengths(tip_chord=0.24))
-
-
-def test_lengths_of_another_wing_are_refused_by_their_record() -> None:
-    with pytest.raises(ExperimentDataError, match="more than 10 % apart"):
-        MeasuredLength("semi_span", 1.8288, 1828.0)

@@ -87,16 +87,10 @@ def test_the_release_is_the_integrators(wing: ReducedModel) -> None:
 
 @pytest.mark.slow
 def test_overdamped_and_critical_modes(wing: ReducedModel) -> None:
-    for beta in (
-        0.03,
-        1.0
-        / (
-            math.pi
-            * wing.modes(
-                young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
-            ).frequency[3]
-        ),
-    ):
+    modes = wing.modes(
+        young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
+    )
+    for beta in (0.03, 1.0 / (math.pi * modes.frequency[3])):
         state = DigitalState(damping_alpha=0.0, damping_beta=beta)
         _, signal = VirtualWing(wing, state).ring_down(0.03, 1.0, 500.0)
         assert np.all(np.isfinite(signal))
@@ -106,12 +100,10 @@ def test_overdamped_and_critical_modes(wing: ReducedModel) -> None:
 @pytest.mark.slow
 def test_records_give_back_the_truth(wing: ReducedModel) -> None:
     bench = VirtualWing(wing, TRUTH, frequency_error=(-0.01, 0.045))
-    first, second = wing.modes(
+    modes = wing.modes(
         young_modulus_factor=1.0073, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
-    ).followed
-    frequency = wing.modes(
-        young_modulus_factor=1.0073, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
-    ).frequency
+    )
+    frequency, (first, second) = modes.frequency, modes.followed
     records = measure_ring_down(bench, 3, sampling_rate=250.0)
     trials = fit_trials(records, Frequencies.FITTED)
     assert trials.frequency(0).mean == pytest.approx(0.99 * frequency[first], rel=2e-4)

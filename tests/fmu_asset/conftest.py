@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -20,6 +21,16 @@ from fmu_asset.packing.structure_fmu import build_fmu
 ROOT = Path(__file__).parents[2]
 NODES = 16
 GAUGES = 24
+
+
+@pytest.fixture
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder in which this test alone makes its temporary folders, here and in subprocesses."""
+    folder = tmp_path / "scratch"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    return folder
 
 
 PLACES = (slice(3, 6), slice(9, 12), slice(6, 8), slice(13, 15))

@@ -17,8 +17,6 @@ from calibration.dynamics.ringdown import FIRST_PEAK, Frequencies, fit_ring_down
 from calibration.dynamics.trials import amplitude_dependence, fit_trials
 from calibration.errors import CalibrationError, ExperimentDataError, ExperimentFileError, RingDownError
 
-REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
-
 
 def ring_down(
     time: NDArray[np.float64],
@@ -80,18 +78,11 @@ def test_a_fast_record_is_decimated_and_cropped() -> None:
     prepared = prepare(record)
     assert prepared.sampling_rate == pytest.approx(2000.0)
     assert prepared.time[0] > FIRST_PEAK
-    fit = fit_ring_down(record, Frequencies.FITTED)
-    assert fit.modes[0].frequency == pytest.approx(5.65, rel=1e-4)
-    assert fit.modes[1].frequency == pytest.approx(29.97, rel=1e-3)
-    assert fit.modes[1].damping_ratio == pytest.approx(0.0717, rel=1e-2)
-
-
-def test_a_time_printed_to_few_digits_is_even_enough() -> None:
-    time = np.arange(0, 400_000) / 100_000.0
-    rounded = RingDownRecord(np.round(time, 4), ring_down(time))
-    fit = fit_ring_down(rounded, Frequencies.FITTED)
-    assert fit.modes[0].frequency == pytest.approx(5.65, rel=1e-4)
-    assert fit.modes[1].frequency == pytest.approx(29.97, rel=1e-3)
+    printed = RingDownRecord(np.round(time, 4), record.signal)  # to few digits, which is even enough
+    for fit in (fit_ring_down(shown, Frequencies.FITTED) for shown in (record, printed)):
+        assert fit.modes[0].frequency == pytest.approx(5.65, rel=1e-4)
+        assert fit.modes[1].frequency == pytest.approx(29.97, rel=1e-3)
+        assert fit.modes[1].damping_ratio == pytest.approx(0.0717, rel=1e-2)
 
 
 @pytest.mark.long
@@ -209,10 +200,8 @@ def test_the_spectrum_of_a_cosine() -> None:
     assert amplitude.max() == pytest.approx(0.02, rel=1e-2)
 
 
-def test_the_digitised_records() -> None:
-    if not REFERENCE.is_dir():
-        pytest.skip("the reference data are not beside the project")
-    records = read_records(REFERENCE)
+def test_the_digitised_records(reference: Path) -> None:
+    records = read_records(reference)
     assert len(records) == 5
     trials = fit_trials(records)
     assert trials.frequency(0).mean == pytest.approx(5.65, rel=0.005)
@@ -260,6 +249,7 @@ TIME = np.arange(0.0, 4.0, 1.0 / 200.0)
         (0.01 * np.exp(-TIME) * np.cos(2.0 * np.pi * 5.65 * TIME), "two spectral peaks"),
         (0.01 * np.exp(-TIME), "oscillation"),
         (np.random.default_rng(0).standard_normal(TIME.size), "does not decay"),
+        (ring_down(TIME, amplitude=(0.01, 3e-5), ratio=(0.05, -0.006)), "decay"),  # a mode that grows
     ],
 )
 def test_records_without_two_decaying_modes(signal: NDArray[np.float64], words: str) -> None:
@@ -267,37 +257,36 @@ def test_records_without_two_decaying_modes(signal: NDArray[np.float64], words: 
         fit_ring_down(RingDownRecord(TIME, signal), start=None)
 
 
-def test_a_mode_that_grows_is_refused() -> None:
-    grows = ring_down(TIME, amplitude=(0.01, 3e-5), ratio=(0.05, -0.006))
-    with pytest.raises(RingDownError, match="decay"):
-        fit_ring_down(RingDownRecord(TIME, grows), start=None)
+GOOD = ring_down(TIME)
+FROM_100 = np.arange(TIME.size) >= 100
 
 
-def test_bad_records_are_told_in_one_sentence() -> None:
-    good = ring_down(TIME)
-    lost = good.copy()
-    lost[17] = math.nan
-    with pytest.raises(ExperimentDataError, match="sample 18 is nan"):
-        RingDownRecord(TIME, lost)
-    with pytest.raises(ExperimentDataError, match="clipped"):
-        RingDownRecord(TIME, np.clip(good, -0.008, 0.008))
-    with pytest.raises(ExperimentDataError, match="constant"):
-        RingDownRecord(TIME, np.zeros(TIME.size))
-    with pytest.raises(ExperimentDataError, match="at least 64"):
-        RingDownRecord(TIME[:20], good[:20])
-    uneven = TIME.copy()
-    uneven[100:] += 0.1
-    with pytest.raises(ExperimentDataError, match="after sample 100"):
-        RingDownRecord(uneven, good)
-    with pytest.raises(ExperimentDataError, match="even steps"):
-        RingDownRecord(TIME[::-1], good)
-    with pytest.raises(ExperimentDataError, match="as long as time"):
-        RingDownRecord(TIME, good[1:])
-    for scale, words in ((1e3, "shows nothing above"), (1e-6, "too short")):
-        with pytest.raises(RingDownError, match=words):
-            fit_ring_down(RingDownRecord(scale * TIME, good), start=None)
-    with pytest.raises(RingDownError, match="remain"):
-        fit_ring_down(RingDownRecord(TIME, good), start=3.5)
+@pytest.mark.parametrize(
+    ("time", "signal", "words"),
+    [
+        (TIME, np.where(np.arange(TIME.size) == 17, math.nan, GOOD), "sample 18 is nan"),
+        (TIME, np.clip(GOOD, -0.008, 0.008), "clipped"),
+        (TIME, np.zeros(TIME.size), "constant"),
+        (TIME[:20], GOOD[:20], "at least 64"),
+        (TIME + 0.1 * FROM_100, GOOD, "after sample 100"),
+        (TIME[::-1], GOOD, "even steps"),
+        (TIME, GOOD[1:], "as long as time"),
+    ],
+)
+def test_bad_records_are_told_in_one_sentence(
+    time: NDArray[np.float64], signal: NDArray[np.float64], words: str
+) -> None:
+    with pytest.raises(ExperimentDataError, match=words):
+        RingDownRecord(time, signal)
+
+
+@pytest.mark.parametrize(
+    ("scale", "start", "words"),
+    [(1e3, None, "shows nothing above"), (1e-6, None, "too short"), (1.0, 3.5, "remain")],
+)
+def test_records_that_cannot_be_fitted(scale: float, start: float | None, words: str) -> None:
+    with pytest.raises(RingDownError, match=words):
+        fit_ring_down(RingDownRecord(scale * TIME, GOOD), start=start)
 
 
 @settings(max_examples=40, deadline=None)

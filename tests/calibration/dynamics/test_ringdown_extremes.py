@@ -13,7 +13,6 @@ from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import RingDownError
 
-REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 WIDTH = 0.00811
 
 
@@ -45,10 +44,8 @@ def test_damping_of_a_drawn_signal() -> None:
     assert 0.0 < second.damping_ratio_standard_error < 0.02
 
 
-def test_the_digitised_records() -> None:
-    if not REFERENCE.is_dir():
-        pytest.skip("the reference data are not beside the project")
-    trials = fit_trials(read_records(REFERENCE))
+def test_the_digitised_records(reference: Path) -> None:
+    trials = fit_trials(read_records(reference))
     refined = refine_by_extremes(trials)
     assert refined.damping_ratio(0).mean == pytest.approx(0.028, rel=0.10)
     # Nearer to the 0.0717 of the raw records than the middle of the ink is.

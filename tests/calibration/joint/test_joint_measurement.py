@@ -15,7 +15,6 @@ from calibration.dynamics.trials import RingDownTrials, fit_trials
 from calibration.joint.measurement import PUBLISHED_MODES, _mean, measured_modes
 from calibration.result.record import Reading
 
-REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 TIME = np.arange(0.0, 6.4, 1.0 / 250.0)
 F1, F2, ZETA1, ZETA2 = 5.65, 29.0, 0.028, 0.05
 
@@ -97,10 +96,8 @@ def test_mean_over_trials() -> None:
     assert _mean([1.0, 2.0], [1e-3, 1e-3])[1] == pytest.approx(1.0)
 
 
-def test_the_published_records() -> None:
-    if not REFERENCE.is_dir():
-        pytest.skip("the reference data are not beside the project")
-    found = measured_modes(fit_trials(read_records(REFERENCE)))
+def test_the_published_records(reference: Path) -> None:
+    found = measured_modes(fit_trials(read_records(reference)))
     for read, published in zip(found, PUBLISHED_MODES, strict=True):
         assert read.deviation == pytest.approx(published.deviation, rel=0.02), read.name
         if read.name.startswith("frequency"):

@@ -25,7 +25,6 @@ from calibration.paper.procedure import damping_coefficients, fit_masses, read_p
 from calibration.result.record import Reading
 from fe.runtime.modal_system import rayleigh_damping_ratio
 
-REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
 READ = (weighed(), *PUBLISHED_MODES)
 
@@ -69,10 +68,8 @@ def test_damping_coefficients_undo_the_damping_ratios(
     assert found == pytest.approx((alpha, beta), rel=1e-6, abs=1e-9)
 
 
-def test_the_authors_table_gives_their_figures() -> None:
-    if not REFERENCE.is_dir():
-        pytest.skip("the reference data are not beside the project")
-    result = read_published_results(REFERENCE)
+def test_the_authors_table_gives_their_figures(reference: Path) -> None:
+    result = read_published_results(reference)
     assert result.samples.shape == (100, 5)
     mean, deviation = result.samples.mean(axis=0), result.samples.std(axis=0, ddof=1)
     assert mean[1:3] == pytest.approx([0.1691, 0.1337], abs=5e-5)
@@ -83,12 +80,10 @@ def test_the_authors_table_gives_their_figures() -> None:
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_our_wing_on_the_published_targets() -> None:
-    if not REFERENCE.is_dir():
-        pytest.skip("the reference data are not beside the project")
+def test_our_wing_on_the_published_targets(reference: Path) -> None:
     from fe.reduction.model_cache import reduced_model
 
-    authors = read_published_results(REFERENCE)
+    authors = read_published_results(reference)
     wing = tabulate_wing(reduced_model())
     ours = fit_masses(wing.frequency, authors.samples[:, 0], wing.validity, READ)
     mean, deviation = ours.samples.mean(axis=0), ours.samples.std(axis=0, ddof=1)
@@ -116,21 +111,14 @@ def test_refusals() -> None:
 def test_bad_files(tmp_path: Path) -> None:
     file = tmp_path / "e.csv"
     header = "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_pitot,freq_1,freq_2\n"
-    for text, error, words in (
-        (header, ExperimentFileError, "no rows"),
-        (
-            header.replace("freq_2\n", "f\n") + "1,5.6,29.9,.03,.07,.17,.1,5.6,28.6\n",
-            ExperimentFileError,
-            "no column 'freq_2'",
-        ),
-        (
-            header + "1,5.6,29.9,.03,.07,.17,,5.6,28.6\n",
-            ExperimentFileError,
-            "'mass_pitot' must hold a number, and nothing",
-        ),
+    row = "1,5.6,29.9,.03,.07,.17,.1,5.6,28.6\n"
+    for text, words in (
+        (header, "no rows"),
+        (header.replace("freq_2\n", "f\n") + row, "no column 'freq_2'"),
+        (header + row.replace(".17,.1,", ".17,,"), "'mass_pitot' must hold a number, and nothing"),
     ):
         file.write_text(text, encoding="utf-8")
-        with pytest.raises(error, match=words):
+        with pytest.raises(ExperimentFileError, match=words):
             read_published_results(file)
     with pytest.raises(ExperimentFileError, match="does not hold"):
         read_published_results(tmp_path)

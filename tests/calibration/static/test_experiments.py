@@ -14,7 +14,6 @@ from calibration.static.experiments import (
     read_measurements,
 )
 
-REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 PAIRS = np.array([[2.4525, 3.937], [4.905, 7.6962], [7.3575, 10.8712], [2.4525, 3.3528], [4.905, 7.2898]])
 
 
@@ -29,10 +28,8 @@ def table(pairs: np.ndarray, header: str = "load,displacement") -> str:
     return "\n".join([header, *(f"{load:.10g},{displacement:.10g}" for load, displacement in pairs)]) + "\n"
 
 
-def test_published_pairs_are_those_of_the_authors_folder():
-    if not REFERENCE.is_dir():
-        pytest.skip("the authors' calibration folder is not beside the project")
-    read, published = read_measurements(REFERENCE), published_measurements()
+def test_published_pairs_are_those_of_the_authors_folder(reference):
+    read, published = read_measurements(reference), published_measurements()
     assert read.sha256 == published.sha256
     assert np.array_equal(read.run, published.run)
 

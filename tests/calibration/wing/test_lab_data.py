@@ -9,18 +9,9 @@ import pytest
 from calibration.errors import ExperimentFileError
 from calibration.wing.lab_data import published_data, read_lab_folder
 
-AUTHORS = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 
-
-@pytest.fixture
-def authors_folder() -> Path:
-    if not AUTHORS.is_dir():
-        pytest.skip(f"the authors' calibration folder is not at {AUTHORS}")
-    return AUTHORS
-
-
-def test_the_published_figures_are_those_of_the_authors_folder(authors_folder: Path) -> None:
-    read, published = read_lab_folder(authors_folder, "published"), published_data()
+def test_the_published_figures_are_those_of_the_authors_folder(reference: Path) -> None:
+    read, published = read_lab_folder(reference, "published"), published_data()
     assert read.pairs.sha256 == published.pairs.sha256
     assert read.input_hashes == published.input_hashes
     assert [origin.read for origin in read.origins] == [True, True, False]
@@ -30,8 +21,8 @@ def test_the_published_figures_are_those_of_the_authors_folder(authors_folder: P
     assert read.trials is None
 
 
-def test_digitised_records_are_fitted_by_their_extremes(authors_folder: Path) -> None:
-    read = read_lab_folder(authors_folder)
+def test_digitised_records_are_fitted_by_their_extremes(reference: Path) -> None:
+    read = read_lab_folder(reference)
     assert read.trials is not None
     assert len(read.trials.fits) == 5
     assert [read.trials.frequency(mode).mean for mode in (0, 1)] == pytest.approx((5.6547, 29.94), rel=1e-3)

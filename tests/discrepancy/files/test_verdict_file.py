@@ -207,28 +207,27 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
     path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
     whole = path.read_text(encoding="utf-8")
 
-    def refused(text: str, words: str) -> None:
-        path.write_text(text, encoding="utf-8")
+    mass = '"family": "mass",'
+    nested = f'"remarks": [{"[" * 3000}{"]" * 3000}, '
+    for old, new, words in (
+        (whole, whole[: len(whole) // 2], "is not valid JSON"),
+        (whole, "[]", "no file of this kind"),
+        ("uav-twin verdict 4", "uav-twin verdict 9", "schema 'uav-twin verdict 9'"),
+        ('"kind": "named"', '"kind": "guessed"', "verdict.kind"),
+        ('"probability": 0.998', '"probability": "high"', "verdict.probability"),
+        ('"sentence"', '"sentences"', "sentence"),
+        (mass, f'{mass} "colour": "red",', "effects.1.colour"),
+        (mass, "", "effects.1.family"),
+        ('"passed": true', '"passed": "yes"', "gates.1.passed is 'yes'"),
+        ('"log_bayes_factor": "Infinity"', '"log_bayes_factor": Infinity', "Infinity is no number"),
+        ('"remarks": [', nested, "nested deeper"),
+        ('"kind": "point_mass"', '"kind": "planet"', "planet|point_mass|kind"),
+        ('"mass": 0.30000000000000004', '"mass": null', "mass"),
+    ):
+        path.write_text(whole.replace(old, new, 1), encoding="utf-8")
         with pytest.raises(VerdictFileError, match=words) as caught:
             read_verdict(path)
         assert "\n" not in str(caught.value)
-
-    refused(whole[: len(whole) // 2], "is not valid JSON")
-    refused("[]", "no file of this kind")
-    refused(whole.replace("uav-twin verdict 4", "uav-twin verdict 9"), "schema 'uav-twin verdict 9'")
-    refused(whole.replace('"kind": "named"', '"kind": "guessed"'), "verdict.kind")
-    refused(whole.replace('"probability": 0.998', '"probability": "high"'), "verdict.probability")
-    refused(whole.replace('"sentence"', '"sentences"', 1), "sentence")
-    refused(whole.replace('"family": "mass",', '"family": "mass", "colour": "red",', 1), "effects.1.colour")
-    refused(whole.replace('"family": "mass",', "", 1), "effects.1.family")
-    refused(whole.replace('"passed": true', '"passed": "yes"', 1), "gates.1.passed is 'yes'")
-    refused(
-        whole.replace('"log_bayes_factor": "Infinity"', '"log_bayes_factor": Infinity'),
-        "Infinity is no number",
-    )
-    refused(whole.replace('"remarks": [', f'"remarks": [{"[" * 3000}{"]" * 3000}, ', 1), "nested deeper")
-    refused(whole.replace('"kind": "point_mass"', '"kind": "planet"', 1), "planet|point_mass|kind")
-    refused(whole.replace('"mass": 0.30000000000000004', '"mass": null', 1), "mass")
     with pytest.raises(VerdictFileError, match="There is no file"):
         read_verdict(tmp_path / "nothing.json")
     path.write_text(whole, encoding="utf-8")
@@ -307,12 +306,10 @@ def test_residual_file_carries_units_and_refuses_damage(tmp_path: Path, make_ben
     with pytest.raises(VerdictFileError, match="time is not finite"):
         read_residuals(lost)
     whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(VerdictFileError, match="damaged"):
-        read_residuals(path)
-    path.write_bytes(b"")
-    with pytest.raises(VerdictFileError, match="damaged"):
-        read_residuals(path)
+    for damaged in (whole[: len(whole) // 2], b""):
+        path.write_bytes(damaged)
+        with pytest.raises(VerdictFileError, match="damaged"):
+            read_residuals(path)
     with pytest.raises(VerdictFileError, match="There is no file"):
         read_residuals(tmp_path / "nothing.nc")
     xr.Dataset(attrs={"schema": "other"}).to_netcdf(path, engine="h5netcdf")

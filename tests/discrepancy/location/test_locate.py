@@ -86,6 +86,16 @@ def test_a_fit_far_from_the_truth_that_leaves_no_degree_of_freedom_is_no_crash(m
 # ---------------------------------------------------------------- known disagreements
 
 
+def _first(found):
+    """Return the first disagreement that is told apart from its channels."""
+    return next(item for item in found.disagreements if item.dependence != "channels")
+
+
+def _in_releases(bench, shape, wave) -> dict[int, np.ndarray]:
+    """Return a wave in time with a size in each channel, added to every release."""
+    return {n: wave(t.time)[:, np.newaxis] * shape for n, t in enumerate(bench.trials[:-1])}
+
+
 def _amplitude_dependent(bench, size: float) -> dict[int, np.ndarray]:
     """An error that grows with the square of the amplitude of mode 1, in phase with its velocity."""
     extra = {}
@@ -103,7 +113,7 @@ def test_an_amplitude_dependence_is_told_where_releases_differ(make_bench) -> No
         bench.fit(np.random.default_rng(2), extra=_amplitude_dependent(bench, 60.0)), frequencies=(5.0, 28.0)
     )
     assert found.disagrees
-    first = next(item for item in found.disagreements if item.dependence != "channels")
+    first = _first(found)
     assert (first.subject, first.dependence, first.trials) == ("mode 1", "amplitude", "ring-down")
     assert first.share > 0.8
     assert first.sentence.startswith("Mode 1, by amplitude, in ring-down trials; explains ")
@@ -115,7 +125,7 @@ def test_an_amplitude_dependence_is_told_where_releases_differ(make_bench) -> No
 def test_one_release_amplitude_cannot_tell_amplitude_from_time(make_bench) -> None:
     bench = make_bench(amplitudes=(200.0, 200.0))
     found = locate(bench.fit(np.random.default_rng(2), extra=_amplitude_dependent(bench, 60.0)))
-    first = next(item for item in found.disagreements if item.dependence != "channels")
+    first = _first(found)
     assert first.subject == "mode 1"
     assert "do not tell the two apart" in first.sentence
 
@@ -147,14 +157,13 @@ def test_few_static_readings_do_not_drown_in_many_samples(make_bench) -> None:
 
 def test_hum_is_common_to_all_channels_and_a_line(make_bench) -> None:
     bench = make_bench()
-    extra = {n: np.full(4, 2.0) * np.cos(2 * np.pi * 17.0 * t.time)[:, np.newaxis]
-             for n, t in enumerate(bench.trials[:-1])}  # fmt: skip
+    extra = _in_releases(bench, np.full(4, 2.0), lambda t: np.cos(2 * np.pi * 17.0 * t))
     found = locate(bench.fit(np.random.default_rng(4), extra=extra))
     line = next(test for test in found.tests if test.name == "Fisher g")
     assert line.rejected
     assert line.where.endswith("17 Hz")
     assert found.patterns[0].meaning == "common"
-    told = next(item for item in found.disagreements if item.dependence != "channels")
+    told = _first(found)
     assert told.dependence == "a line at 17 Hz"
     assert told.share > 0.9
 
@@ -165,7 +174,7 @@ def test_a_mode_that_the_model_lacks_is_a_decaying_line(make_bench) -> None:
     extra = {n: 40.0 * shape * (np.cos(2 * np.pi * 9.0 * t.time + n) * np.exp(-2.0 * t.time))[:, np.newaxis]
              for n, t in enumerate(bench.trials[:-1])}  # fmt: skip
     found = locate(bench.fit(np.random.default_rng(4), extra=extra))
-    told = next(item for item in found.disagreements if item.dependence != "channels")
+    told = _first(found)
     assert told.dependence in ("a decaying line at 9 Hz", "a decaying line at 9.08 Hz")
     assert told.share > 0.8
     assert told.sentence.startswith("All channels, a decaying line at 9")
@@ -214,7 +223,7 @@ def test_temperature_is_told(make_bench) -> None:
     steps = bench.trials[-1]
     extra = {len(bench.trials) - 1: np.full(4, 3.0) * steps.temperature[:, np.newaxis]}
     found = locate(bench.fit(np.random.default_rng(5), extra=extra))
-    told = next(item for item in found.disagreements if item.dependence != "channels")
+    told = _first(found)
     assert (told.trials, told.dependence) == ("static", "temperature")
     assert any(c.statistic == "temperature" and c.significant for c in found.cells)
 
@@ -222,12 +231,11 @@ def test_temperature_is_told(make_bench) -> None:
 def test_shape_that_is_given_is_recognised(make_bench) -> None:
     bench = make_bench()
     shape = np.array([0.4, -0.6, -0.9, 0.5])
-    extra = {n: 30.0 * shape * (np.cos(2 * np.pi * 27.0 * t.time) * np.exp(-3.0 * t.time))[:, np.newaxis]
-             for n, t in enumerate(bench.trials[:-1])}  # fmt: skip
+    extra = _in_releases(bench, 30.0 * shape, lambda t: np.cos(2 * np.pi * 27.0 * t) * np.exp(-3.0 * t))
     shapes = {"mode 2": dict(zip(("g1", "g2", "g3", "g4"), shape.tolist(), strict=True))}
     found = locate(bench.fit(np.random.default_rng(6), extra=extra), shapes=shapes, frequencies=(5.0, 28.0))
     assert "shape of mode 2" in found.patterns[0].sentence
-    told = next(item for item in found.disagreements if item.dependence != "channels")
+    told = _first(found)
     assert told.subject == "mode 2"
 
 
@@ -258,8 +266,7 @@ def test_residuals_below_the_stated_noise_are_remarked(make_bench) -> None:
 def test_a_line_in_the_noise_record_is_not_the_models_fault(make_bench) -> None:
     bench = make_bench()
     generator = np.random.default_rng(9)
-    extra = {n: np.full(4, 1.5) * np.cos(2 * np.pi * 17.0 * t.time)[:, np.newaxis]
-             for n, t in enumerate(bench.trials[:-1])}  # fmt: skip
+    extra = _in_releases(bench, np.full(4, 1.5), lambda t: np.cos(2 * np.pi * 17.0 * t))
     time = 0.01 * np.arange(400)
     samples = 2.0 * generator.standard_normal(400) + 1.5 * np.cos(2 * np.pi * 17.0 * time)
     record = NoiseRecord(float(samples.std()), 399.0, samples, 0.01, "pre-trigger")
@@ -333,15 +340,9 @@ def test_one_linear_mode_does_not_explain_the_real_ring_downs() -> None:
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     rows = np.split(-noise * found.jac, np.cumsum([t.size for t in time])[:-1])
     items = []
-    for record, t, s, p, rate, jacobian in zip(
-        records,
-        time,
-        signal,
-        predicted(found.x),
-        map(np.gradient, predicted(found.x), time),
-        rows,
-        strict=True,
-    ):
+    prediction = predicted(found.x)
+    rates = map(np.gradient, prediction, time)
+    for record, t, s, p, rate, jacobian in zip(records, time, signal, prediction, rates, rows, strict=True):
         S = sensitivity(jacobian[:, np.newaxis], covariance, np.array([noise]))
         ring = TrialKind.RINGDOWN
         values = s[:, np.newaxis]

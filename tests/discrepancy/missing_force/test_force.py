@@ -13,7 +13,7 @@ from benchmarks.open_rigs.campaigns import drawn, write
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.catalogue.library import library
+from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.linearisation import Point
@@ -119,15 +119,34 @@ def write_drive(folder: Path) -> None:
     (folder / "campaign.toml").write_text(DRIVEN, "utf-8")
 
 
+def asked(campaign: Campaign, model: Model) -> Problem:
+    return Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+
+
+def read(folder: Path) -> Problem:
+    """Read a folder with a campaign and its model."""
+    model = load_model(folder / "model.toml")
+    campaign, faults = checked(read_campaign(folder), model)
+    assert not faults
+    return asked(campaign, model)
+
+
+def show(problem: Problem, gain: float = 1.0) -> None:
+    """Give a campaign the model's own response, times a gain, and noise alone as its readings."""
+    random = np.random.default_rng(8)
+    start = problem.start(Candidate())
+    for number, data in enumerate(problem.trials):
+        bare, _ = problem.response(number, start.shared, start.local[number], ModelPatch())
+        response = gain * problem.prediction(number, start, bare)
+        data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
+
+
 def problem_of(folder: Path, number: int) -> Problem:
     """Write a campaign of the blind rigs and return it with its model."""
     folder = folder / "campaign"
     bench, truth, _ = drawn(number, 1)
     write(folder, bench, truth, "plain", (1, number))
-    model = load_model(folder / "model.toml")
-    campaign, faults = checked(read_campaign(folder), model)
-    assert not faults
-    return Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+    return read(folder)
 
 
 @pytest.mark.parametrize(
@@ -146,8 +165,7 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(
     search = ForceSearch(problem)
     at = search.locate()
     assert max(at, key=lambda name: at[name].evidence) == port
-    effects = [item for item in library() if item.unavailable(problem.setting) is None]
-    ranked = [item for item in search.name(effects) if len(item.candidate.terms) == 1]
+    ranked = [item for item in search.name(available(problem)) if len(item.candidate.terms) == 1]
     (term,) = ranked[0].candidate.terms
     assert (term.effect.identifier, term.place) == (effect, port)
     families = {ranked[0].candidate.terms[0].effect.family}
@@ -196,12 +214,7 @@ def test_a_report_opens_with_the_missing_force(tmp_path: Path) -> None:
 def test_a_rig_without_a_gap_misses_no_force(tmp_path: Path) -> None:
     """The same campaign with the model's own response and noise alone as its readings."""
     problem = problem_of(tmp_path, CART)
-    random = np.random.default_rng(8)
-    start = problem.start(Candidate())
-    for number, data in enumerate(problem.trials):
-        bare, _ = problem.response(number, start.shared, start.local[number], ModelPatch())
-        response = problem.prediction(number, start, bare)
-        data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
+    show(problem)
     assert seen_force(problem) is None
     found = investigate(problem.campaign, problem.model)
     assert found.verdict.kind is VerdictKind.NOTHING_MISSING
@@ -263,7 +276,7 @@ def test_an_fmu_whose_system_is_not_known_shows_no_force(foreign_fmu: Any, tmp_p
     )
     fmu = FmuModel.load(file)
     try:
-        problem = Problem(campaign, fmu, Setting(campaign, fmu, fmu.scales(campaign)))
+        problem = asked(campaign, fmu)
         found = Search(problem, (), fit(problem, Candidate(), problem.start(Candidate())))
         assert not found.by_force()
     finally:
@@ -318,18 +331,21 @@ def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path: Path
         np.testing.assert_allclose(found, expected, atol=3e-3 * np.abs(expected).max())
 
 
+def available(problem: Problem) -> list[Effect]:
+    return [item for item in library() if item.unavailable(problem.setting) is None]
+
+
+FRICTION = effect_by_identifier("coulomb_friction", library())
+
+
 def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path: Path) -> None:
     """A thousand samples a second by an encoder, at rest half of the time, creeping before it slides."""
     write_drive(tmp_path)
-    model = load_model(tmp_path / "model.toml")
-    campaign, faults = checked(read_campaign(tmp_path), model)
-    assert not faults
-    problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+    problem = read(tmp_path)
     search = ForceSearch(problem)
     search.locate()
-    effects = [item for item in library() if item.unavailable(problem.setting) is None]
     found = [search.followed(search.whole, Candidate((term,)), start)
-             for _, term, start in search.screened(search.whole, effects)[:12]]  # fmt: skip
+             for _, term, start in search.screened(search.whole, available(problem))[:12]]  # fmt: skip
     best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.evidence)
     (term,) = best.candidate.terms
     assert term.effect.identifier == "coulomb_friction"
@@ -343,17 +359,17 @@ def chain(kind: ExampleKind, effect: str, place: str, **values: float) -> Proble
     model = LumpedModel.load("three_mass_chain")
     plan = plan_of(model)
     plain = example_campaign(model, kind, 3, plan)
-    (hidden,) = (item for item in library() if item.identifier == effect)
-    patch = hidden.patch(Setting(plain, model, model.scales(plain)), values, place)
+    patch = effect_by_identifier(effect, library()).patch(
+        Setting(plain, model, model.scales(plain)), values, place
+    )
     campaign = example_campaign(model, kind, 3, plan, patch)
-    return Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+    return asked(campaign, model)
 
 
 def test_friction_that_holds_is_the_law_of_the_missing_force() -> None:
     """The joint sticks half of the time; what is told of it is of the trials in motion."""
     problem = chain("laboratory", "coulomb_friction", "joint", friction_ratio=0.004)
-    (friction,) = (item for item in library() if item.identifier == "coulomb_friction")
-    missing = seen_force(problem, friction, "joint")
+    missing = seen_force(problem, FRICTION, "joint")
     assert missing is not None
     assert (missing.port, missing.law) == ("joint", "Coulomb friction")
     assert share_of(missing) > 0.95
@@ -367,8 +383,7 @@ def test_friction_that_holds_is_the_law_of_the_missing_force() -> None:
 def test_the_missing_force_does_not_depend_on_where_it_is_linear_about() -> None:
     """Gains and parameters at the fit of the right law, or where the search finds them without one."""
     problem = chain("ringdown", "coulomb_friction", "joint", friction_ratio=0.004)
-    (friction,) = (item for item in library() if item.identifier == "coulomb_friction")
-    candidate = Candidate((Term(friction, "joint"),))
+    candidate = Candidate((Term(FRICTION, "joint"),))
     there = fit(problem, candidate, problem.start(candidate)).point
     one, other = (ForceSearch(problem).locate(about)["joint"] for about in (None, there))
     assert one.evidence == pytest.approx(other.evidence, abs=40.0)  # of 15,000 readings
@@ -377,12 +392,7 @@ def test_the_missing_force_does_not_depend_on_where_it_is_linear_about() -> None
 def test_a_verdict_that_is_no_law_at_a_port_shows_no_force(tmp_path: Path) -> None:
     """A gain of five hundredths and nothing else."""
     problem = problem_of(tmp_path, CART)
-    random = np.random.default_rng(8)
-    start = problem.start(Candidate())
-    for number, data in enumerate(problem.trials):
-        bare, _ = problem.response(number, start.shared, start.local[number], ModelPatch())
-        response = 1.05 * problem.prediction(number, start, bare)
-        data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
+    show(problem, 1.05)
     found = investigate(problem.campaign, problem.model)
     assert found.missing is None or not found.verdict.effects
 

@@ -109,9 +109,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Calibration, Float]:
     return calibrate_parameters(campaign, choice_of(line, *PRIORS), samples=20_000, seed=4), values
 
 
-def test_a_linear_model_has_the_posterior_of_the_closed_form(
-    told: tuple[Calibration, Float],
-) -> None:
+def test_a_linear_model_has_the_posterior_of_the_closed_form(told: tuple[Calibration, Float]) -> None:
     found, values = told
     design = np.column_stack([FORCE / 10.0, (FORCE / 40.0) ** 2])
     mean, precision = np.array([1.0, 0.5]), np.diag([0.2**-2, 0.3**-2])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -44,6 +45,24 @@ from tests.discrepancy.rigs import FEW, ORIGIN
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
 
+def read(page: str) -> str:
+    """Return a page as a browser shows it."""
+    return html.unescape(page).replace("\N{NO-BREAK SPACE}", " ")
+
+
+def text_of(investigation: Investigation) -> str:
+    """Return the whole page of an investigation without its figures."""
+    return read(render_report(ReportInput(investigation, ORIGIN), {}, {}))
+
+
+def section_of(add: Callable[..., None], content: object) -> str:
+    """Return what is added to a page."""
+    page = Page("a", "b")
+    page.add_section("c")
+    add(page, content)
+    return read(page.render())
+
+
 def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: Investigation) -> None:
     assert drag.proof is not None
     closed, held = drag.proof.gap_closed, drag.proof.held_out_after
@@ -51,10 +70,7 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: 
     said = closing_sentence(drag)
     assert said.startswith(f"It closes {percent(closed)} % of the gap on held-out trials: χ²/dof is ")
     assert f"and {number(held.chi_square_per_dof)} after it" in said
-    page = Page("a", "b")
-    page.add_section("c")
-    add_verdict(page, ReportInput(drag, ORIGIN))  # without intervals of the patch, by its parameters
-    text = html.unescape(page.render()).replace("\N{NO-BREAK SPACE}", " ")
+    text = section_of(add_verdict, ReportInput(drag, ORIGIN))  # without intervals, by its parameters
     assert text.index(headline(drag.verdict)) < text.index("Its size: ") < text.index(said)
     assert text.count(f"{percent(closed)} %") == 1
     # no name, no gap to close, no proof
@@ -65,12 +81,6 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: 
     worse = replace(drag, proof=replace(drag.proof, gap_closed=-0.2, held_out_after=None))
     assert closing_sentence(worse).startswith("On fitted trials χ²/dof is ")
     assert closing_sentence(replace(drag, proof=None)) == ""
-
-
-def text_of(investigation: Investigation) -> str:
-    """Return the whole page of an investigation without its figures."""
-    page = html.unescape(render_report(ReportInput(investigation, ORIGIN), {}, {}))
-    return page.replace("\N{NO-BREAK SPACE}", " ")
 
 
 def test_a_report_opens_with_effect_size_share_and_probability(drag: Investigation) -> None:
@@ -108,11 +118,9 @@ def test_members_of_a_group_stand_apart_and_first(drag: Investigation) -> None:
 def test_what_was_not_compared_is_told_by_reason(drag: Investigation) -> None:
     left = tuple(NotFitted(name, "No flight trial.") for name in ("washout", "inertia_relief"))
     left += (NotFitted("free_play", "screened out: 0.3 nat at most", 0.3),)
-    page = Page("a", "b")
-    page.add_section("c")
-    add_not_compared(page, replace(drag.verdict, not_fitted=left))
-    assert "<td>No flight trial.</td><td>washout and inertia relief</td>" in page.render()
-    assert "<td>Screened out</td><td>free play (0.3 nat)</td>" in page.render()
+    text = section_of(add_not_compared, replace(drag.verdict, not_fitted=left))
+    assert "<td>No flight trial.</td><td>washout and inertia relief</td>" in text
+    assert "<td>Screened out</td><td>free play (0.3 nat)</td>" in text
 
 
 def test_parameters_are_shown_before_and_after(drag: Investigation) -> None:
@@ -131,10 +139,7 @@ def test_parameters_are_shown_before_and_after(drag: Investigation) -> None:
 
 
 def test_gates_say_what_they_compare(drag: Investigation) -> None:
-    page = Page("a", "b")
-    page.add_section("c")
-    add_gates(page, drag)
-    text = page.render()
+    text = section_of(add_gates, drag)
     absolute, shape, consistency, _ = drag.verdict.gates
     for gate in (absolute, consistency):
         assert f"p = {gate.statistic:.2g}</td>" in text
@@ -151,10 +156,8 @@ def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_ju
         replace(consistency, passed=False, statistic=2e-5),
     )  # fmt: skip
     verdict = replace(drag.verdict, kind=VerdictKind.UNEXPLAINED, effects=(), gates=gates, force=None)
-    page = Page("a", "b")
-    page.add_section("c")
-    add_verdict(page, ReportInput(replace(drag, verdict=verdict, proof=None), ORIGIN))
-    assert "p of the consistency; a fit has at least 0.001" in page.render()
+    text = section_of(add_verdict, ReportInput(replace(drag, verdict=verdict, proof=None), ORIGIN))
+    assert "p of the consistency; a fit has at least 0.001" in text
 
 
 def test_a_reader_sees_which_trial_is_held_out(drag: Investigation) -> None:
@@ -228,9 +231,7 @@ def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(dr
         remainders=(RemainderEstimate("displacement", 3.1, 0.25, 2.0),),
         not_fitted=(NotFitted("washout", "No flight trial."), NotFitted("free_play", "screened out", 0.3)),
     )
-    content = ReportInput(replace(drag, verdict=verdict), ORIGIN)
-    text = render_report(content, {}, {})
-    text = text.replace("\N{NO-BREAK SPACE}", " ")
+    text = text_of(replace(drag, verdict=verdict))
     for words in (
         "90.0 % of the mean square on held-out trials",
         "displacement 3.1 noises over 0.25 s, swinging at 2 Hz",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,10 @@ from fe.wing.design import WingDesign, load_design
 from tests.kept import FE, ROOT, kept
 
 ROWS = 12
+SLOPES = "frequency_at_one", "frequency_slope", "mass_slope"
+HEADER = (
+    "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_servo_2,mass_pitot,freq_1,freq_2"
+)
 
 
 @pytest.fixture(scope="session")
@@ -68,22 +73,9 @@ def targets_of(model: LocalModel) -> Targets:
         sources={},
     )
     found = outputs(model, blank)
-    return Targets(
-        **{
-            **blank.__dict__,
-            "strain": found.strain,
-            "tip_stiffness": found.tip_stiffness,
-            "tip_stiffness_slope": found.tip_stiffness_slope,
-            "strain_slope": found.strain_slope,
-            "frequency": found.frequency,
-            "frequency_at_one": found.frequency_at_one,
-            "frequency_slope": found.frequency_slope,
-            "mass_slope": found.mass_slope,
-            "all_frequency_at_one": found.frequency_at_one,
-            "all_frequency_slope": found.frequency_slope,
-            "all_mass_slope": found.mass_slope,
-        }
-    )
+    own = ("strain", "tip_stiffness", "tip_stiffness_slope", "strain_slope", "frequency", *SLOPES)
+    met = {name: getattr(found, name) for name in own}
+    return replace(blank, **met, **{f"all_{name}": met[name] for name in SLOPES})
 
 
 def write_results(folder: Path) -> Path:
@@ -94,21 +86,9 @@ def write_results(folder: Path) -> Path:
     step = folder / "calibration" / "step3"
     step.mkdir(parents=True, exist_ok=True)
     path = step / "massoptimizationresults.csv"
-    header = [
-        "e_sample",
-        "target_freq_1",
-        "target_freq_2",
-        "zeta_1",
-        "zeta_2",
-        "mass_servo_1",
-        "mass_servo_2",
-        "mass_pitot",
-        "freq_1",
-        "freq_2",
-    ]
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(header)
+        writer.writerow(HEADER.split(","))
         for e, own, tube, one, two in zip(factor, servo, pitot, first, second, strict=True):
             writer.writerow([e, 5.6492, 29.9699, 0.0281, 0.0717, own, own, tube, one, two])
     return path

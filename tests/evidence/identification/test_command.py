@@ -16,53 +16,35 @@ from fe.wing.design import load_design, parse_design
 from tests import command_line
 from tests.kept import ROOT
 
-HEADER = (
-    "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_servo_2,mass_pitot,freq_1,freq_2"
-)
-
 
 def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
     return command_line.call(monkeypatch, *words, main=main)
 
 
-@pytest.fixture
-def data(tmp_path: Path, library_file: Path) -> Path:
-    """Both published folders of a wing that never was."""
-    step = tmp_path / "data" / "calibration" / "step3"
-    step.mkdir(parents=True)
-    (tmp_path / "data" / "UAVconfig.json").write_bytes(library_file.read_bytes())
-    lines = [HEADER]
-    for number in range(12):
-        factor, pitot = 0.96 + 0.01 * number, 0.12 + 0.003 * (number % 5)
-        servo = 0.5 * (0.472 - pitot)
-        first, second = 5.632 * factor**0.41 - pitot, 28.5 * factor**0.32 - pitot
-        row = [factor, 5.6492, 29.9699, 0.0281, 0.0717, servo, servo, pitot, first, second]
-        lines.append(",".join(map(repr, row)))
-    (step / "massoptimizationresults.csv").write_text("\n".join(lines) + "\n")
-    return tmp_path / "data"
-
-
 def test_files_that_are_missing_or_wrong_end_in_one_sentence(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    published_folder: Path,
+    tmp_path: Path,
 ) -> None:
     out = tmp_path / "out"
     empty = tmp_path / "empty"
     empty.mkdir()
     assert call(monkeypatch, "--data", str(empty), "--out", str(out)) == 1
     assert "holds 0 files UAVconfig.json" in capsys.readouterr().err
-    results = data / "calibration" / "step3" / "massoptimizationresults.csv"
+    results = published_folder / "calibration" / "step3" / "massoptimizationresults.csv"
     text = results.read_text()
     results.write_text(text.replace("mass_pitot", "pitot"))
-    assert call(monkeypatch, "--data", str(data), "--out", str(out)) == 1
+    assert call(monkeypatch, "--data", str(published_folder), "--out", str(out)) == 1
     assert "no column 'mass_pitot'" in capsys.readouterr().err
     results.write_text(text.replace("5.6492", "nan", 1))
-    assert call(monkeypatch, "--data", str(data), "--out", str(out)) == 1
+    assert call(monkeypatch, "--data", str(published_folder), "--out", str(out)) == 1
     assert capsys.readouterr().err.count("\n") == 1
     results.write_text(text)
     short = load_design().changed(gauges={"positions": load_design().gauges.positions[:8]})
     start = tmp_path / "short.toml"
     start.write_text(design_toml(short, {}))
-    assert call(monkeypatch, "--data", str(data), "--design", str(start), "--out", str(out)) == 1
+    assert call(monkeypatch, "--data", str(published_folder), "--design", str(start), "--out", str(out)) == 1
     assert "8 gauges" in capsys.readouterr().err
     assert not out.exists()
 
@@ -77,13 +59,16 @@ def test_the_command_is_that_of_the_module(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_run_leaves_a_design_a_record_and_a_report(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    published_folder: Path,
+    tmp_path: Path,
 ) -> None:
     coarse = load_design().changed(mesh={"refinement": 0.25, "span_size": 0.06, "chord_size": 0.2})
     start = tmp_path / "start.toml"
     start.write_text(design_toml(coarse, {}))
     out = tmp_path / "out"
-    arguments = ("--data", str(data), "--design", str(start), "--out", str(out), "--steps", "1")
+    arguments = ("--data", str(published_folder), "--design", str(start), "--out", str(out), "--steps", "1")
     # One model is not enough for a wing that never was; the result is written and the exit code says so.
     assert call(monkeypatch, *arguments) == 1
     captured = capsys.readouterr()

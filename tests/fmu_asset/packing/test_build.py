@@ -24,11 +24,6 @@ BIN = Path(sys.executable).parent
 ROOT = Path(__file__).parents[3]
 
 
-def test_two_builds_are_equal_to_the_byte(model: ReducedModel, fmu: Path, tmp_path: Path) -> None:
-    again = build_fmu(ReducedModel.from_bytes(model.to_bytes()), tmp_path / "again.fmu")
-    assert again.path.read_bytes() == fmu.read_bytes()
-
-
 def test_two_builds_in_different_processes_are_equal(fmu: Path, model: ReducedModel, tmp_path: Path) -> None:
     model.save(tmp_path / "model.npz")
     program = (

@@ -33,7 +33,7 @@ from fe.runtime.patch import (
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.sensors import SensorRecord, apply_sensors
 from fmu_asset.check import check_fmu
-from fmu_asset.door.binding import Binding, load_binding, parse_binding
+from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.packing.patch_file import SCHEMA, PatchFile, parse_patch
@@ -281,20 +281,6 @@ def test_state_goes_on_to_the_bit_in_a_new_process(patched: Path, sending: Bindi
             assert seen[0].extra == seen[1].extra
 
 
-def test_scenario_names_reach_the_fmu(patched: Path, fmu: Path) -> None:
-    binding = load_binding(ROOT / "scenarios" / "bindings" / "uav_wing.toml")
-    with (
-        FmiAsset(fmu, binding) as plain,
-        FmiAsset(
-            patched, binding, parameters={"effect.gauge_gain.active": 1, "effect.gauge_gain.gain[1]": 0.2}
-        ) as asset,
-    ):
-        one, other = plain.step({"load_factor": 3.0}), asset.step({"load_factor": 3.0})
-    ratio = other.values / one.values
-    np.testing.assert_allclose(ratio[[2, 4]], [1.2, 0.96], rtol=1e-12)
-    assert np.all(np.delete(ratio, [2, 4]) == 1.0)
-
-
 @given(st.data())
 def test_values_and_patch_belong_together(data: st.DataObject) -> None:
     effects = plain_effects(parse_patch(content()).for_outputs(CHANNELS))
@@ -366,11 +352,6 @@ def test_an_id_that_comes_twice_is_numbered() -> None:
         "gain_2",
         "gain_3",
     ]
-
-
-def test_the_compiled_kind_names_the_other(model: ReducedModel, patch: PatchFile, tmp_path: Path) -> None:
-    with pytest.raises(PatchFileError, match="build the kind 'python'"):
-        build_fmu(model, tmp_path / "wing.fmu", kind="source", patch=patch)
 
 
 def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> None:

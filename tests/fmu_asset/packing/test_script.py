@@ -46,10 +46,7 @@ def test_units_of_a_list_are_converted_each_on_its_own(pump: Path) -> None:
         "binding": {"name": "si", "step_size": 1.0},
         "control": {"speed": {"variable": "speed", "unit": "1/s"}},
         "observation": {
-            "all": {
-                "variables": ["temperature", "filter_pressure", "flow"],
-                "unit": ["K", "Pa", "L/min"],
-            }
+            "all": {"variables": ["temperature", "filter_pressure", "flow"], "unit": ["K", "Pa", "L/min"]}
         },
     }
     with FmiAsset(pump, binding_files()["gear_pump"]) as asset:

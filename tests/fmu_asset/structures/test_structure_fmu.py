@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,16 +43,18 @@ def _inputs(model: ReducedModel, steps: int) -> list[dict[str, float]]:
     ]
 
 
+def _step(asset: FmiAsset, model: ReducedModel, chosen: dict[str, float]) -> Any:
+    control, health = ({name: chosen[name] for name in names} for names in (model.controls, model.regions))
+    return asset.step(control, health)
+
+
 def test_every_step_is_that_of_the_model(model: ReducedModel, fmu: Path, beam: Structure) -> None:
     """Quasi-static: strains, displacements and bounds to 1e-12 of the largest; accelerations are zero."""
     with FmiAsset(
         fmu, structure_binding(beam.design), parameters={"e": 1.06, "pump": 0.03}, isolated=False
     ) as asset:
         for chosen in _inputs(model, 20):
-            seen = asset.step(
-                {name: chosen[name] for name in model.controls},
-                {name: chosen[name] for name in model.regions},
-            )
+            seen = _step(asset, model, chosen)
             found = model.static_response({**chosen, "e": 1.06, "pump": 0.03})
             wanted = [*found.strain, *found.displacement, 0.0]
             np.testing.assert_allclose(
@@ -67,24 +70,14 @@ def test_motion_is_that_of_the_model(model: ReducedModel, fmu: Path, beam: Struc
         steps[number] |= {name: steps[0][name] for name in model.regions}
     binding = structure_binding(beam.design)
     binding = binding.model_copy(update={"binding": binding.binding.model_copy(update={"step_size": 1e-3})})
-    seen, kept, after = [], b"", []
+    seen, kept = [], b""
     with FmiAsset(fmu, binding, parameters={"response": 2}, isolated=False) as asset:
         for number, chosen in enumerate(steps):
             if number == 8:
                 kept = asset.save_state()
-            values = asset.step(
-                {name: chosen[name] for name in model.controls},
-                {name: chosen[name] for name in model.regions},
-            ).values
-            seen.append(values)
+            seen.append(_step(asset, model, chosen).values)
         asset.restore_state(kept)
-        for chosen in steps[8:]:
-            after.append(
-                asset.step(
-                    {name: chosen[name] for name in model.controls},
-                    {name: chosen[name] for name in model.regions},
-                ).values
-            )
+        after = [_step(asset, model, chosen).values for chosen in steps[8:]]
     assert np.array_equal(after, seen[8:])
     motion = ModalIntegrator(model, model.nominal, *model.damping)
     state = motion.at_rest(model.load_coefficients(model.nominal))

@@ -55,117 +55,105 @@ def key(tmp_path: Path) -> Path:
     return path
 
 
-class Targets:
-    """What is attempted, by name: the target that the FMU is told, and whether it was reached."""
+def listening(cleaner: ExitStack, family: int, kind: int, address: Any) -> tuple[object, Attempted]:
+    line = cleaner.enter_context(socket.socket(family, kind))
+    line.bind(address)
+    if kind == socket.SOCK_STREAM:
+        line.listen()
+    line.setblocking(False)
 
-    def __init__(self, folder: Path, key: Path, cleaner: ExitStack) -> None:
-        self._folder, self._key, self._cleaner = folder, key, cleaner
+    def reached() -> bool:
+        try:
+            line.accept()[0].close() if kind == socket.SOCK_STREAM else line.recv(8)
+        except BlockingIOError:
+            return False
+        return True
 
-    def delete(self) -> tuple[str, Attempted]:
-        return str(self._key), lambda: not self._key.exists()
+    return line.getsockname()[1] if family == socket.AF_INET else address, reached
 
-    def overwrite(self) -> tuple[str, Attempted]:
-        return str(self._key), lambda: self._key.read_text() == ""
 
-    def read(self) -> tuple[str, Attempted]:
-        return str(self._key), lambda: True  # what the FMU returns says it
+def shared(cleaner: ExitStack, kind: str, *size: int) -> int:
+    libc = ctypes.CDLL(None)
+    number = getattr(libc, f"{kind}get")(0, *size, 0o600)
+    remove_now = (0, 0) if kind == "sem" else (0,)  # IPC_RMID, of a semaphore after its number
+    cleaner.callback(getattr(libc, f"{kind}ctl"), number, *remove_now, None)
+    return int(number)
 
-    def project(self) -> tuple[str, Attempted]:
-        return str(Path(__file__).parents[3] / "pyproject.toml"), lambda: True
 
-    def spy(self) -> tuple[str, Attempted]:
-        return f"/proc/{os.getpid()}/environ", lambda: True
+def measured(process: int) -> tuple[object, ...]:
+    limits = resource.prlimit(process, resource.RLIMIT_NOFILE)
+    way = os.sched_getscheduler(process), os.sched_getaffinity(process)
+    return limits, os.getpriority(os.PRIO_PROCESS, process), way
 
-    def make(self) -> tuple[str, Attempted]:
-        path = self._folder / "made"
-        return str(path), path.exists
 
-    def permit(self) -> tuple[str, Attempted]:
-        return str(self._key), lambda: self._key.stat().st_mode & 0o777 == 0o777
-
-    def call(self) -> tuple[str, Attempted]:
-        return self._listening(socket.AF_INET, socket.SOCK_STREAM, ("127.0.0.1", 0))
-
-    def datagram(self) -> tuple[str, Attempted]:
-        return self._listening(socket.AF_INET, socket.SOCK_DGRAM, ("127.0.0.1", 0))
-
-    def service(self) -> tuple[str, Attempted]:
-        return self._listening(socket.AF_UNIX, socket.SOCK_STREAM, str(self._folder / "service"))
-
-    def mailbox(self) -> tuple[str, Attempted]:
-        return self._listening(socket.AF_UNIX, socket.SOCK_DGRAM, str(self._folder / "mailbox"))
-
-    def watch(self) -> tuple[str, Attempted]:
-        return str(self._folder), lambda: True
-
-    def share(self) -> tuple[str, Attempted]:
-        return self._shared("shm", 4096)
-
-    def semaphore(self) -> tuple[str, Attempted]:
-        return self._shared("sem", 1)
-
-    def message(self) -> tuple[str, Attempted]:
-        return self._shared("msg")
-
-    def _shared(self, kind: str, *size: int) -> tuple[str, Attempted]:
-        libc = ctypes.CDLL(None)
-        number = getattr(libc, f"{kind}get")(0, *size, 0o600)
-        remove = getattr(libc, f"{kind}ctl")
-        remove_now = (0, 0) if kind == "sem" else (0,)  # IPC_RMID, of a semaphore after its number
-        self._cleaner.callback(remove, number, *remove_now, None)
-        return str(number), lambda: True
-
-    def queue(self) -> tuple[str, Attempted]:
-        name = f"uav-twin-{os.getpid()}"
-        return name, lambda: ctypes.CDLL(None).mq_unlink(f"/{name}".encode()) == 0
-
-    def disturb(self) -> tuple[str, Attempted]:
-        return self.kill()[0], lambda: True
-
-    def hamper(self) -> tuple[str, Attempted]:
-        number = int(self.kill()[0])
-
-        def measured() -> tuple[object, ...]:
-            limits = resource.prlimit(number, resource.RLIMIT_NOFILE)
-            way = os.sched_getscheduler(number), os.sched_getaffinity(number)
-            return limits, os.getpriority(os.PRIO_PROCESS, number), way
-
-        before = measured()
-        return str(number), lambda: measured() != before
-
-    def kill(self) -> tuple[str, Attempted]:
-        process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-        self._cleaner.callback(process.communicate)
-
-        def killed() -> bool:
-            try:
-                return process.wait(0.0) != 0
-            except subprocess.TimeoutExpired:
-                return False
-
-        return str(process.pid), killed
-
-    def _listening(self, family: int, kind: int, address: Any) -> tuple[str, Attempted]:
-        line = self._cleaner.enter_context(socket.socket(family, kind))
-        line.bind(address)
-        if kind == socket.SOCK_STREAM:
-            line.listen()
-        line.setblocking(False)
-
-        def reached() -> bool:
-            try:
-                line.accept()[0].close() if kind == socket.SOCK_STREAM else line.recv(8)
-            except BlockingIOError:
-                return False
-            return True
-
-        return str(line.getsockname()[1] if family == socket.AF_INET else address), reached
+Targets = Callable[[str], tuple[str, Attempted]]
 
 
 @pytest.fixture
 def targets(tmp_path: Path, key: Path) -> Iterator[Targets]:
+    """Return what is attempted, by name: the target that the FMU is told, and whether it was reached."""
+    place = "127.0.0.1", 0
+    made, queue = tmp_path / "made", f"uav-twin-{os.getpid()}"
+
+    def told_by_fmu() -> bool:
+        return True
+
+    def process() -> subprocess.Popen[bytes]:
+        running = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+        cleaner.callback(running.communicate)
+        return running
+
+    def kill() -> tuple[object, Attempted]:
+        running = process()
+
+        def killed() -> bool:
+            try:
+                return running.wait(0.0) != 0
+            except subprocess.TimeoutExpired:
+                return False
+
+        return running.pid, killed
+
+    def hamper() -> tuple[object, Attempted]:
+        number = process().pid
+        before = measured(number)
+        return number, lambda: measured(number) != before
+
+    ways: dict[str, Callable[[], tuple[object, Attempted]]] = {
+        "delete": lambda: (key, lambda: not key.exists()),
+        "overwrite": lambda: (key, lambda: key.read_text() == ""),
+        "read": lambda: (key, told_by_fmu),
+        "project": lambda: (Path(__file__).parents[3] / "pyproject.toml", told_by_fmu),
+        "spy": lambda: (f"/proc/{os.getpid()}/environ", told_by_fmu),
+        "make": lambda: (made, made.exists),
+        "call": lambda: listening(cleaner, socket.AF_INET, socket.SOCK_STREAM, place),
+        "datagram": lambda: listening(cleaner, socket.AF_INET, socket.SOCK_DGRAM, place),
+        "service": lambda: listening(cleaner, socket.AF_UNIX, socket.SOCK_STREAM, str(tmp_path / "service")),
+        "mailbox": lambda: listening(cleaner, socket.AF_UNIX, socket.SOCK_DGRAM, str(tmp_path / "mailbox")),
+        "watch": lambda: (tmp_path, told_by_fmu),
+        "share": lambda: (shared(cleaner, "shm", 4096), told_by_fmu),
+        "semaphore": lambda: (shared(cleaner, "sem", 1), told_by_fmu),
+        "message": lambda: (shared(cleaner, "msg"), told_by_fmu),
+        "queue": lambda: (queue, lambda: ctypes.CDLL(None).mq_unlink(f"/{queue}".encode()) == 0),
+        "disturb": lambda: (process().pid, told_by_fmu),
+        "hamper": hamper,
+        "kill": kill,
+    }
+
+    def target(what: str) -> tuple[str, Attempted]:
+        told, happened = ways[what]()
+        return str(told), happened
+
     with ExitStack() as cleaner:
-        yield Targets(tmp_path, key, cleaner)
+        yield target
+
+
+def refused(asset: FmiAsset | CoupledAsset, sentence: str, kind: type[Exception] = FmuCallError) -> Exception:
+    """Let an asset make its attempt, which is in the third step, and return the error that it must be."""
+    asset.step(), asset.step()
+    with pytest.raises(kind, match=sentence) as caught:
+        asset.step()
+    return caught.value
 
 
 ATTEMPTS = [
@@ -215,13 +203,11 @@ def test_what_is_not_its_own_is_out_of_reach(
 ) -> None:
     """And the same FMU reaches it where the sandbox is off: it is the sandbox that holds."""
     fmu = foreign_fmu("hostile2", f"ATTEMPT={attempt}")
-    target, happened = getattr(targets, what)()
+    target, happened = targets(what)
     monkeypatch.setenv("HOSTILE_TARGET", target)
     with FmiAsset(fmu, binding()) as asset:
-        asset.step(), asset.step()
-        with pytest.raises(FmuCallError, match=rf"(?s)step 2 .*it cannot have {target}: {reason}") as caught:
-            asset.step()
-    assert ("granted by `read`, `write`, `ports`" in str(caught.value)) == (reason == "Permission denied")
+        error = refused(asset, rf"(?s)step 2 .*it cannot have {target}: {reason}")
+    assert ("granted by `read`, `write`, `ports`" in str(error)) == (reason == "Permission denied")
     assert what in WITHOUT_TRACE or not happened()
     with FmiAsset(fmu, binding(sandbox=False)) as asset:
         for _ in range(3):
@@ -234,9 +220,7 @@ def test_an_fmu_that_does_not_say_what_it_was_refused(
 ) -> None:
     monkeypatch.setenv("HOSTILE_TARGET", str(key))
     with FmiAsset(foreign_fmu("hostile2", "ATTEMPT=look_into(TARGET)", "SILENT"), binding()) as asset:
-        asset.step(), asset.step()
-        with pytest.raises(FmuCallError, match=r"The system refused it something \(Permission denied\)"):
-            asset.step()
+        refused(asset, r"The system refused it something \(Permission denied\)")
 
 
 def test_an_fmu_in_python_names_what_it_was_refused(
@@ -286,7 +270,7 @@ def test_what_is_granted_can_be_had(
     attempt: str,
     key_name: str,
 ) -> None:
-    target, happened = getattr(targets, what)()
+    target, happened = targets(what)
     monkeypatch.setenv("HOSTILE_TARGET", target)
     granted = {key_name: [int(target) if key_name == "ports" else target]}
     with FmiAsset(foreign_fmu("hostile2", f"ATTEMPT={attempt}"), binding(**granted)) as asset:
@@ -302,13 +286,11 @@ def test_a_port_beside_the_granted_one_and_another_protocol_stay_closed(
         ("call", "call(SOCK_STREAM,262,TARGET)"),
         ("service", "call_service(TARGET)"),
     ):
-        target, happened = getattr(targets, what)()
+        target, happened = targets(what)
         monkeypatch.setenv("HOSTILE_TARGET", target)
         port = int(target) if "262" in attempt else 9
         with FmiAsset(foreign_fmu("hostile2", f"ATTEMPT={attempt}"), binding(ports=[port])) as asset:
-            asset.step(), asset.step()
-            with pytest.raises(FmuCallError, match="Permission denied"):
-                asset.step()
+            refused(asset, "Permission denied")
         assert not happened()
 
 
@@ -339,9 +321,7 @@ def test_its_own_folder_is_its_own(foreign_fmu: Any, monkeypatch: pytest.MonkeyP
         with FmiAsset(foreign_fmu("hostile2", f"ATTEMPT={attempt}"), binding(**granted)) as asset:
             assert [asset.step().values[0] for _ in range(4)] == [1.0, 2.0, 3.0, 4.0]
     with FmiAsset(foreign_fmu("hostile2", "ATTEMPT=create(beside_binary())"), binding()) as asset:
-        asset.step(), asset.step()
-        with pytest.raises(FmuCallError, match="Permission denied"):
-            asset.step()
+        refused(asset, "Permission denied")
 
 
 REFUSED = [
@@ -409,9 +389,7 @@ def test_components_and_samplers_are_confined_too(
         "observation": {"y": {"variables": "thief.y", "unit": "m"}},
     }
     with CoupledAsset(structure, parse_binding(record)) as system:
-        system.step(), system.step()
-        with pytest.raises(FmuCallError, match=rf"it cannot have {key}: Permission denied"):
-            system.step()
+        refused(system, rf"it cannot have {key}: Permission denied")
     file, grid = sampled(fmu, tmp_path)
     with pytest.raises(FmuCallError, match=rf"it cannot have {key}: Permission denied"):
         sample_library(grid, tmp_path / "library.nc", workers=1)
@@ -477,10 +455,8 @@ def test_a_trap_in_the_place_of_the_log(
     monkeypatch.setenv("HOSTILE_TARGET", str(key))
     fmu = foreign_fmu("hostile2", f'ATTEMPT=(unlink("worker.log"),{trap},raise(SIGKILL))')
     with FmiAsset(fmu, binding()) as asset:
-        asset.step(), asset.step()
-        with pytest.raises(FmuWorkerError, match="SIGKILL") as caught:
-            asset.step()
-    assert not caught.value.messages
+        error = refused(asset, "SIGKILL", FmuWorkerError)
+    assert not error.messages
 
 
 def test_a_link_that_takes_the_place_of_a_folder_while_it_is_removed(

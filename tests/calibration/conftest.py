@@ -1,0 +1,16 @@
+"""The authors' folder of measurements, which is beside the project where it is at hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference" / "uav_experimental_calibration"
+
+
+@pytest.fixture
+def reference() -> Path:
+    if not REFERENCE.is_dir():
+        pytest.skip(f"the authors' calibration folder is not at {REFERENCE}")
+    return REFERENCE
