@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fe.compilation import callable_when_compiled, compiled
 
-__all__ = ["Lists", "backward_pass", "forward_pass", "move", "sweep"]
+__all__ = ["Lists", "backward_pass", "forward_pass", "move", "move_rows", "sweep"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -103,8 +103,8 @@ def _split(logarithm: Float, value: Float, power: Float) -> None:
 
 
 @compiled
-def _move_scaled(lists: Lists, control: int, before: Float, after: Float) -> None:
-    """Apply every block to one belief (S,), both as logarithms; nothing underflows on the way."""
+def _move_scaled(lists: Lists, control: int, before: Float, after: Float, log_after: Float) -> None:
+    """Apply every block to one belief (S,) given as logarithms; nothing underflows on the way."""
     levels, first_row, start, source, probability, _ = lists
     from_value, from_power = np.empty(len(before)), np.empty(len(before))
     to_value, to_power = np.empty(len(before)), np.empty(len(before))
@@ -140,7 +140,10 @@ def _move_scaled(lists: Lists, control: int, before: Float, after: Float) -> Non
                 to_value[i * count + level] = total[i]
                 to_power[i * count + level] = power[i]
     for i in range(len(before)):
-        after[i] = np.log(to_value[i]) + to_power[i] * LOG_STEP if to_value[i] > 0.0 else -np.inf
+        power_of_it = to_power[i]
+        scale = 1.0 if power_of_it == 0.0 else (STEP if power_of_it == -1.0 else STEP * STEP)
+        after[i] = to_value[i] * scale if power_of_it > -3.0 else 0.0
+        log_after[i] = np.log(to_value[i]) + power_of_it * LOG_STEP if to_value[i] > 0.0 else -np.inf
 
 
 @_inlined
@@ -150,9 +153,7 @@ def _move_one(
     """Apply every block to one belief (S,), as it is and as logarithms."""
     levels, _, start, source, _, log_probability = lists
     if len(levels) > 1:
-        _move_scaled(lists, control, log_before, log_after)
-        for state in range(len(after)):
-            after[state] = _exp(log_after[state])
+        _move_scaled(lists, control, log_before, after, log_after)
         return
     _apply(lists, control, before, after, after)
     for state in range(len(after)):
@@ -225,6 +226,38 @@ def forward_pass(
                 log_now[state] -= evidence
 
 
+@_counting_nothing
+def _come_back(
+    lists: Lists, control: int, before: Float, log_before: Float, later: Float, now: Float, added: Float
+) -> float:
+    """Fill now and added (S,) of a single block: p(i) = filtered(i) now(i) + added(i).
+
+    `added` is from where the forecast underflows. Returned is the largest of the ratios later / forecast.
+    """
+    _, _, start, source, probability, log_probability = lists
+    largest = 1.0
+    for state in range(len(now)):
+        now[state], added[state] = 0.0, 0.0
+    for state in range(len(now)):
+        if later[state] > 0.0:
+            row = control * len(now) + state
+            begin, end = start[row], start[row + 1]
+            total = 0.0
+            for k in range(begin, end):
+                total += before[source[k]] * probability[k]
+            if total >= SAFE:
+                ratio = later[state] / total
+                largest = max(largest, ratio)
+                for k in range(begin, end):
+                    now[source[k]] += probability[k] * ratio
+            else:
+                log_total = _log_sum(begin, end, source, log_probability, log_before)
+                for k in range(begin, end):
+                    weight = _exp(log_before[source[k]] + log_probability[k] - log_total)
+                    added[source[k]] += weight * later[state]
+    return largest
+
+
 @compiled
 def backward_pass(
     forward: Lists, backward: Lists, control: Index, filtered: Float, log_filtered: Float, smoothed: Float
@@ -236,8 +269,8 @@ def backward_pass(
     weights need care, where the forecast or the filtered belief underflows.
     """
     twins, steps, size = log_filtered.shape
-    levels, _, start, source, probability, _ = forward
-    forecast, ratio, work = np.empty(size), np.empty(size), np.empty(size)
+    levels = forward[0]
+    forecast, ratio, work, added = np.empty(size), np.empty(size), np.empty(size), np.zeros(size)
     for twin in range(twins):
         if steps:
             smoothed[twin, steps - 1] = filtered[twin, steps - 1]
@@ -245,18 +278,7 @@ def backward_pass(
             now, later, log_now = smoothed[twin, t], smoothed[twin, t + 1], log_filtered[twin, t]
             before, scaled, largest = filtered[twin, t], False, 1.0
             if len(levels) == 1:
-                now[:] = 0.0
-                for state in range(size):
-                    if later[state] > 0.0:
-                        row = control[twin, t] * size + state
-                        total = 0.0
-                        for k in range(start[row], start[row + 1]):
-                            total += before[source[k]] * probability[k]
-                        scaled |= total < SAFE
-                        share = later[state] / max(total, SAFE)
-                        largest = max(largest, share)
-                        for k in range(start[row], start[row + 1]):
-                            now[source[k]] += probability[k] * share
+                largest = _come_back(forward, control[twin, t], before, log_now, later, now, added)
             else:
                 _apply(forward, control[twin, t], before, forecast, work)
                 for state in range(size):
@@ -265,10 +287,10 @@ def backward_pass(
                     largest = max(largest, ratio[state])
                 _apply(backward, control[twin, t], ratio, now, work)
             if scaled:
-                _move_scaled(forward, control[twin, t], log_now, forecast)
+                _move_scaled(forward, control[twin, t], log_now, work, forecast)
                 for state in range(size):
                     forecast[state] = np.log(later[state]) - forecast[state] if later[state] > 0.0 else -np.inf
-                _move_scaled(backward, control[twin, t], forecast, ratio)
+                _move_scaled(backward, control[twin, t], forecast, work, ratio)
             least, total = UNDERFLOW - np.log(largest), 0.0
             for state in range(size):
                 if scaled:
@@ -279,6 +301,7 @@ def backward_pass(
                     now[state] = _exp(log_now[state] + np.log(now[state]))
                 else:
                     now[state] = 0.0
+                now[state] += added[state]
                 total += now[state]
             for state in range(size):
                 now[state] /= total
@@ -307,3 +330,13 @@ def sweep(
             change = max(change, abs(improved - value[state]))
             value[state] = improved
         iterations += 1
+
+
+@compiled
+def move_rows(lists: Lists, control: int, rows: NDArray[np.floating]) -> None:
+    """Bring beliefs (N, S) as they are one transition further; those of zeros stay."""
+    after, work = np.empty_like(rows[0]), np.empty_like(rows[0])
+    for row in range(len(rows)):
+        if np.any(rows[row]):
+            _apply(lists, control, rows[row], after, work)
+            rows[row] = after
