@@ -25,7 +25,7 @@ Index = NDArray[np.int64]
 LARGE = 1e100
 """A product is taken to the logarithm above this."""
 NEGLIGIBLE = -70.0
-"""States this many nats below the best of a hypothesis add nothing to its statistics that doubles can hold."""
+"""States this many nats below the best of a hypothesis add nothing that doubles can hold."""
 
 
 @dataclass(frozen=True)

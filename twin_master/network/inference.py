@@ -152,10 +152,10 @@ def filter_many(
     """
     forecast, filtered, log_filtered = (np.empty_like(rows) for _ in range(3))
     log_evidence, failed = np.empty(rows.shape[:2]), np.empty(len(rows), dtype=np.int64)
-    found = Filtered(forecast, filtered, log_filtered, log_evidence)
+    found = forecast, filtered, log_filtered, log_evidence
     first = np.full((len(rows), rows.shape[2]), log_before), np.full(len(rows), control_before)
-    forward_pass(model.transition.forward_lists.arrays, control, *first, rows, *vars(found).values(), failed)
-    return found, failed
+    forward_pass(model.transition.forward_lists.arrays, control, *first, rows, *found, failed)
+    return Filtered(*found), failed
 
 
 def smooth_many(transition: TransitionModel, control: Index, filtered: Float, log_filtered: Float) -> Float:

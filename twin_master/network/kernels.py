@@ -61,17 +61,28 @@ def _apply(lists: Lists, control: int, before: Float, after: Float, work: Float)
     for block in range(len(levels)):
         count = levels[block]
         rest = np.uint64(len(before) // count)
-        if block > 0:
-            for i in range(len(work)):
-                work[i] = after[i]
-            given = work
         for level in range(count):
-            row = first_row[block] + control * count + level
-            for i in range(rest):
+            row, out = first_row[block] + control * count + level, np.uint64(level) * rest
+            if len(levels) == 1:
                 total = 0.0
                 for k in range(start[row], start[row + 1]):
-                    total += given[source[k] * rest + i] * probability[k]
-                after[i * np.uint64(count) + np.uint64(level)] = total
+                    total += given[source[k]] * probability[k]
+                after[level] = total
+                continue
+            for i in range(rest):
+                after[out + i] = 0.0
+            for k in range(start[row], start[row + 1]):
+                first, share = source[k] * rest, probability[k]
+                for i in range(rest):
+                    after[out + i] += given[first + i] * share
+        if len(levels) > 1:
+            for level in range(count):
+                for i in range(rest):
+                    work[i * np.uint64(count) + np.uint64(level)] = after[np.uint64(level) * rest + i]
+            given = work
+    if len(levels) > 1:
+        for i in range(len(work)):
+            after[i] = work[i]
 
 
 @_counting_nothing
@@ -124,7 +135,10 @@ def _move_scaled(lists: Lists, control: int, before: Float, after: Float, log_af
                 while share < LEAST:
                     share, share_power = share / STEP, share_power - 1.0
                 first = source[k] * np.uint64(rest)
-                value, value_power = from_value[first : first + np.uint64(rest)], from_power[first : first + np.uint64(rest)]
+                value, value_power = (
+                    from_value[first : first + np.uint64(rest)],
+                    from_power[first : first + np.uint64(rest)],
+                )
                 for i in range(rest):
                     # What is two steps below the other is 2^-512 of it at most.
                     its = value_power[i] + share_power
@@ -289,7 +303,9 @@ def backward_pass(
             if scaled:
                 _move_scaled(forward, control[twin, t], log_now, work, forecast)
                 for state in range(size):
-                    forecast[state] = np.log(later[state]) - forecast[state] if later[state] > 0.0 else -np.inf
+                    forecast[state] = (
+                        np.log(later[state]) - forecast[state] if later[state] > 0.0 else -np.inf
+                    )
                 _move_scaled(backward, control[twin, t], forecast, work, ratio)
             least, total = UNDERFLOW - np.log(largest), 0.0
             for state in range(size):
@@ -311,10 +327,10 @@ def backward_pass(
 def sweep(
     backward: Lists, reward: Float, discount: Float, limit: float, most: int, value: Float, first: Float
 ) -> tuple[int, float]:
-    """Iterate the Bellman equation until the value (S,) changes by no more than `limit`, `most` times at most.
+    """Iterate the Bellman equation until the value (S,) changes by `limit` at most, or `most` times.
 
-    Filled are the value and `first` (S, U), the same where a control is taken first; returned are the number of
-    sweeps and the last change.
+    Filled are the value and `first` (S, U), the same where a control is taken first; returned are the number
+    of sweeps and the last change.
     """
     later, work, change, iterations = np.empty(len(value)), np.empty(len(value)), np.inf, 0
     while True:
