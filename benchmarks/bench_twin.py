@@ -210,7 +210,7 @@ def run() -> list[Measurement]:
 
     def side_by_side() -> None:
         found, _ = filter_many(model, many_controls, many, model.log_prior)
-        smooth_many(model.transition, many_controls, found.log_filtered)
+        smooth_many(model.transition, many_controls, found.filtered, found.log_filtered)
 
     batch = median_seconds(side_by_side, repeats=9)
     single = median_seconds(one_by_one, repeats=3)

@@ -168,18 +168,18 @@ class LearningFilter:
         )
         near = self.sensor_model.nearest(seen, control_index, value)
         log_belief = forecast + told + near.log_density[self._draw]
-        log_belief += self._gauges.log_density(seen, near.value[self._draw], inverse, statistics, count)
-        evidence = float(logsumexp(log_belief))
-        if evidence == -np.inf:
+        log_belief += self._gauges.log_density(seen, self._draw, near.value, inverse, statistics, count)
+        best = float(log_belief.max())
+        if best == -np.inf:
             worst = self.sensor_model.worst_residuals(seen, control_index)
             raise ImpossibleObservation(self._name, turn, worst)
+        filtered = np.exp(log_belief - best)
+        evidence = best + float(np.log(filtered.sum()))
+        filtered /= filtered.sum()
         log_belief -= evidence
-        filtered = np.exp(log_belief)
         if self._gauges.learns:
-            log_share = logsumexp(log_belief, axis=1, keepdims=True)
-            given = np.exp(log_belief - np.where(np.isfinite(log_share), log_share, 0.0))
             scale = inverse * np.sqrt(near.left)
-            statistics = statistics + self._gauges.told(seen, near.alone[self._draw], scale, given)
+            statistics = statistics + self._gauges.told(seen, self._draw, near.alone, scale, log_belief)
         count = count + ~np.isnan(seen)
         arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}
         return Estimate(
@@ -248,7 +248,8 @@ class LearningFilter:
         held = np.flatnonzero(weight > 0.0)
         own = rows[:, held] - logsumexp(rows[:, held], axis=2, keepdims=True)
         control = self._first_control[held, None] + np.array([turn.control_index for turn in carried])
-        parts = smooth_many(self._transition, control, np.ascontiguousarray(own.swapaxes(0, 1)))
+        own = np.ascontiguousarray(own.swapaxes(0, 1))
+        parts = smooth_many(self._transition, control, np.exp(own), own)
         result[:, held] = weight[held, None] * parts.swapaxes(0, 1)
         return result
 

@@ -15,9 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from fe.compilation import compiled
+
 __all__ = ["GaugeRegression"]
 
 Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+LARGE = 1e100
+"""A product is taken to the logarithm above this."""
+NEGLIGIBLE = -70.0
+"""States this many nats below the best of a hypothesis add nothing that doubles can hold."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +71,7 @@ class GaugeRegression:
         return np.asarray((self.degrees + fitted[..., 5]) / np.maximum(self.degrees + count - 2.0, 1.0))
 
     def log_density(
-        self, seen: Float, value: Float, inverse: Float, statistics: Float, count: Float
+        self, seen: Float, draw: Index, value: Float, inverse: Float, statistics: Float, count: Float
     ) -> Float:
         """Return log p(o | state, hypothesis, what was observed before): (K, S).
 
@@ -71,39 +79,111 @@ class GaugeRegression:
         ----------
         seen : (G,)
             SI; NaN where a sensor is lost.
-        value : (K, S, G)
-            Predictions, SI.
+        draw : (K,)
+            Of each hypothesis.
+        value : (E, S, G)
+            Predictions of each draw, SI.
         inverse : (S, G)
             Of the assumed standard deviation.
         statistics : (K, G, 6)
         count : (G,)
             Of the observations before.
         """
-        there = ~np.isnan(seen)
-        inverse = inverse[:, there]
-        residual = (seen[there] - value[..., there]) * inverse
-        fitted = np.moveaxis(self.fitted(statistics)[:, None, there], -1, 0)
-        spread = np.ones(1)
-        if np.any(self.gain > 0.0) or np.any(self.offset > 0.0):
-            a, c = self.offset[there] * inverse, self.gain[there] * value[..., there] * inverse
-            residual -= a * fitted[0] + c * fitted[1]
-            spread = 1.0 + a * (a * fitted[2] + 2.0 * c * fitted[3]) + c**2 * fitted[4]
+        there, fitted = ~np.isnan(seen), self.fitted(statistics)
+        density: Float = np.full(len(seen), -0.5 * np.log(2.0 * np.pi))
         if self.degrees > 0.0:
-            power, left = 0.5 * (self.degrees + count[there] + 1.0), self.degrees + fitted[5]
-            density = gammaln(power) - gammaln(power - 0.5) - 0.5 * np.log(np.pi * left)
-            density = density - power * np.log(1.0 + residual**2 / (left * spread))
-        else:
-            density = -0.5 * np.log(2.0 * np.pi) - 0.5 * residual**2 / spread
-        return np.asarray((density + np.log(inverse) - 0.5 * np.log(spread)).sum(axis=-1))
+            power = 0.5 * (self.degrees + count + 1.0)
+            density = gammaln(power) - gammaln(power - 0.5)
+            density = density - 0.5 * np.log(np.pi * (self.degrees + fitted[..., 5]))
+        result = np.empty((len(draw), value.shape[1]))
+        result[:] = np.sum(density, axis=-1, where=there)[..., None]
+        result += np.log(inverse[:, there]).sum(axis=1)
+        _add_densities(
+            seen, draw, value, inverse, self.offset, self.gain, fitted, self.degrees, count, result
+        )
+        return result
 
-    def told(self, seen: Float, value: Float, inverse: Float, weight: Float) -> Float:
+    def told(self, seen: Float, draw: Index, value: Float, inverse: Float, log_weight: Float) -> Float:
         """Return what an observation adds to the statistics (K, G, 6), expected over the state.
 
-        Parameters are those of `log_density`; weight is (K, S), p(state | hypothesis).
+        Parameters are those of `log_density`; log_weight is (K, S), of a state given the hypothesis but for a
+        constant of it.
         """
-        there = ~np.isnan(seen)
-        x = np.where(there, seen - value, 0.0) * inverse
-        a, c, share = self.offset * inverse, self.gain * value * inverse, weight[:, :, None]
-        pairs = ((a, a), (a, c), (c, c), (a, x), (c, x), (x, x))
-        sums = [(share * (one * other)).sum(axis=1) for one, other in pairs]
-        return np.where(there[:, None], np.stack(sums, axis=-1), 0.0)
+        result = np.zeros((len(draw), len(seen), 6))
+        _expect(seen, draw, value, inverse, self.offset, self.gain, log_weight, result)
+        return result
+
+
+@compiled
+def _add_densities(
+    seen: Float,
+    draw: Index,
+    value: Float,
+    inverse: Float,
+    offset: Float,
+    gain: Float,
+    fitted: Float,
+    degrees: float,
+    count: Float,
+    result: Float,
+) -> None:
+    """Add to result (K, S) what the densities of all gauges have of the state.
+
+    Factors are multiplied, those of Student's densities of the same degrees, before a logarithm is taken,
+    which is what costs.
+    """
+    for k in range(result.shape[0]):
+        for s in range(result.shape[1]):
+            total, product, half, wide = 0.0, 1.0, 0.0, 1.0
+            for g in range(len(seen)):
+                if np.isnan(seen[g]):
+                    continue
+                scale, predicted = inverse[s, g], value[draw[k], s, g]
+                a, c = offset[g] * scale, gain[g] * predicted * scale
+                x = (seen[g] - predicted) * scale - a * fitted[k, g, 0] - c * fitted[k, g, 1]
+                spread = 1.0 + a * (a * fitted[k, g, 2] + 2.0 * c * fitted[k, g, 3]) + c * c * fitted[k, g, 4]
+                power = 0.5 * (degrees + count[g] + 1.0) if degrees > 0.0 else 0.0
+                if power != half or product > LARGE or wide > LARGE:
+                    total -= half * np.log(product) + 0.5 * np.log(wide)
+                    product, half, wide = 1.0, power, 1.0
+                wide *= spread
+                if degrees > 0.0:
+                    product *= 1.0 + x * x / ((degrees + fitted[k, g, 5]) * spread)
+                else:
+                    total -= 0.5 * x * x / spread
+            result[k, s] += total - half * np.log(product) - 0.5 * np.log(wide)
+
+
+@compiled
+def _expect(
+    seen: Float,
+    draw: Index,
+    value: Float,
+    inverse: Float,
+    offset: Float,
+    gain: Float,
+    log_weight: Float,
+    result: Float,
+) -> None:
+    """Add to result (K, G, 6) the products of a, c and x of each gauge, expected over the state."""
+    weight = np.empty(log_weight.shape[1])
+    for k in range(len(draw)):
+        best = np.max(log_weight[k])
+        if best == -np.inf:
+            continue
+        for s in range(len(weight)):
+            weight[s] = np.exp(max(log_weight[k, s] - best, NEGLIGIBLE))
+        weight /= weight.sum()
+        for s in range(len(weight)):
+            if log_weight[k, s] - best <= NEGLIGIBLE:
+                continue
+            for g in range(len(seen)):
+                if not np.isnan(seen[g]):
+                    predicted, scale = value[draw[k], s, g], inverse[s, g]
+                    a, c, x = offset[g] * scale, gain[g] * predicted * scale, (seen[g] - predicted) * scale
+                    result[k, g, 0] += weight[s] * a * a
+                    result[k, g, 1] += weight[s] * a * c
+                    result[k, g, 2] += weight[s] * c * c
+                    result[k, g, 3] += weight[s] * a * x
+                    result[k, g, 4] += weight[s] * c * x
+                    result[k, g, 5] += weight[s] * x * x

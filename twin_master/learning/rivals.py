@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.compilation import compiled
+
 __all__ = ["Shown", "mix_onset", "weigh_gauges", "weigh_model", "weigh_none"]
 
 Float = NDArray[np.float64]
@@ -100,32 +102,66 @@ def weigh_gauges(
     log_likelihood are of the model. belief (G K, N), squares (G, K) and sums are brought up to date;
     returned is the log evidence (G, K).
     """
-    held = belief >= NEGLIGIBLE_RIVAL
-    belief[~held] = 0.0
-    rival, place = np.nonzero(held)
-    g, k = np.divmod(rival, len(gains))
-    left, unknown = shown.degrees + squares, 1.0 / (1.0 + sums[..., 0])
-    fitted = np.clip(unknown * sums[..., 1], -1.0, 1.0)
-    constant = 0.5 * np.log((shown.degrees + squares_of_model)[:, None] / left) * shown.there[:, None]
-    size = shown.size[place, g]
-    c = reach[k] * size
-    x = shown.residual[place, g] - gains[k] * size
-    innovation, wide = x - c * fitted[g, k], 1.0 + c**2 * unknown[g, k]
-    density = np.log(known[place, g] / (1.0 + innovation**2 / (left[g, k] * wide)))
-    log_value = log_likelihood[place] + constant[g, k] + shown.power[g] * density - 0.5 * np.log(wide)
-    best, first = np.full(len(belief), -np.inf), np.flatnonzero(np.diff(rival, prepend=-1))
-    best[rival[first]] = np.maximum.reduceat(log_value, first) if first.size else -np.inf
-    weight = belief[rival, place] * np.exp(log_value - best[rival])
+    result = np.empty_like(squares)
+    _weigh_gauges(
+        shown.there, shown.residual, shown.size, shown.power, shown.degrees, gains, reach, squares_of_model,
+        known, log_likelihood, belief, squares, sums, result,
+    )  # fmt: skip
+    return result
 
-    def total(values: Float) -> Float:
-        return np.bincount(rival, values, len(belief)).astype(np.float64).reshape(squares.shape)
 
-    mass = total(weight)
-    weight /= mass[g, k]
-    belief[rival, place] = weight
-    squares += total(weight * innovation**2 / wide)
-    sums += np.stack([total(weight * c**2), total(weight * c * x)], axis=-1)
-    return np.asarray(best.reshape(squares.shape) + np.log(mass))
+@compiled
+def _weigh_gauges(
+    there: NDArray[np.bool_],
+    residual: Float,
+    size: Float,
+    power: Float,
+    degrees: float,
+    gains: Float,
+    reach: Float,
+    squares_of_model: Float,
+    known: Float,
+    log_likelihood: Float,
+    belief: Single,
+    squares: Float,
+    sums: Float,
+    result: Float,
+) -> None:
+    """Fill result (G, K), see `weigh_gauges`."""
+    weight = np.empty(len(log_likelihood))
+    for rival in range(len(belief)):
+        g, k = divmod(rival, len(gains))
+        left, unknown = degrees + squares[g, k], 1.0 / (1.0 + sums[g, k, 0])
+        fitted = min(max(unknown * sums[g, k, 1], -1.0), 1.0)
+        constant = 0.5 * np.log((degrees + squares_of_model[g]) / left)
+        own, best, mass, added, cc, cx = belief[rival], -np.inf, 0.0, 0.0, 0.0, 0.0
+        for n in range(len(own)):
+            if own[n] < NEGLIGIBLE_RIVAL:
+                own[n] = 0.0
+                continue
+            weight[n] = log_likelihood[n]
+            if there[g]:
+                c = reach[k] * size[n, g]
+                x, wide = residual[n, g] - gains[k] * size[n, g] - c * fitted, 1.0 + c * c * unknown
+                weight[n] += constant + power[g] * np.log(known[n, g] / (1.0 + x * x / (left * wide)))
+            best = max(best, weight[n])
+        for n in range(len(own)):
+            if own[n] > 0.0:
+                c = reach[k] * size[n, g]
+                x, wide = residual[n, g] - gains[k] * size[n, g], 1.0 + c * c * unknown
+                weight[n] = own[n] * np.exp(weight[n] - best) / (np.sqrt(wide) if there[g] else 1.0)
+                mass += weight[n]
+                cc += weight[n] * c * c
+                cx += weight[n] * c * x
+                added += weight[n] * (x - c * fitted) ** 2 / wide
+        result[g, k] = best + np.log(mass) if mass > 0.0 else -np.inf
+        for n in range(len(own)):
+            if own[n] > 0.0:
+                own[n] = weight[n] / mass
+        if mass > 0.0:
+            squares[g, k] += added / mass
+            sums[g, k, 0] += cc / mass
+            sums[g, k, 1] += cx / mass
 
 
 def weigh_none(

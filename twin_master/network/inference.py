@@ -130,7 +130,7 @@ def log_forecast(transition: TransitionModel, control: ArrayLike, log_filtered: 
 
 
 def filter_many(
-    model: GraphicalModel, control: Index, rows: Float, log_first: Float
+    model: GraphicalModel, control: Index, rows: Float, log_before: Float, control_before: ArrayLike = -1
 ) -> tuple[Filtered, Index]:
     """Filter B twins without any check.
 
@@ -140,27 +140,29 @@ def filter_many(
     control : (B, T)
     rows : (B, T, S)
         log p(o_t | D_t, u_t).
-    log_first : (B, S) or (S,)
-        Logarithm of the belief before the first of the observations.
+    log_before : (B, S) or (S,)
+        Logarithm of the belief in the turn before the first, or of the prior where there is none.
+    control_before : int or (B,)
+        Control in force in that turn; -1 where there is none.
 
     Returns
     -------
     tuple of Filtered, (B,)
         The latter is -1, or the row whose observation is impossible; the rest of such a twin means nothing.
     """
-    forecast, filtered, log_filtered = (np.zeros_like(rows) for _ in range(3))
-    log_evidence, failed = np.zeros(rows.shape[:2]), np.empty(len(rows), dtype=np.int64)
-    log_filtered[:, :1] = np.broadcast_to(log_first, (len(rows), rows.shape[2]))[:, None]
-    lists = model.transition.forward_lists.arrays
-    forward_pass(lists, control, rows, forecast, filtered, log_filtered, log_evidence, failed)
-    return Filtered(forecast, filtered, log_filtered, log_evidence), failed
+    forecast, filtered, log_filtered = (np.empty_like(rows) for _ in range(3))
+    log_evidence, failed = np.empty(rows.shape[:2]), np.empty(len(rows), dtype=np.int64)
+    found = forecast, filtered, log_filtered, log_evidence
+    first = np.full((len(rows), rows.shape[2]), log_before), np.full(len(rows), control_before)
+    forward_pass(model.transition.forward_lists.arrays, control, *first, rows, *found, failed)
+    return Filtered(*found), failed
 
 
-def smooth_many(transition: TransitionModel, control: Index, log_filtered: Float) -> Float:
+def smooth_many(transition: TransitionModel, control: Index, filtered: Float, log_filtered: Float) -> Float:
     """Smooth the filtered beliefs (B, T, S) of B twins under controls (B, T), without any check."""
     smoothed = np.empty_like(log_filtered)
     lists = transition.forward_lists.arrays, transition.backward_lists.arrays
-    backward_pass(*lists, control, np.ascontiguousarray(log_filtered), smoothed)
+    backward_pass(*lists, control, filtered, log_filtered, smoothed)
     return smoothed
 
 
@@ -195,11 +197,10 @@ def filter_step(
         )
     control = _checked_controls(model, previous_control_index or 0)
     rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
-    first = model.log_prior
+    before: tuple[Any, ...] = (model.log_prior,)
     if previous_log_filtered is not None:
-        before = _checked_rows(model, control, previous_log_filtered, what="previous log belief")
-        first = log_forecast(model.transition, control[None], before[None])
-    found, failed = filter_many(model, control[None, None], rows[None, None], first)
+        before = _checked_rows(model, control, previous_log_filtered, what="previous log belief"), control
+    found, failed = filter_many(model, control[None, None], rows[None, None], *before)
     if failed[0] >= 0:
         raise ImpossibleObservation("twin", 0)
     return found[0, 0]
@@ -255,7 +256,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
     if control.ndim != 1:
         raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
     rows = _checked_rows(model, control, log_filtered, what="log belief")
-    return Smoothed(smooth_many(model.transition, control[None], rows[None])[0])
+    return Smoothed(smooth_many(model.transition, control[None], np.exp(rows)[None], rows[None])[0])
 
 
 def predict(

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from twin_master.errors import PlanningError
 from twin_master.network.distributions import stochastic_matrix
 from twin_master.network.graphical_model import deterministic_policy
+from twin_master.network.kernels import sweep
 from twin_master.network.transition import TransitionModel
 
 __all__ = ["BeliefPolicy", "PlannedPolicy", "evaluate_policy", "given_policy", "value_iteration"]
@@ -176,14 +177,9 @@ def value_iteration(
     scale = float(np.abs(rewards).max()) or 1.0
     # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
     limit = max(tolerance * scale * (1.0 - largest), 4e-16 * scale / (1.0 - largest))
-    value: Float = np.zeros(len(rewards))
-    change, iterations = np.inf, 0
-    action_value = rewards
-    while change > limit and iterations < max_iterations:
-        improved = action_value.max(axis=1)
-        change = float(np.abs(improved - value).max())
-        value, iterations = improved, iterations + 1
-        action_value = _action_value(model, rewards, factors, value)
+    value, action_value = np.zeros(len(rewards)), np.empty_like(rewards)
+    lists = model.backward_lists.arrays
+    iterations, change = sweep(lists, rewards, factors.copy(), limit, max_iterations, value, action_value)
     if change > limit:
         raise PlanningError(
             f"value iteration still changes by {change:.3g} after {max_iterations} sweeps with discount "

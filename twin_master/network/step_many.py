@@ -1,12 +1,13 @@
 """One turn of many twins of a model: what each would conclude alone, to the last bit."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import filter_many, log_forecast
+from twin_master.network.inference import filter_many
 from twin_master.network.planner import BeliefPolicy, PlannedPolicy
 
 __all__ = ["decide_many", "filter_step_many", "rationed"]
@@ -41,11 +42,11 @@ def filter_step_many(
         Whether the observation has probability zero wherever the belief has support; the rest of such a row
         means nothing.
     """
-    first = model.log_prior
+    before: tuple[Any, ...] = (model.log_prior,)
     if previous_control is not None and previous_log_filtered is not None:
-        first = log_forecast(model.transition, previous_control, previous_log_filtered)
+        before = previous_log_filtered, previous_control
     control = np.zeros((len(log_likelihood), 1), dtype=np.int64)
-    found, failed = filter_many(model, control, log_likelihood[:, None], first)
+    found, failed = filter_many(model, control, log_likelihood[:, None], *before)
     step = found[:, 0]
     return step.filtered, step.log_filtered, step.log_evidence, failed >= 0
 

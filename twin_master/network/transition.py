@@ -78,21 +78,21 @@ class TransitionLists:
         Where each row begins.
     source : (non-zeros,)
         The predecessor of a level within its block.
-    probability, power : (non-zeros,)
-        Of the transition from it: probability * 2^(512 power), with a probability of 2^-256 at least.
+    probability, log_probability : (non-zeros,)
+        Of the transition from it.
     """
 
     levels: Index
     first_row: Index
-    start: Index
-    source: Index
+    start: Unsigned
+    source: Unsigned
     probability: Float
-    power: Float
+    log_probability: Float
 
     @property
     def arrays(self) -> Lists:
         """All of them, as the compiled loops take them."""
-        return self.levels, self.first_row, self.start, self.source, self.probability, self.power
+        return self.levels, self.first_row, self.start, self.source, self.probability, self.log_probability
 
     @classmethod
     def from_blocks(cls, blocks: Sequence[Float]) -> "TransitionLists":
@@ -100,15 +100,13 @@ class TransitionLists:
         lists = [SparseTransition.from_matrix(block) for block in blocks]
         rows = [len(entry.start) - 1 for entry in lists]
         counts = np.concatenate([np.diff(entry.start.astype(np.int64)) for entry in lists])
-        probability = np.concatenate([entry.probability for entry in lists])
-        power = np.where(probability < 2.0**-256, np.where(probability < 2.0**-768, -2.0, -1.0), 0.0)
         return cls(
             levels=np.array([block.shape[1] for block in blocks], dtype=np.int64),
             first_row=np.concatenate([[0], np.cumsum(rows)[:-1]]).astype(np.int64),
-            start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-            source=np.concatenate([entry.source for entry in lists]).astype(np.int64),
-            probability=np.ldexp(probability, (-512 * power).astype(np.int32)),
-            power=power,
+            start=np.concatenate([[0], np.cumsum(counts)]).astype(np.uint64),
+            source=np.concatenate([entry.source for entry in lists]),
+            probability=np.concatenate([entry.probability for entry in lists]),
+            log_probability=np.concatenate([entry.log_probability for entry in lists]),
         )
 
 

@@ -210,7 +210,7 @@ def test_many_twins_equal_one_by_one():
     control = rng.integers(0, 2, (7, 15))
     log_likelihood = rng.normal(size=(7, 15, 25)) * 100
     filtered, failed = filter_many(MODEL, control, log_likelihood, MODEL.log_prior)
-    smoothed = smooth_many(MODEL.transition, control, filtered.log_filtered)
+    smoothed = smooth_many(MODEL.transition, control, np.exp(filtered.log_filtered), filtered.log_filtered)
     np.testing.assert_array_equal(failed, -1)
     for twin in range(7):
         alone, alone_smoothed = infer(MODEL, control[twin], log_likelihood[twin])
