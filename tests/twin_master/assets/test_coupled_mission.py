@@ -309,9 +309,7 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
 def test_the_shipped_scenario_in_process_in_workers_and_resumed(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    die_after_turn: Callable[..., None],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
 ) -> None:
     loaded = shipped("three_fmus", tmp_path, ("steps = 50", "steps = 24"))
     whole = new_run(loaded, tmp_path / "whole").folder

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -77,21 +76,6 @@ def test_the_worker_and_this_process_fly_the_same_mission(asset_folder: Path, tm
         for here in (False, True)
     ]
     assert runs[0].read_bytes() == runs[1].read_bytes()
-
-
-def test_a_resumed_flight_of_an_fmu_is_bit_identical(
-    asset_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
-) -> None:
-    loaded = load_scenario(asset_folder / "fouling.toml")
-    whole = new_run(loaded, tmp_path / "whole").folder
-    with monkeypatch.context() as patch:
-        die_after_turn(patch, 11)
-        with pytest.raises(KeyboardInterrupt):
-            new_run(loaded, tmp_path / "part")
-    # What is flown lies in the run folder: the files that it came from may change or go.
-    resume_run(tmp_path / "part")
-    for name in ("run.nc", "config.json", "summary.json", "journal.jsonl", "csv/observed.csv"):
-        assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
 
 
 def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(asset_folder: Path, tmp_path: Path) -> None:

@@ -90,33 +90,6 @@ def test_timing_of_a_turn(library_file: Path) -> None:
         assert flight.control_index[step + 1] == np.argmax(flight.filtered[step] @ knowledge.plan.policy)
 
 
-def test_a_mission_is_steered_by_the_rule_of_its_scenario(library_file: Path) -> None:
-    """Damage only grows: the rule that looks ahead falls back no later, and earlier in some missions."""
-    base = load_scenario("paper_level_turns").scenario
-    noisy = base.observation.model_copy(update={"standard_deviation": 1e-3})
-    base = base.model_copy(update={"observation": noisy})
-    first_gentle: dict[str, list[int]] = {}
-    for rule in ("filtered", "predicted"):
-        planner = base.planner.model_copy(update={"decide_on": rule})
-        scenario = base.model_copy(update={"planner": planner})
-        source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
-        knowledge = prepare_knowledge(scenario, source, 0)
-        first_gentle[rule] = []
-        for seed in range(40):
-            flight = flown(source, knowledge, seed)
-            belief = flight.filtered
-            if rule == "predicted":
-                matrix = knowledge.model.transition.matrix[flight.control_index]
-                belief = np.einsum("ts,tsr->tr", flight.filtered, matrix)
-            asked = belief @ knowledge.plan.policy
-            np.testing.assert_allclose(flight.decision_probability, asked, atol=1e-14)
-            np.testing.assert_array_equal(flight.control_index[1:], asked[:-1].argmax(axis=1))
-            first_gentle[rule].append(int(np.argmin(flight.control_index)))
-    earlier = np.subtract(first_gentle["filtered"], first_gentle["predicted"])
-    assert np.all(earlier >= 0)
-    assert np.any(earlier > 0)
-
-
 def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_twin(
     library_file: Path,
 ) -> None:

@@ -195,9 +195,7 @@ def test_every_figure_is_one_that_a_reference_can_name(each: MissionResult) -> N
     assert tuple(figure.key for figure in figures) == each.scenario.figure_names
 
 
-def test_figures_stand_beside_the_references_of_the_scenario(
-    each: MissionResult,
-) -> None:
+def test_figures_stand_beside_the_references_of_the_scenario(each: MissionResult) -> None:
     references = (
         Reference(figure="fallback_delay", value="1 or 2", source="somewhere"),
         Reference(figure="mean_reward_error", value=-0.4, source="elsewhere"),

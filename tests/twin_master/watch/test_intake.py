@@ -176,20 +176,6 @@ def test_a_flood_and_messages_of_ten_megabytes_are_counted_and_forgotten(
     assert max(map(len, content)) < 1200
 
 
-def test_an_observation_that_no_state_allows_is_refused_and_its_turn_predicted_through(
-    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path
-) -> None:
-    noise = replace(
-        knowledge
-    )  # the likelihood of 0.4 underflows nowhere: a certain prior makes it impossible
-    twin, intake = watched(
-        noise, [message(0, strains[0]), message(1, np.full(24, 0.4)), message(2, strains[2])], tmp_path / "r"
-    )
-    assert twin.turns == 3
-    assert np.isfinite(twin.smoothed()).all()
-    assert intake.counts.received == 3
-
-
 @pytest.mark.parametrize(
     "times",
     [
