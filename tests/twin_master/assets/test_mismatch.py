@@ -41,7 +41,6 @@ from uav_twin import cli
 
 ROOT = Path(__file__).parents[3]
 TEXT = scenario_files()["model_mismatch"].read_text(encoding="utf-8")
-SAME = ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "csv/health.csv")
 
 
 def write_scenario(folder: Path, *changes: tuple[str, str]) -> Path:

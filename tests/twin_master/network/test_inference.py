@@ -59,7 +59,7 @@ def infer(model, control, log_likelihood):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_filter_smoother_and_evidence_equal_enumeration(seed):
-    """Transitions with zeros; steps without an observation, or that rule states out; every joint trajectory."""
+    """Transitions with zeros; steps that show nothing, or rule states out; every trajectory."""
     rng = np.random.default_rng(seed)
     model = random_model(rng, (2, 2) if seed % 2 else (5,), zeros=0.4 * (seed != 3))
     steps = 5

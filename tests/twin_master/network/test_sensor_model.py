@@ -194,7 +194,7 @@ UNIFORM = known_control(np.full(STATES, 0.25), 0, CONTROLS)
 REFUSED = [
     *((lambda bad=bad: GaussianSensorModel(VALUES, bad, WEIGHT), "positive noise standard deviation")
       for bad in (0.0, -1.0, np.nan, np.ones(SENSORS + 1), np.r_[DEVIATION[:-1], np.inf])),
-    *((lambda bad=bad: GaussianSensorModel(VALUES, DEVIATION, WEIGHT, model_error=bad), "relative model error")
+    *((lambda bad=bad: GaussianSensorModel(VALUES, 1.0, WEIGHT, model_error=bad), "relative model error")
       for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1))),
     (lambda: GaussianSensorModel(VALUES, DEVIATION, WEIGHT, average="both"), "'outside' or 'inside'"),
     (lambda: HOLDING.log_likelihood(OBSERVATION[:-1], 0), f"expected {SENSORS} sensor values"),
