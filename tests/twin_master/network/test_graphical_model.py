@@ -132,6 +132,21 @@ def test_rows_at_the_damage_limit_sum_to_one():
     assert row[limit.index((0.8, 0.4))] == pytest.approx(0.1)
 
 
+def test_predecessor_lists_hold_every_non_zero_transition_and_no_other():
+    matrix = TransitionModel.from_factors(
+        [[worsening_table(4, p), worsening_table(3, 0.5)] for p in (0.0, 1.0)]
+    )
+    sparse = matrix.sparse
+    rebuilt = np.zeros_like(matrix.matrix)
+    for control in range(2):
+        for state in range(12):
+            row = control * 12 + state
+            for k in range(sparse.start[row], sparse.start[row + 1]):
+                rebuilt[control, sparse.source[k], state] = sparse.probability[k]
+    np.testing.assert_array_equal(rebuilt, matrix.matrix)
+    np.testing.assert_allclose(np.exp(sparse.log_probability), sparse.probability, rtol=1e-15)
+
+
 def test_deterministic_policy():
     np.testing.assert_array_equal(deterministic_policy([1, 0], 3), [[0, 1, 0], [1, 0, 0]])
 

@@ -132,6 +132,29 @@ def test_extreme_likelihoods_equal_arbitrary_precision(seed, scale, steps, shift
     np.testing.assert_allclose(filtered.log_evidence, oracle[3], rtol=1e-13, atol=known)
 
 
+def test_a_state_that_underflows_comes_back():
+    """Data of 2,000 nats for the wrong state are outweighed later; no floor decides, the data do."""
+    wrong, right = 0, 24
+    log_likelihood = np.zeros((12, 25))
+    log_likelihood[:, wrong] = 0.0
+    log_likelihood[8, wrong] = 2000.0
+    log_likelihood[11] = -9000.0
+    log_likelihood[11, right] = -100.0
+    control = np.ones(12, dtype=int)
+    filtered, smoothed = infer(MODEL, control, log_likelihood)
+    assert filtered.filtered[8, wrong] == pytest.approx(1.0)
+    assert filtered.filtered[8, right] == 0.0
+    forecast = MODEL.prior @ np.linalg.matrix_power(MODEL.transition.matrix[1], 8)
+    assert filtered.log_filtered[8, right] == pytest.approx(
+        np.log(forecast[right] / forecast[wrong]) - 2000.0, rel=1e-13
+    )
+    assert filtered.filtered[11, right] == pytest.approx(1.0)
+    oracle = precise_forward_backward(MODEL, control, log_likelihood)
+    np.testing.assert_allclose(filtered.filtered, oracle[0], **EXACT)
+    np.testing.assert_allclose(smoothed, oracle[1], **EXACT)
+    assert smoothed[8, right] > 0.05
+
+
 def test_stable_over_ten_thousand_steps():
     rng = np.random.default_rng(0)
     steps = 10_000
