@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,14 +16,14 @@ from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
-from twin_master import workflow
+from tests.twin_master.runs import check_same, cut_off_after
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.workflow import new_run, resume_run
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing"), pytest.mark.usefixtures("no_report")]
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +50,7 @@ def test_reliability(wing: ReducedModel) -> None:
     assert np.all([study.rms(0).value <= 0.045, study.rms(1).value <= 0.13])
 
 
-def test_the_whole_chain_and_its_resumption(
-    wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
-) -> None:
-    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
+def test_the_whole_chain_and_its_resumption(wing: ReducedModel, tmp_path: Path) -> None:
     loaded = load_scenario("paper_level_turns")
     outcome = new_run(loaded, tmp_path / "whole")
     figures = {figure.key: figure for figure in outcome.figures}
@@ -66,20 +62,17 @@ def test_the_whole_chain_and_its_resumption(
     config = json.loads((outcome.folder / "config.json").read_text(encoding="utf-8"))
     assert config["inputs"]["design"] == wing.design_hash
     assert (outcome.folder / "wing.vtu").stat().st_size > 10_000
-    with monkeypatch.context() as patch:
-        die_after_turn(patch, 23)
-        with pytest.raises(KeyboardInterrupt):
-            new_run(loaded, tmp_path / "part")
+    with cut_off_after(23):
+        new_run(loaded, tmp_path / "part")
     resume_run(tmp_path / "part")
-    for name in ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "asset/asset.fmu"):
-        assert (tmp_path / "part" / name).read_bytes() == (outcome.folder / name).read_bytes(), name
+    names = "run.nc config.json summary.json calibration.json wing.vtu asset/asset.fmu"
+    check_same(tmp_path / "part", outcome.folder, *names.split())
 
 
 @pytest.mark.long
 def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(
-    wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wing: ReducedModel, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
     loaded = load_scenario("paper_level_turns")
 
     def arrays(name: str, overrides: Overrides, packed: str = "python") -> dict[str, np.ndarray]:

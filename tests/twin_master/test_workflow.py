@@ -7,16 +7,15 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from reporting.errors import DiskFullError
 from reporting.progress import SilentProgress
+from tests.twin_master.runs import cut_off_after
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import (
@@ -30,17 +29,12 @@ from twin_master.errors import (
 from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import lock_run_folder
 from twin_master.scenario.reading import load_scenario
-from twin_master.store.writing import RunOutcome
+from twin_master.store.writing import RunOutcome, read_run
 from twin_master.workflow import new_run, resume_run
 
+pytestmark = pytest.mark.usefixtures("no_report")
 ROOT = Path(__file__).parents[2]
 SAME = ("run.nc", "config.json", "summary.json", "csv/health.csv", "csv/observed.csv", "csv/decisions.csv")
-
-
-@pytest.fixture(autouse=True)
-def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The report has tests of its own and takes seconds."""
-    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
 
 
 def fly(folder: Path, library: Path, scenario: str = "level_turns", **options: object) -> RunOutcome:
@@ -54,8 +48,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_run_folder(tmp_path: Path, library_file: Path) -> None:
     outcome = fly(tmp_path / "a" / "run", library_file, "failing_gauges")
     folder = outcome.folder
-    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
-        tree.load()
+    tree = read_run(folder)
     assert set(tree.children) == {
         "observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice",
     }  # fmt: skip
@@ -120,18 +113,11 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_mission(
     [("level_turns", 1), ("failing_gauges", 50), pytest.param("growing_damage", 30, marks=pytest.mark.long)],
 )
 def test_a_resumed_run_is_bit_identical(
-    tmp_path: Path,
-    library_file: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    die_after_turn: Callable[..., None],
-    scenario: str,
-    turns: int,
+    tmp_path: Path, library_file: Path, scenario: str, turns: int
 ) -> None:
     whole = contents(fly(tmp_path / "whole", library_file, scenario).folder)
-    with monkeypatch.context() as patch:
-        die_after_turn(patch, turns)
-        with pytest.raises(KeyboardInterrupt):
-            fly(tmp_path / "part", library_file, scenario)
+    with cut_off_after(turns):
+        fly(tmp_path / "part", library_file, scenario)
     assert not (tmp_path / "part" / "run.nc").exists()
     (tmp_path / "part" / ".checkpoint.1-2.partial.npz").write_bytes(b"left by a killed process")
     resume_run(tmp_path / "part", load_scenario(scenario))
@@ -238,18 +224,14 @@ def test_existing_folders_are_refused(tmp_path: Path, library_file: Path) -> Non
     fly(tmp_path / "empty", library_file)
 
 
-def test_what_cannot_be_resumed(
-    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
-) -> None:
+def test_what_cannot_be_resumed(tmp_path: Path, library_file: Path) -> None:
     with pytest.raises(NotResumableError, match="there is no run folder"):
         resume_run(tmp_path / "nothing")
     with pytest.raises(NotResumableError, match="is no run folder"):
         resume_run(tmp_path)
     folder = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        die_after_turn(patch, 3)
-        with pytest.raises(KeyboardInterrupt):
-            fly(folder, library_file)
+    with cut_off_after(3):
+        fly(folder, library_file)
     with pytest.raises(NotResumableError, match="another scenario"):
         resume_run(folder, load_scenario("growing_damage"))
     config = (folder / "config.json").read_text(encoding="utf-8")
@@ -273,17 +255,13 @@ def test_what_cannot_be_resumed(
     resume_run(folder)
 
 
-def test_a_run_needs_nothing_but_its_folder(
-    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
-) -> None:
+def test_a_run_needs_nothing_but_its_folder(tmp_path: Path, library_file: Path) -> None:
     library = tmp_path / "a library" / "é.json"
     library.parent.mkdir()
     library.write_bytes(library_file.read_bytes())
     whole = contents(fly(tmp_path / "whole", library_file).folder)
-    with monkeypatch.context() as patch:
-        die_after_turn(patch, 3)
-        with pytest.raises(KeyboardInterrupt):
-            fly(tmp_path / "part", library)
+    with cut_off_after(3):
+        fly(tmp_path / "part", library)
     library.unlink()
     moved = (tmp_path / "part").rename(tmp_path / "moved é")
     resume_run(moved)
@@ -296,13 +274,9 @@ def test_a_run_needs_nothing_but_its_folder(
     assert not (tmp_path / "never").exists()
 
 
-def test_a_copy_that_changed_is_refused(
-    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
-) -> None:
-    with monkeypatch.context() as patch:
-        die_after_turn(patch, 3)
-        with pytest.raises(KeyboardInterrupt):
-            fly(tmp_path / "run", library_file)
+def test_a_copy_that_changed_is_refused(tmp_path: Path, library_file: Path) -> None:
+    with cut_off_after(3):
+        fly(tmp_path / "run", library_file)
     copy = tmp_path / "run" / "asset" / "UAVconfig.json"
     content = copy.read_bytes()
     copy.write_bytes(content + b"\n")

@@ -31,10 +31,7 @@ def test_no_place_is_refused(panel: Scenario, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "point", "words"),
-    [
-        ("end_1", "[150, 100, 2]", "end_1"),
-        ("far", "[150, 100, 90]", r"gauge\[1\] \(far\): the point"),
-    ],
+    [("end_1", "[150, 100, 2]", "end_1"), ("far", "[150, 100, 90]", r"gauge\[1\] \(far\): the point")],
 )
 def test_what_is_wrong_names_the_option(
     panel: Scenario, tmp_path: Path, name: str, point: str, words: str

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 from fmu_asset.packing.script import build_script_fmu
 from reporting.progress import SilentProgress
 from scenarios import asset_scripts, binding_files
-from twin_master import workflow
+from tests.twin_master.runs import check_same, cut_off_after
 from twin_master.assets.observation_library import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
@@ -27,10 +26,7 @@ from twin_master.workflow import new_run, resume_run
 sys.path.insert(0, str(Path(__file__).parent))
 from pump_mission import PATH, pump_table, small_pump
 
-
-@pytest.fixture(autouse=True)
-def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
+pytestmark = pytest.mark.usefixtures("no_report")
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +63,7 @@ def test_a_table_over_another_parameter_grid_is_interpolated(library: Observatio
 
 
 def test_a_run_with_a_library_keeps_it_and_can_be_resumed(
-    made: tuple[Path, SamplingGrid],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    die_after_turn: Callable[..., None],
+    made: tuple[Path, SamplingGrid], tmp_path: Path
 ) -> None:
     path = tmp_path / "pump.nc"
     shutil.copy(made[0], path)
@@ -81,14 +74,11 @@ def test_a_run_with_a_library_keeps_it_and_can_be_resumed(
     assert config["scenario"]["belief"]["file"] == "asset/observation_library.nc"
     assert config["scenario"]["asset"]["kind"] == "fmu"
     assert set(config["inputs"]) == {"binding", "fmu", "observation_library"}
-    with monkeypatch.context() as patch:
-        die_after_turn(patch, 3)
-        with pytest.raises(KeyboardInterrupt):
-            new_run(small_pump(), tmp_path / "part", Overrides(library=path))
+    with cut_off_after(3):
+        new_run(small_pump(), tmp_path / "part", Overrides(library=path))
     path.unlink()
     resume_run(tmp_path / "part")
-    for name in ("run.nc", "summary.json", "csv/health.csv"):
-        assert (tmp_path / "part" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    check_same(tmp_path / "part", tmp_path / "whole", "run.nc", "summary.json", "csv/health.csv")
     stored = tmp_path / "part" / "asset" / "observation_library.nc"
     stored.write_bytes(stored.read_bytes()[:-200])
     (tmp_path / "part" / "run.nc").unlink()  # of a finished run nothing is read again

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
-import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,7 +22,6 @@ from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
-from twin_master import workflow
 from twin_master.assets.asset_source import PairedSource
 from twin_master.assets.interface import AssetReading, StatelessAsset
 from twin_master.assets.mismatch import find_misfit
@@ -37,14 +35,12 @@ from twin_master.fleet.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.workflow import new_run, resume_run
 from uav_twin import cli
 
 ROOT = Path(__file__).parents[3]
 TEXT = scenario_files()["model_mismatch"].read_text(encoding="utf-8")
-SAME = ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "csv/health.csv")
 
 
 def write_scenario(folder: Path, *changes: tuple[str, str]) -> Path:
@@ -373,70 +369,6 @@ class TestOnTheWing:
         assert np.abs(expected[1]) > 0.05
         assert np.sign(wrong.bias(1).value) == np.sign(expected[1])
         assert wrong.credible_share.value < right.credible_share.value
-
-    @pytest.mark.long
-    def test_a_run_says_that_asset_and_model_differ_and_is_resumed_bit_for_bit(
-        self,
-        wing: ReducedModel,
-        twisted: Path,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        die_after_turn: Callable[..., None],
-    ) -> None:
-        loaded = load_scenario("model_mismatch")
-        over = Overrides(strain_library=twisted)
-        whole = new_run(loaded, tmp_path / "whole", over)
-        assert whole.origin.differ
-        page = whole.report.read_text(encoding="utf-8")
-        assert "model differ: flown was the strain library" in page
-        assert "reduced model of the design" in page
-        summary = json.loads((whole.folder / "summary.json").read_text(encoding="utf-8"))
-        assert summary["asset_and_model_differ"] is True
-        assert summary["asset"] == "strain library"
-        figures = {figure.key: figure for figure in whole.figures}
-        assert float(figures["model_misfit_rms"].value or 0.0) == pytest.approx(4.0, abs=1.5)
-        assert set(figures) <= {*resolved(twisted).figure_names}
-        with xr.open_datatree(whole.folder / "run.nc", engine="h5netcdf") as tree:
-            assert tree.attrs["asset"] == "strain library"
-            assert tree.attrs["twin_model"].startswith("reduced model of the design")
-            flown = load_strain_library(twisted).strain_at((0.0, 0.0), 1)
-            np.testing.assert_allclose(tree["truth"]["strain"][0], flown)
-            mean = float(figures["young_modulus_factor_mean"].value or 0.0)
-            believed = wing.static_response(
-                young_modulus_factor=mean, stiffness_loss=(0.0, 0.0), load_factor=3.0
-            ).strain
-            np.testing.assert_allclose(tree["filtered"]["quantity_mean"][0], believed, rtol=1e-3)
-        assert (whole.folder / "wing.vtu").stat().st_size > 10_000
-        config = json.loads((whole.folder / "config.json").read_text(encoding="utf-8"))
-        assert config["inputs"]["design"] == wing.design_hash
-        assert set(config["inputs"]) == {"design", "strain_library"}
-        self.resume_elsewhere(loaded, twisted, tmp_path, monkeypatch, die_after_turn, whole.folder)
-
-    def resume_elsewhere(
-        self,
-        loaded: LoadedScenario,
-        library: Path,
-        place: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        die_after_turn: Callable[..., None],
-        whole: Path,
-    ) -> None:
-        copy = place / "copy" / "UAVconfig.json"
-        copy.parent.mkdir()
-        copy.write_bytes(library.read_bytes())
-        monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
-        with monkeypatch.context() as patch:
-            die_after_turn(patch, 23)
-            with pytest.raises(KeyboardInterrupt):
-                new_run(loaded, place / "part", Overrides(strain_library=copy))
-        copy.unlink()
-        moved = (place / "part").rename(place / "moved")
-        resume_run(moved)
-        for name in SAME:
-            assert (moved / name).read_bytes() == (whole / name).read_bytes(), name
-        for path in moved.rglob("*"):
-            if path.is_file():
-                assert str(place).encode() not in path.read_bytes(), path
 
     @pytest.mark.long
     def test_the_study_prints_its_table(self, wing: ReducedModel, twisted: Path) -> None:

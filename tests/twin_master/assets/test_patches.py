@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from fe.runtime.patch import (
     BoucWen,
@@ -24,13 +23,12 @@ from fe.runtime.patch import (
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
-from twin_master import workflow
 from twin_master.assets.patches import check_model_patch
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.scenario.reading import load_scenario
-from twin_master.store.writing import RunOutcome
+from twin_master.store.writing import RunOutcome, read_run
 from twin_master.workflow import new_run, resume_run
 from uav_twin import cli
 
@@ -145,20 +143,18 @@ def test_what_is_flown_and_what_is_believed_has_its_name(tmp_path: Path) -> None
 
 
 @pytest.fixture
-def mission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
-
+def mission(tmp_path: Path, no_report: None) -> Any:
     def fly(
         name: str, lines: str = "", parameters: str = "", belief: str = ""
     ) -> tuple[RunOutcome, dict[str, np.ndarray]]:
         loaded = load_scenario(write_scenario(tmp_path / "scenario", lines, parameters, belief))
         outcome = new_run(loaded, tmp_path / name, Overrides(in_process=True))
-        with xr.open_datatree(outcome.folder / "run.nc", engine="h5netcdf") as tree:
-            shown = {
-                "observed": tree["observed"]["strain"].values,
-                "truth": tree["truth"]["strain"].values if "strain" in tree["truth"] else np.zeros(0),
-                "predicted": tree["filtered"]["z1"].values if "z1" in tree["filtered"] else np.zeros(0),
-            }
+        tree = read_run(outcome.folder)
+        shown = {
+            "observed": tree["observed"]["strain"].values,
+            "truth": tree["truth"]["strain"].values if "strain" in tree["truth"] else np.zeros(0),
+            "predicted": tree["filtered"]["z1"].values if "z1" in tree["filtered"] else np.zeros(0),
+        }
         return outcome, shown
 
     return fly

@@ -10,16 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import norm
 
 from reporting.progress import SilentProgress
-from twin_master import workflow
 from twin_master.assets.resolution import Overrides
 from twin_master.library.request import grid_of_scenario
 from twin_master.library.sampling import sample_library
+from twin_master.store.writing import read_run
 from twin_master.workflow import new_run
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -73,18 +72,8 @@ def move(control: str, before: int, after: int) -> float:
 @pytest.fixture(scope="module", params=["asset", "library"])
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("pump")
-    patch = pytest.MonkeyPatch()
-    patch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
-    loaded = small_pump()
-    library = None
-    if request.param == "library":
-        library = sample(folder)
-    try:
-        run_folder = new_run(loaded, folder / "run", Overrides(library=library)).folder
-    finally:
-        patch.undo()
-    with xr.open_datatree(run_folder / "run.nc", engine="h5netcdf") as tree:
-        return tree.load()
+    library = sample(folder) if request.param == "library" else None
+    return read_run(new_run(small_pump(), folder / "run", Overrides(library=library), report=False).folder)
 
 
 def sample(folder: Path) -> Path:
@@ -171,12 +160,3 @@ def test_rewards_are_those_of_the_sensors_that_have_a_limit(run: Any) -> None:
             assert reward[2] == pytest.approx(
                 probability[t] @ np.nanmean(error, axis=2).mean(axis=1), rel=1e-7
             )
-
-
-def test_units_and_names_are_in_the_store(run: Any) -> None:
-    observed = run["observed"]
-    assert list(observed["sensor_unit"].values) == ["L/min", "N.m", "degC", "bar"]
-    assert list(observed["sensor_title"].values)[3] == "filter pressure drop"
-    assert observed["operation"].attrs["units"] == "see sensor_unit"
-    assert observed["speed"].attrs["units"] == "1/min"
-    assert run["truth"]["loss"].attrs["units"] == "W"

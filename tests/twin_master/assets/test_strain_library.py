@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.errors import InvalidStrainLibraryError
@@ -141,36 +139,9 @@ class TestAuthorsLibrary:
         assert library.discount == 0.6
         assert library.worsening_probability == {"2g": 0.05, "3g": 0.1}
 
-    def test_the_model_is_linear_in_the_load_factor(self, library):
-        two, three = library.controls.index("2g"), library.controls.index("3g")
-        for strain in (library.strain, library.strain_per_draw):
-            np.testing.assert_allclose(strain[..., three, :], 1.5 * strain[..., two, :], rtol=1e-5)
-
-    def test_the_mean_entry_is_no_average_of_the_draws(self, library):
-        distance = np.abs(library.strain_per_draw.mean(axis=0) - library.strain).max()
-        assert distance == pytest.approx(6.6e-6, abs=0.1e-6)
-        order = np.argsort(library.young_modulus_factor)
-        gauge = library.strain_per_draw[:, 0, 1, 16]
-        e = np.interp(library.strain[0, 1, 16], gauge[order][::-1], library.young_modulus_factor[order][::-1])
-        assert e == pytest.approx(1.0073, abs=2e-4)
-
-    def test_the_effects_of_the_regions_multiply(self, library):
-        strain = library.strain.reshape(5, 5, 2, 24)
-        product = strain[:, :1] * strain[:1, :] / strain[:1, :1]
-        assert np.abs(strain / product - 1.0).max() < 8e-4
-
     def test_gauge_16_carries_the_maximum_everywhere(self, library):
         assert np.all(library.strain.argmax(axis=2) == 16)
         assert np.all(library.strain_per_draw.argmax(axis=3) == 16)
         states = [library.states.index((z, 0.0)) for z in (0.0, 0.2, 0.4, 0.6, 0.8)]
         largest = library.strain_per_draw.mean(axis=0)[states, library.controls.index("3g"), 16]
         np.testing.assert_allclose(largest, np.array([3013, 3278, 3621, 4093, 4795]) * 1e-6, atol=1e-6)
-
-    @given(st.tuples(st.floats(0.0, 0.8), st.floats(0.0, 0.8)), st.integers(0, 1))
-    def test_an_asset_between_the_levels_lies_between_the_corners(self, library, loss, control):
-        strain = library.strain_at(loss, control)
-        table = library.strain.reshape(5, 5, 2, 24)[:, :, control]
-        corners = [np.clip(np.searchsorted((0.2, 0.4, 0.6), z, side="right"), 0, 3) for z in loss]
-        cell = table[corners[0] : corners[0] + 2, corners[1] : corners[1] + 2].reshape(4, 24)
-        assert np.all(strain >= cell.min(axis=0) - 1e-12)
-        assert np.all(strain <= cell.max(axis=0) + 1e-12)

@@ -5,23 +5,22 @@ from __future__ import annotations
 import re
 import shutil
 import tomllib
-import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import meshio
 import numpy as np
 import pytest
-import xarray as xr
 
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
 from fe.runtime.errors import FiniteElementError
 from fe.structure.operators import load_and_assemble
 from scenarios import scenario_files, structure_files
+from tests.twin_master.runs import check_same, cut_off_after
 from twin_master.errors import TwinMasterError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.store.writing import read_run
 from twin_master.workflow import new_run, resume_run
 
 PATH = scenario_files()["bracket"]
@@ -59,8 +58,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_twin_finds_the_damage_of_the_full_model(flown: Path) -> None:
     """The strains flown are those of the full model within their bound; the heel is accused, not the arm."""
-    with xr.open_datatree(flown / "run.nc", engine="h5netcdf") as tree:
-        tree.load()
+    tree = read_run(flown)
     structure = load_and_assemble(structure_files()["bracket"])
     unit = structure.load("weight", 1.0)
     truth, observed = tree["truth"], tree["observed"]
@@ -92,8 +90,7 @@ def test_damage_between_two_levels_does_not_condemn_a_sound_region(tmp_path: Pat
         },
     )
     folder = new_run(loaded, tmp_path / "run", report=False).folder
-    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
-        probability = tree["filtered"]["probability"].values.reshape(-1, 5, 5)
+    probability = read_run(folder)["filtered"]["probability"].values.reshape(-1, 5, 5)
     sound = probability[-3:, :, 0].sum(axis=1)
     assert np.all(sound > 0.4) if between else np.all(sound < 0.01)
 
@@ -113,8 +110,7 @@ def test_damage_is_found_from_frequencies_alone(tmp_path: Path) -> None:
     rewards |= dict.fromkeys(("health_limit_microstrain", "error_scale_microstrain"))
     noise = {"truth": {"noise": {"standard_deviation": [0.2, 0.4, 1.2]}}}
     flown = new_run(short(observation=seen, rewards=rewards, **noise), tmp_path / "run", report=False).folder
-    with xr.open_datatree(flown / "run.nc", engine="h5netcdf") as tree:
-        tree.load()
+    tree = read_run(flown)
     assert tree["truth"]["frequency"].attrs["units"] == "Hz"
     structure = load_and_assemble(structure_files()["bracket"])
     squares, _ = lowest_eigenpairs(structure.stiffness({"e": 1.02}, {"z_heel": 0.4}), structure.mass(), 3)
@@ -129,37 +125,19 @@ def test_damage_is_found_from_frequencies_alone(tmp_path: Path) -> None:
         new_run(changed, tmp_path / "no")
 
 
-def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(
-    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
-) -> None:
+def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(flown: Path, tmp_path: Path) -> None:
     for name in ("bracket.toml", "bracket.inp"):
         shutil.copy(structure_files()["bracket"].with_name(name), tmp_path)
     own = {"structure": str(tmp_path / "bracket.toml")}
     loaded = short(asset=own, belief=own)
-    with monkeypatch.context() as patch:
-        die_after_turn(patch, 4)
-        with pytest.raises(KeyboardInterrupt):
-            new_run(loaded, tmp_path / "part", report=False)
+    with cut_off_after(4):
+        new_run(loaded, tmp_path / "part", report=False)
     for name in ("bracket.toml", "bracket.inp"):
         (tmp_path / name).unlink()
     moved = tmp_path / "moved"
     (tmp_path / "part").rename(moved)
     resume_run(moved, report=False)
-    for name in ("csv/observed.csv", "csv/estimated.csv", "csv/decisions.csv"):
-        assert (moved / name).read_bytes() == (flown / name).read_bytes(), name
-
-
-@pytest.mark.long
-def test_the_compiled_fmu_is_flown_where_the_scenario_says_so(flown: Path, tmp_path: Path) -> None:
-    """Strains are those of the Python FMU within 1e-12 of the largest; the run folder holds the binary."""
-    folder = new_run(short(asset={"packed": "compiled"}), tmp_path / "run", report=False).folder
-    with zipfile.ZipFile(folder / "asset" / "asset.fmu") as archive:
-        assert not any(name.endswith(".py") for name in archive.namelist())
-    python, compiled = (
-        xr.open_datatree(run / "run.nc", engine="h5netcdf")["truth"]["strain"].load().values
-        for run in (flown, folder)
-    )
-    np.testing.assert_allclose(compiled, python, rtol=0.0, atol=1e-12 * np.abs(python).max())
+    check_same(moved, flown, "csv/observed.csv", "csv/estimated.csv", "csv/decisions.csv")
 
 
 def test_the_field_of_the_last_estimate_is_written(flown: Path) -> None:

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from scenarios import scenario_files
+from tests.twin_master.runs import check_same, cut_off_after
 from twin_master.errors import TwinMasterError
 from twin_master.network.identified import packed_row
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.store.writing import read_run
 from twin_master.watch.message import MessageReader, Refused
 from twin_master.workflow import new_run, resume_run
 
@@ -74,8 +75,7 @@ def flown(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_twin_finds_the_loss_from_records_of_accelerations(flown: Path) -> None:
     """Features lie within their errors of those of the model that flies; the inner region is accused."""
-    with xr.open_datatree(flown / "run.nc", engine="h5netcdf") as tree:
-        tree.load()
+    tree = read_run(flown)
     true, seen = tree["truth"]["modes"].values, tree["observed"]["modes"].values
     assert list(tree["observed"]["sensor_unit"].values) == ["Hz", "1", "1"] * 2
     titles = ["frequency_1", "damping_ratio_1", "mid_1", "frequency_3", "damping_ratio_3", "mid_3"]
@@ -92,8 +92,7 @@ def test_an_ambient_record_tells_the_same_mode(file: Path, tmp_path: Path) -> No
     modes = MODES | {"bands": MODES["bands"][:1], "numbers": [1]}
     table = {"mission": {"steps": 1}, "truth": {"gains": []}, "observation": {"modes": modes}}
     folder = new_run(mission(file, "ambient", **table), tmp_path / "run", report=False).folder
-    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
-        tree.load()
+    tree = read_run(folder)
     true, seen = tree["truth"]["modes"].values[0], tree["observed"]["modes"].values[0]
     titles = ("frequency_1", "damping_ratio_1", "mid_1")
     errors = np.array([tree["truth"][f"standard_error_{title}"].values[0] for title in titles])
@@ -103,19 +102,12 @@ def test_an_ambient_record_tells_the_same_mode(file: Path, tmp_path: Path) -> No
 
 @pytest.mark.long
 def test_a_resumed_flight_goes_on_with_the_records_of_its_turns(
-    file: Path,
-    flown: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    die_after_turn: Callable[..., None],
+    file: Path, flown: Path, tmp_path: Path
 ) -> None:
-    with monkeypatch.context() as patch:
-        die_after_turn(patch, 3)
-        with pytest.raises(KeyboardInterrupt):
-            new_run(mission(file, "decay"), tmp_path / "part", report=False)
+    with cut_off_after(3):
+        new_run(mission(file, "decay"), tmp_path / "part", report=False)
     resume_run(tmp_path / "part", report=False)
-    for name in ("csv/observed.csv", "csv/estimated.csv"):
-        assert (tmp_path / "part" / name).read_bytes() == (flown / name).read_bytes(), name
+    check_same(tmp_path / "part", flown, "csv/observed.csv", "csv/estimated.csv")
 
 
 @pytest.mark.parametrize(

@@ -15,17 +15,7 @@ from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
-from twin_master.fleet.posterior import (
-    HIGHEST,
-    LOWEST,
-    Grid,
-    logistic,
-    logit,
-    points_of,
-    population,
-    refined,
-    shared,
-)
+from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
 from twin_master.fleet.reading import attention, fleet_groups
 from twin_master.fleet.report import write_fleet_report
 from twin_master.mission.preparation import kept_knowledge
@@ -59,11 +49,7 @@ def enumerated(scenario: Scenario, control: list[int], likelihood: np.ndarray) -
 
 
 @pytest.mark.parametrize(
-    "probability",
-    [
-        {"2g": 0.07, "3g": 0.2},
-        {"2g": {"z1": 0.07, "z2": 0.3}, "3g": {"z1": 0.2, "z2": 0.01}},
-    ],
+    "probability", [{"2g": 0.07, "3g": 0.2}, {"2g": {"z1": 0.07, "z2": 0.3}, "3g": {"z1": 0.2, "z2": 0.01}}]
 )
 def test_evidence_of_a_twin_is_that_of_all_paths(probability: object) -> None:
     scenario = tiny(probability)
@@ -214,13 +200,6 @@ def test_a_population_of_few_is_told_with_its_doubt(members: int) -> None:
             low, high = line.interval()
             held[which] += low <= truth[which] <= high
     assert (held >= 71).all(), held  # 76 expected, with a deviation of 1.9
-
-
-def test_points_are_those_of_the_axes() -> None:
-    axes = (np.array([-1.0, 0.0]), np.array([0.0, 1.0, 2.0]))
-    found = points_of(axes)
-    assert found.shape == (6, 2)
-    np.testing.assert_allclose(logit(found[4]), [0.0, 1.0])
 
 
 @pytest.fixture(scope="module")

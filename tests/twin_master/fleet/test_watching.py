@@ -162,6 +162,31 @@ def test_an_asset_is_lost_alone(fleet_file: Path, alone: list[bytes], tmp_path: 
         FleetWatch(load_fleet(fleet_file), tmp_path / "flown", print, print)
 
 
+@pytest.fixture
+def broker(fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mosquitto]:
+    """A broker that has a topic for each asset of the fleet."""
+    if shutil.which("mosquitto") is None:
+        pytest.skip("no mosquitto")
+    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
+    broker = Mosquitto(tmp_path)
+    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+    yield broker
+    broker.stop()
+
+
+def make_unwell(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Let the watch of an asset meet an error of ours once, behind its third turn."""
+    decisions, unwell = Watch.decisions, iter([True])
+
+    def once_unwell(watch: Watch, *given: Any) -> Iterator[dict[str, Any]]:
+        for decision in decisions(watch, *given):
+            yield decision
+            if watch.folder.name == name and decision["turn"] >= 2 and next(unwell, False):
+                raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr(Watch, "decisions", once_unwell)
+
+
 def test_an_asset_that_was_lost_is_taken_up_again(
     fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,15 +195,9 @@ def test_an_asset_that_was_lost_is_taken_up_again(
         monkeypatch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
     logs = [tmp_path / "logs" / f"wing-{number}.csv" for number in range(3)]
     (tmp_path / "logs" / "wing-1.txt").write_text("turn,strain_1\n")  # another of that name
-    contents, (at, decisions) = [log.read_bytes() for log in logs], (0, Watch.decisions)
+    contents, at = [log.read_bytes() for log in logs], 0
     logs[1].write_text("turn,strian_1\n")
-    unwell = iter([True])
-
-    def once_unwell(watch: Watch, *given: Any) -> Iterator[dict[str, Any]]:
-        for number, decision in enumerate(decisions(watch, *given)):
-            yield decision
-            if watch.folder.name == "wing-2" and number == 2 and next(unwell, False):
-                raise ZeroDivisionError("division by zero")
+    make_unwell(monkeypatch, "wing-2")
 
     def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
         if asset.name == "north/wing-0" and decision["turn"] == 2 and "told_again" not in decision:
@@ -192,7 +211,6 @@ def test_an_asset_that_was_lost_is_taken_up_again(
                 log.write_bytes(content)
         fleet.asked = at == 6
 
-    monkeypatch.setattr(Watch, "decisions", once_unwell)
     notes: list[str] = []
     file = fleet_of(tmp_path, "logs/*")
     fleet = FleetWatch(load_fleet(file), tmp_path / "out", tell, notes.append, follow=True)
@@ -206,13 +224,7 @@ def test_an_asset_that_was_lost_is_taken_up_again(
     assert sorted(again) == ["north/wing-1 is watched again.", "north/wing-2 is watched again."]
 
 
-@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
-def test_a_topic_for_each_asset(
-    fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
-    broker = Mosquitto(tmp_path)
-    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+def test_a_topic_for_each_asset(broker: Mosquitto, alone: list[bytes], tmp_path: Path) -> None:
     heard: list[tuple[str, int]] = []
     listener = broker.client("listener")
     listener.on_message = lambda _client, _data, message: heard.append(
@@ -242,7 +254,6 @@ def test_a_topic_for_each_asset(
         notes: list[str] = []
         fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
         fleet.run(send)
-    broker.stop()
     kept = [[line[65:] for line in own.splitlines()[1:]] for own in journals(tmp_path / "out")]
     for ours, theirs in zip(kept, (alone[0], alone[2]), strict=True):
         wanted = [json.loads(line[65:]) for line in theirs.splitlines()[1:]]
@@ -254,23 +265,11 @@ def test_a_topic_for_each_asset(
     assert {topic for topic, _ in heard} == {"wings/wing-0/decision", "wings/wing-2/decision"}
 
 
-@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
 def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
-    fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
-    decisions, unwell = Watch.decisions, iter([True])
-
-    def once_unwell(watch: Watch, *given: Any) -> Iterator[dict[str, Any]]:
-        for decision in decisions(watch, *given):
-            yield decision
-            if decision["turn"] == 2 and next(unwell, False):
-                raise ZeroDivisionError("division by zero")
-
-    monkeypatch.setattr(Watch, "decisions", once_unwell)
-    broker = Mosquitto(tmp_path)
-    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+    make_unwell(monkeypatch, "wing-0")
     publisher, notes, told, sent = broker.client("publisher"), list[str](), list[int](), list[int]()
 
     def send() -> None:
@@ -295,7 +294,6 @@ def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
     north.mkdir()
     (north / "late").write_text("no folder")  # an asset whose first taking up fails
     fleet.run(send)
-    broker.stop()
     assert sorted(told) == sorted([*range(TURNS)] * 2)
     assert notes[1].startswith("north/late is not watched: ")
     assert notes[2:5] == [
@@ -306,13 +304,7 @@ def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
     assert fleet.assets["north/wing-0"].keep.intake.counts.missing == 0
 
 
-@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
-def test_a_topic_that_jumps_ahead_and_is_left_alone(
-    fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
-    broker = Mosquitto(tmp_path)
-    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+def test_a_topic_that_jumps_ahead_and_is_left_alone(broker: Mosquitto, tmp_path: Path) -> None:
     publisher, notes, told = broker.client("publisher"), list[str](), list[tuple[str, int, int]]()
     last = 2 * TURNS_AT_ONCE  # a single message that brings more turns than a file is read at once
 
@@ -332,25 +324,21 @@ def test_a_topic_that_jumps_ahead_and_is_left_alone(
         load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append, turns=last + 1
     )
     fleet.run(send)
-    broker.stop()
     lost = [0, *[24] * (last - 1), 0]
     assert told == [*(("north/wing-0", turn, lost[turn]) for turn in range(last + 1)), ("north/last", 0, 24)]
     inboxes = fleet._sources[0]._inboxes  # type: ignore[union-attr]
     assert [len(inbox.came) for inbox in inboxes.values() if inbox] == [0, 0]  # nineteen came too late
 
 
-@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
 def test_an_asset_that_falls_silent_while_another_is_heard(
-    fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also one that was watched before; and what was decided of it and never published is."""
-    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.0)
     with (tmp_path / "wing.toml").open("a") as file:
         file.write("\n[watch]\nquiet_after_seconds = 0.5\n")
-    broker, heard = Mosquitto(tmp_path), list[dict[str, Any]]()
-    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+    heard = list[dict[str, Any]]()
     client, notes, told = broker.client("client", heard), list[str](), list[tuple[str, int, list[str]]]()
     client.subscribe([("wings/+/decision", 1), ("wings/fleet/heartbeat", 1)])
     turns = iter(range(1000))
@@ -379,7 +367,6 @@ def test_an_asset_that_falls_silent_while_another_is_heard(
     again.run(end)
     wait_until(lambda: [one["state"] for one in heard if "state" in one][-1] == "ended")
     client.disconnect()
-    broker.stop()
     assert [said for said in told if said[0] == "north/two"] == [
         ("north/two", 0, []), ("north/two", 0, ["quiet"]),
     ]  # fmt: skip

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.reading import load_scenario
 from twin_master.viewer.flight import Flight
 from twin_master.watch.replay import gap_of
-from twin_master.workflow import resume_run
 from uav_twin.cli import app
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
@@ -197,18 +195,6 @@ def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario: Path, run: xr.D
     gap = gap_of(history, 4, knowledge.sensor_model)
     residual = run["filtered"]["residual"].values[4:]
     assert gap["rms_residual"] == pytest.approx(np.sqrt(np.mean(residual**2)))
-
-
-def test_a_run_that_was_cut_off_learns_the_same(folder: Path) -> None:
-    cut = folder.parent / "cut"
-    shutil.copytree(folder, cut)
-    journal = cut / JOURNAL_NAME
-    journal.write_text("".join(journal.read_text().splitlines(keepends=True)[:6]))
-    kept = {name: (cut / name).read_bytes() for name in ("run.nc", "summary.json")}
-    for name in kept:
-        (cut / name).unlink()
-    resume_run(cut, report=False)
-    assert {name: (cut / name).read_bytes() for name in kept} == kept
 
 
 def test_a_watch_keeps_the_last_turns_of_what_it_learnt(

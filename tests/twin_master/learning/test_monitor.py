@@ -272,23 +272,6 @@ def test_a_turn_without_readings_changes_no_evidence() -> None:
     assert after.log_evidence_none == pytest.approx(before.log_evidence_none, abs=1e-6)
 
 
-def test_a_twin_that_was_saved_goes_on_to_the_last_bit() -> None:
-    model, sensors = small()
-    seen = drawn(np.random.default_rng(6), 8)
-    first, second = (
-        Twin("small", model, sensors, np.ones((3, 1)), lag=2, estimator=watchful()) for _ in range(2)
-    )
-    for row in seen[:5]:
-        first.turn(row)
-    second.restore_state(first.save_state())
-    for row in seen[5:]:
-        one, other = first.turn(row).suspicion, second.turn(row).suspicion
-        assert one is not None
-        assert other is not None
-        assert one.none_of_these == other.none_of_these
-        np.testing.assert_array_equal(one.log_evidence_gauge, other.log_evidence_gauge)
-
-
 def test_a_late_observation_tells_what_it_brings_to_light_in_its_turn() -> None:
     model, sensors = small()
     twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful(), lag=8)
@@ -383,24 +366,6 @@ def test_an_alarm_names_no_command_where_none_looks_for_causes(wing: Knowledge) 
     alarm = next(n.sentence for estimate in estimates for n in estimate.notices if n.kind == "alarm")
     assert "gauge 5 (place 5) shows too much" in alarm
     assert alarm.endswith("against the model, alarm from 100)")
-
-
-def test_what_no_state_explains_is_not_taken_for_a_gauge(wing: Knowledge) -> None:
-    """Several gauges about a place show more: as where a third region softens."""
-    estimates = fly(wing, 25, {9: 0.15, 10: 0.25, 11: 0.25, 12: 0.15, 22: 0.2}, 5)
-    last = estimates[-1].suspicion
-    assert last is not None
-    assert last.none_of_these > 0.9
-    sentences = [notice.sentence for estimate in estimates for notice in estimate.notices]
-    assert "no state of the model explains all gauges together" in sentences[0]
-
-
-def test_a_healthy_wing_raises_no_alarm(wing: Knowledge) -> None:
-    estimates = fly(wing, 40, {})
-    assert not any(estimate.notices for estimate in estimates)
-    last = estimates[-1].suspicion
-    assert last is not None
-    assert last.none_of_these + last.gauge_off < 0.05
 
 
 def test_an_absurd_gauge_is_left_out_with_a_word(wing: Knowledge) -> None:

@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
-from twin_master import workflow
+from tests.twin_master.runs import check_same
 from twin_master.environment import ScenarioEnvironment
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble
@@ -19,7 +19,10 @@ from twin_master.fleet.reading import fleet_groups
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.store import ENDED
 from twin_master.scenario.reading import load_scenario
+from twin_master.store.writing import read_run
 from twin_master.workflow import new_run, resume_run
+
+pytestmark = pytest.mark.usefixtures("no_report")
 
 BINDING = """
 [binding]
@@ -114,11 +117,6 @@ standard_deviation = 0.1
 """
 
 
-@pytest.fixture(autouse=True)
-def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
-
-
 def scenario(folder: Path, fmu: Path) -> Any:
     (folder / "binding.toml").write_text(BINDING, encoding="utf-8")
     (folder / "scenario.toml").write_text(SCENARIO.replace("FMU", str(fmu)), encoding="utf-8")
@@ -155,8 +153,7 @@ def test_a_run_is_resumed_once_the_cause_is_gone(
         resume_run(tmp_path / "part")
     flag.unlink()
     resume_run(tmp_path / "part")
-    for name in ("run.nc", "config.json", "summary.json", "csv/observed.csv"):
-        assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
+    check_same(tmp_path / "part", whole, "run.nc", "config.json", "summary.json", "csv/observed.csv")
 
 
 def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
@@ -235,8 +232,7 @@ def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu: Any, tmp_path: Pat
     text = text.replace("standard_deviation = 0.1", "standard_deviation = 0.05")
     (tmp_path / "scenario.toml").write_text(text, encoding="utf-8")
     folder = new_run(load_scenario(tmp_path / "scenario.toml"), tmp_path / "run").folder
-    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
-        tree.load()
+    tree = read_run(folder)
     truth = tree["truth"]
     assert truth["state_calls"].values.tolist() == [1.0, 2.0, 3.0]
     assert truth["y[1]"].attrs["units"] == "mm"

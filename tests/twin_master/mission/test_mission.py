@@ -17,6 +17,7 @@ from twin_master.mission.loop import Checkpoint, fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.turns import History, Turn
 from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.schema import Scenario
 
 
 @pytest.fixture(params=["level_turns", "growing_damage", "failing_gauges"])
@@ -29,25 +30,26 @@ def knowledge_of(source: StrainLibrarySource) -> Knowledge:
     return prepare_knowledge(source._scenario, source, 3)
 
 
+def of_the_paper(library: Path, seed: int = 1) -> tuple[Scenario, StrainLibrarySource, Knowledge]:
+    scenario = load_scenario("paper_level_turns").scenario
+    source = StrainLibrarySource(scenario, load_strain_library(library), "h")
+    return scenario, source, prepare_knowledge(scenario, source, seed)
+
+
 def flown(source: StrainLibrarySource, knowledge: Knowledge, seed: int = 3, **options: object) -> History:
     plant = knowledge.plant(knowledge.truth(seed), source.open())
     return fly(knowledge.scenario, knowledge.twin(), plant, **options)  # type: ignore[arg-type]
 
 
+ARRAYS = (
+    "observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted", "decision_probability",
+    "state",
+)  # fmt: skip
+
+
 def same(first: History, second: History) -> bool:
-    arrays = (
-        "observed",
-        "control_index",
-        "filtered",
-        "log_evidence",
-        "smoothed",
-        "predicted",
-        "decision_probability",
-    )
-    return all(
-        np.array_equal(getattr(first, name), getattr(second, name), equal_nan=name == "observed")
-        for name in arrays
-    ) and np.array_equal(first.state, second.state)
+    pairs = [(getattr(first, name), getattr(second, name)) for name in ARRAYS]
+    return all(np.array_equal(one, other, equal_nan=True) for one, other in pairs)
 
 
 def stopped(kept: list[tuple[Turn, bytes]]) -> Checkpoint:
@@ -70,8 +72,7 @@ def test_resuming_after_any_turn_is_bit_identical(source: StrainLibrarySource) -
 
 def test_timing_of_a_turn(library_file: Path) -> None:
     """Control u_t is in force while d_t, the gain of step t included, is observed."""
-    scenario = load_scenario("paper_level_turns").scenario
-    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
+    scenario, source, knowledge = of_the_paper(library_file)
     asked: list[tuple[float, float, float]] = []
     inner = source.open()
 
@@ -79,7 +80,6 @@ def test_timing_of_a_turn(library_file: Path) -> None:
         asked.append((control["load_factor"], health["z1"], health["z2"]))
         return inner.step(control, health)
 
-    knowledge = prepare_knowledge(scenario, source, 1)
     plant = knowledge.plant(knowledge.truth(1), StatelessAsset(observe))
     flight = fly(scenario, knowledge.twin(), plant)
     assert asked[0] == (3.0, 0.0, 0.0)
@@ -90,39 +90,10 @@ def test_timing_of_a_turn(library_file: Path) -> None:
         assert flight.control_index[step + 1] == np.argmax(flight.filtered[step] @ knowledge.plan.policy)
 
 
-def test_a_mission_is_steered_by_the_rule_of_its_scenario(library_file: Path) -> None:
-    """Damage only grows: the rule that looks ahead falls back no later, and earlier in some missions."""
-    base = load_scenario("paper_level_turns").scenario
-    noisy = base.observation.model_copy(update={"standard_deviation": 1e-3})
-    base = base.model_copy(update={"observation": noisy})
-    first_gentle: dict[str, list[int]] = {}
-    for rule in ("filtered", "predicted"):
-        planner = base.planner.model_copy(update={"decide_on": rule})
-        scenario = base.model_copy(update={"planner": planner})
-        source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
-        knowledge = prepare_knowledge(scenario, source, 0)
-        first_gentle[rule] = []
-        for seed in range(40):
-            flight = flown(source, knowledge, seed)
-            belief = flight.filtered
-            if rule == "predicted":
-                matrix = knowledge.model.transition.matrix[flight.control_index]
-                belief = np.einsum("ts,tsr->tr", flight.filtered, matrix)
-            asked = belief @ knowledge.plan.policy
-            np.testing.assert_allclose(flight.decision_probability, asked, atol=1e-14)
-            np.testing.assert_array_equal(flight.control_index[1:], asked[:-1].argmax(axis=1))
-            first_gentle[rule].append(int(np.argmin(flight.control_index)))
-    earlier = np.subtract(first_gentle["filtered"], first_gentle["predicted"])
-    assert np.all(earlier >= 0)
-    assert np.any(earlier > 0)
-
-
 def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_twin(
     library_file: Path,
 ) -> None:
-    scenario = load_scenario("paper_level_turns").scenario
-    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
-    knowledge = prepare_knowledge(scenario, source, 1)
+    _, source, knowledge = of_the_paper(library_file)
     flight = flown(source, knowledge, 1)
     residual = flight.observed - flight.observation
     np.testing.assert_allclose(residual, knowledge.truth(1).noise, atol=1e-12)
@@ -133,9 +104,7 @@ def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_tw
 
 
 def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(library_file: Path) -> None:
-    scenario = load_scenario("paper_level_turns").scenario
-    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
-    knowledge = prepare_knowledge(scenario, source, 1)
+    scenario, source, knowledge = of_the_paper(library_file)
     inner = source.open()
     count = 0
 
@@ -160,9 +129,7 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(library
 
 
 def test_a_checkpoint_whose_decisions_do_not_follow_is_refused(library_file: Path) -> None:
-    scenario = load_scenario("paper_level_turns").scenario
-    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
-    knowledge = prepare_knowledge(scenario, source, 1)
+    _, source, knowledge = of_the_paper(library_file)
     kept: list[tuple[Turn, bytes]] = []
     flown(source, knowledge, keep=lambda *told: kept.append(told))
     altered = stopped(kept[:10])
@@ -173,9 +140,7 @@ def test_a_checkpoint_whose_decisions_do_not_follow_is_refused(library_file: Pat
 
 def test_study_on_the_published_library(published_library: Path) -> None:
     """Policy and reliability of the reference twin; the bars are those of 300 missions, widened for 60."""
-    scenario = load_scenario("paper_level_turns").scenario
-    source = StrainLibrarySource(scenario, load_strain_library(published_library), "h")
-    knowledge = prepare_knowledge(scenario, source, 0)
+    scenario, source, knowledge = of_the_paper(published_library, 0)
     z1 = knowledge.model.states.coordinates[:, 0]
     np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
     margin = (knowledge.plan.action_value[:, 1] - knowledge.plan.action_value[:, 0]).reshape(5, 5)

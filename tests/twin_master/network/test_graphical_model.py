@@ -132,15 +132,6 @@ def test_rows_at_the_damage_limit_sum_to_one():
     assert row[limit.index((0.8, 0.4))] == pytest.approx(0.1)
 
 
-def test_joint_transition_is_the_product_of_the_factors():
-    first, second = worsening_table(5, 0.2), worsening_table(3, 0.3)
-    matrix = TransitionModel.from_factors([[first, second]]).matrix[0]
-    for i in range(5):
-        for j in range(3):
-            expected = np.outer(first[i], second[j]).ravel()
-            np.testing.assert_allclose(matrix[i * 3 + j], expected, rtol=1e-15)
-
-
 def test_predecessor_lists_hold_every_non_zero_transition_and_no_other():
     matrix = TransitionModel.from_factors(
         [[worsening_table(4, p), worsening_table(3, 0.5)] for p in (0.0, 1.0)]
@@ -154,15 +145,6 @@ def test_predecessor_lists_hold_every_non_zero_transition_and_no_other():
                 rebuilt[control, sparse.source[k], state] = sparse.probability[k]
     np.testing.assert_array_equal(rebuilt, matrix.matrix)
     np.testing.assert_allclose(np.exp(sparse.log_probability), sparse.probability, rtol=1e-15)
-
-
-def test_model_checks_that_its_parts_fit():
-    transition = TransitionModel.from_factors([[worsening_table(5, 0.1), worsening_table(3, 0.1)]])
-    prior = SPACE.certain((0.0, 0.0))
-    model = GraphicalModel(SPACE, ("hold",), prior, transition)
-    assert model.log_prior[0] == 0.0
-    assert np.all(np.isneginf(model.log_prior[1:]))
-    assert model.policy(np.ones((15, 1))).shape == (15, 1)
 
 
 def test_deterministic_policy():

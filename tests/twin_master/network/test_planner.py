@@ -71,22 +71,26 @@ def test_ties_go_to_the_first_control():
     assert np.all(value_iteration(transition, np.zeros((7, 3)), 0.9).control_index == 0)
 
 
-def test_bad_problems_are_refused():
-    transition, reward = random_problem(0)
-    with pytest.raises(PlanningError, match="rewards of shape"):
-        value_iteration(transition, reward.T, 0.6)
-    for discount in (1.0, -0.1, np.nan):
-        with pytest.raises(PlanningError, match=r"discount factor in \[0, 1\)"):
-            value_iteration(transition, reward, discount)
-    with pytest.raises(PlanningError, match="after 3 sweeps"):
-        value_iteration(transition, reward, 0.9, max_iterations=3)
-    with pytest.raises(InvalidDistributionError, match="does not sum to one"):
-        value_iteration(transition * 0.95, reward, 0.6)
-    with pytest.raises(PlanningError, match="expected a policy of shape"):
-        evaluate_policy(transition, reward, 0.6, np.ones((7, 1)))
-    reward[2, 1] = np.nan
-    with pytest.raises(PlanningError, match=r"\(2, 1\) is nan"):
-        value_iteration(transition, reward, 0.6)
+MOVES, REWARD = random_problem(0)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: value_iteration(MOVES, REWARD.T, 0.6), "rewards of shape"),
+        *(
+            (lambda bad=bad: value_iteration(MOVES, REWARD, bad), r"discount factor in \[0, 1\)")
+            for bad in (1.0, -0.1, np.nan)
+        ),
+        (lambda: value_iteration(MOVES, REWARD, 0.9, max_iterations=3), "after 3 sweeps"),
+        (lambda: value_iteration(MOVES * 0.95, REWARD, 0.6), "does not sum to one"),
+        (lambda: evaluate_policy(MOVES, REWARD, 0.6, np.ones((7, 1))), "expected a policy of shape"),
+        (lambda: value_iteration(MOVES, np.full((7, 3), np.nan), 0.6), r"\(0, 0\) is nan"),
+    ],
+)
+def test_bad_problems_are_refused(make, sentence):
+    with pytest.raises((PlanningError, InvalidDistributionError), match=sentence):
+        make()
 
 
 @pytest.mark.skipif(not LIBRARY.exists(), reason="the authors' strain library is not on this machine")

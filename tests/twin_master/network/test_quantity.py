@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from twin_master.errors import InvalidDistributionError, InvalidModelError
-from twin_master.network.inference import known_control
 from twin_master.network.quantity import QuantityModel
 
 
@@ -58,13 +57,6 @@ def test_quantiles_are_those_of_the_mixture(seed, ties):
                 assert result[b, i, g] == expected
 
 
-def test_without_spread_every_quantile_is_the_value():
-    model = QuantityModel(np.full((1, 2, 1, 3), 7.0))
-    joint = known_control([0.5, 0.5], 0, 1)
-    np.testing.assert_array_equal(model.quantiles(joint, [0.025, 0.975]), 7.0)
-    np.testing.assert_array_equal(model.moments(joint)[1], 0.0)
-
-
 def test_leading_axes_are_kept():
     values, weight, joint = random_case(1)
     model = QuantityModel(values, weight)
@@ -74,17 +66,6 @@ def test_leading_axes_are_kept():
     np.testing.assert_array_equal(mean.reshape(6, 5), model.moments(joint[:6])[0])
     assert model.quantiles(nested, [0.5]).shape == (2, 3, 1, 5)
     assert model.quantiles(joint[0], [0.5]).shape == (1, 5)
-
-
-def test_uncertainty_comes_from_state_control_and_draws():
-    values = np.array([[[[1.0], [10.0]], [[2.0], [20.0]]], [[[3.0], [30.0]], [[4.0], [40.0]]]])
-    model = QuantityModel(values)
-    certain, _ = model.moments(known_control([1.0, 0.0], 0, 2)), None
-    assert certain[0] == pytest.approx(2.0)
-    assert certain[1] == pytest.approx(1.0)  # from the draws alone
-    both = model.moments(np.full((2, 2), 0.25))
-    assert both[0] == pytest.approx(np.mean(values))
-    assert both[1] == pytest.approx(np.std(values))
 
 
 def test_bad_input_is_refused():

@@ -24,41 +24,6 @@ def random_case(seed, spread=1.0):
     return rng, values, weight, deviation, observation
 
 
-@settings(deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    spread=st.sampled_from([1.0, 50.0, 1e4]),
-    lost=st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS),
-    control=st.integers(0, CONTROLS - 1),
-)
-def test_likelihood_is_the_integral_and_eq_32_its_approximation(seed, spread, lost, control):
-    _, values, weight, deviation, observation = random_case(seed, spread)
-    observation[lost] = np.nan
-    log_density = norm.logpdf(observation, values[:, :, control], deviation)  # (E, S, G)
-    seen = ~np.isnan(observation)
-    outside = logsumexp(log_density[..., seen].sum(axis=2), b=weight[:, None], axis=0)
-    inside = logsumexp(log_density[..., seen], b=weight[:, None, None], axis=0).sum(axis=1)
-    model = GaussianSensorModel(values, deviation, weight)
-    printed = GaussianSensorModel(values, deviation, weight, average="inside")
-    if not seen.any():
-        outside = inside = np.zeros(STATES)
-    np.testing.assert_allclose(model.log_likelihood(observation, control), outside, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(printed.log_likelihood(observation, control), inside, rtol=1e-12, atol=1e-12)
-
-
-def test_both_averages_agree_for_one_draw_and_one_sensor():
-    _, values, weight, deviation, observation = random_case(1)
-    for chosen, share in ((values[:1], None), (values[..., :1], weight)):
-        sensors = chosen.shape[-1]
-        pair = [
-            GaussianSensorModel(chosen, deviation[:sensors], share, average=average).log_likelihood(
-                observation[:sensors], 1
-            )
-            for average in ("outside", "inside")
-        ]
-        np.testing.assert_allclose(pair[0], pair[1], rtol=1e-13)
-
-
 def test_a_sequence_is_its_steps():
     rng, values, weight, deviation, _ = random_case(2)
     observations = rng.normal(size=(9, SENSORS))
@@ -71,16 +36,12 @@ def test_a_sequence_is_its_steps():
         np.testing.assert_array_equal(rows[t], model.log_likelihood(observations[t], int(control[t])))
 
 
-def test_when_all_sensors_are_lost_the_step_is_flagged_and_says_nothing():
+def test_sensors_that_are_received_are_counted():
     _, values, weight, deviation, observation = random_case(3)
     model = GaussianSensorModel(values, deviation, weight)
+    partly = np.where(np.arange(SENSORS) < 2, np.nan, observation)
     lost = np.full(SENSORS, np.nan)
-    assert np.all(model.log_likelihood(lost, 0) == 0.0)
-    partly = observation.copy()
-    partly[:2] = np.nan
-    np.testing.assert_array_equal(
-        model.observed_count([lost, observation, partly]), [0, SENSORS, SENSORS - 2]
-    )
+    assert model.observed_count([lost, observation, partly]).tolist() == [0, SENSORS, SENSORS - 2]
 
 
 def test_far_observations_stay_comparable_and_beyond_double_precision_they_are_impossible():
@@ -91,24 +52,18 @@ def test_far_observations_stay_comparable_and_beyond_double_precision_they_are_i
     assert np.all(np.isneginf(model.log_likelihood([1e200], 0)))
 
 
-def test_one_standard_deviation_for_all_sensors():
-    _, values, weight, _, observation = random_case(4)
-    one = GaussianSensorModel(values, 0.7, weight)
-    each = GaussianSensorModel(values, np.full(SENSORS, 0.7), weight)
-    np.testing.assert_array_equal(one.log_likelihood(observation, 0), each.log_likelihood(observation, 0))
-    np.testing.assert_array_equal(one.standard_deviation, np.full(SENSORS, 0.7))
-
-
-def test_predictive_check_of_a_model_that_holds():
+@pytest.mark.parametrize("error", [0.0, 0.4])
+def test_predictive_check_of_a_model_that_holds(error):
     """Observations drawn from the model: uniform transforms, unit residuals, coverage as stated."""
     rng, values, weight, deviation, _ = random_case(5)
-    model = GaussianSensorModel(values, deviation, weight)
+    model = GaussianSensorModel(values, deviation, weight, model_error=error)
     steps = 4000
     belief = rng.dirichlet(np.ones(STATES))
-    draw = rng.choice(DRAWS, steps, p=weight)
-    state = rng.choice(STATES, steps, p=belief)
-    observations = values[draw, state, 1] + rng.normal(size=(steps, SENSORS)) * deviation
-    check = model.predictive_check(known_control(np.tile(belief, (steps, 1)), 1, CONTROLS), observations)
+    draw, state = rng.choice(DRAWS, steps, p=weight), rng.choice(STATES, steps, p=belief)
+    noise = rng.normal(size=(steps, SENSORS)) * model.total_standard_deviation[state, 1]
+    check = model.predictive_check(
+        known_control(np.tile(belief, (steps, 1)), 1, CONTROLS), values[draw, state, 1] + noise
+    )
     for sensor in range(SENSORS):
         assert kstest(check.probability_integral_transform[:, sensor], "uniform").pvalue > 1e-3
     np.testing.assert_allclose(check.residual.mean(axis=0), 0.0, atol=0.08)
@@ -120,40 +75,43 @@ def test_predictive_check_of_a_model_that_holds():
 @settings(deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
+    spread=st.sampled_from([1.0, 50.0, 1e4]),
+    relative=st.sampled_from([0.0, 0.5]),
     lost=st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS),
-    average=st.sampled_from(["outside", "inside"]),
+    control=st.integers(0, CONTROLS - 1),
 )
-def test_a_model_error_widens_each_density_by_a_share_of_the_prediction(seed, lost, average):
-    rng, values, weight, deviation, observation = random_case(seed)
+def test_likelihood_is_the_integral_and_eq_32_its_approximation(seed, spread, relative, lost, control):
+    """With a model error, which widens each density by a share of the prediction, and without."""
+    rng, values, weight, deviation, observation = random_case(seed, spread)
     observation[lost] = np.nan
-    error = rng.uniform(0.0, 0.5, SENSORS)
+    error = relative * rng.uniform(0.0, 1.0, SENSORS)
     mean = np.einsum("e,esug->sug", weight, values)
     total = np.sqrt(deviation**2 + (error * mean) ** 2)
-    model = GaussianSensorModel(values, deviation, weight, average, model_error=error)
-    np.testing.assert_allclose(model.total_standard_deviation, total, rtol=1e-13)
     seen = ~np.isnan(observation)
-    density = norm.logpdf(observation, values[:, :, 1], total[:, 1])[..., seen]  # (E, S, G)
-    if average == "outside":
-        expected = logsumexp(density.sum(axis=2), b=weight[:, None], axis=0)
-    else:
-        expected = logsumexp(density, b=weight[:, None, None], axis=0).sum(axis=1)
-    if not seen.any():
-        expected = np.zeros(STATES)
-    np.testing.assert_allclose(model.log_likelihood(observation, 1), expected, rtol=1e-12, atol=1e-12)
+    density = norm.logpdf(observation, values[:, :, control], total[:, control])[..., seen]  # (E, S, G)
+    expected = {
+        "outside": logsumexp(density.sum(axis=2), b=weight[:, None], axis=0),
+        "inside": logsumexp(density, b=weight[:, None, None], axis=0).sum(axis=1),
+    }
+    for average, wanted in expected.items():
+        model = GaussianSensorModel(values, deviation, weight, average, model_error=error)
+        np.testing.assert_allclose(model.total_standard_deviation, total, rtol=1e-13)
+        wanted = wanted if seen.any() else np.zeros(STATES)
+        np.testing.assert_allclose(model.log_likelihood(observation, control), wanted, rtol=1e-12, atol=1e-12)
     joint = rng.dirichlet(np.ones(STATES * CONTROLS), 3).reshape(3, STATES, CONTROLS)
     noise = np.sqrt(np.einsum("bsu,sug->bg", joint, total**2))
     np.testing.assert_allclose(model.noise(joint), noise, rtol=1e-13)
 
 
-def test_no_model_error_changes_not_a_bit():
-    _, values, weight, deviation, observation = random_case(9)
-    without = GaussianSensorModel(values, deviation, weight)
-    zero = GaussianSensorModel(values, deviation, weight, model_error=np.zeros(SENSORS))
-    np.testing.assert_array_equal(zero.log_likelihood(observation, 0), without.log_likelihood(observation, 0))
-    one = GaussianSensorModel(values, deviation, weight, model_error=0.1)
-    each = GaussianSensorModel(values, deviation, weight, model_error=np.full(SENSORS, 0.1))
+@pytest.mark.parametrize(("deviation", "error"), [(0.7, 0.0), (0.7, 0.1)])
+def test_one_number_stands_for_all_sensors(deviation, error):
+    _, values, weight, _, observation = random_case(9)
+    one = GaussianSensorModel(values, deviation, weight, model_error=error)
+    given = {"model_error": np.full(SENSORS, error)} if error else {}
+    each = GaussianSensorModel(values, np.full(SENSORS, deviation), weight, **given)
     np.testing.assert_array_equal(one.log_likelihood(observation, 0), each.log_likelihood(observation, 0))
-    np.testing.assert_array_equal(one.model_error, np.full(SENSORS, 0.1))
+    np.testing.assert_array_equal(one.standard_deviation, np.full(SENSORS, deviation))
+    np.testing.assert_array_equal(one.model_error, np.full(SENSORS, error))
 
 
 @settings(deadline=None)
@@ -217,20 +175,6 @@ def test_an_absurd_observation_is_impossible_within_an_interval_too():
         GaussianSensorModel(np.zeros((1, 2, 1, 1)), 1.0, interval=interval[..., 0])
 
 
-def test_predictive_check_of_a_model_with_the_error_that_it_assumes():
-    rng, values, weight, deviation, _ = random_case(8)
-    model = GaussianSensorModel(values, deviation, weight, model_error=0.4)
-    steps = 4000
-    belief = rng.dirichlet(np.ones(STATES))
-    draw, state = rng.choice(DRAWS, steps, p=weight), rng.choice(STATES, steps, p=belief)
-    total = model.total_standard_deviation[state, 1]
-    observations = values[draw, state, 1] + rng.normal(size=(steps, SENSORS)) * total
-    check = model.predictive_check(known_control(np.tile(belief, (steps, 1)), 1, CONTROLS), observations)
-    for sensor in range(SENSORS):
-        assert kstest(check.probability_integral_transform[:, sensor], "uniform").pvalue > 1e-3
-    np.testing.assert_allclose(check.residual.std(axis=0), 1.0, atol=0.05)
-
-
 def test_predictive_check_leaves_lost_sensors_out():
     _, values, weight, deviation, observation = random_case(6)
     observation[2] = np.nan
@@ -244,26 +188,24 @@ def test_predictive_check_leaves_lost_sensors_out():
     assert np.all(np.isfinite(np.delete(check.residual, 2)))
 
 
-def test_bad_input_is_refused():
-    _, values, weight, deviation, observation = random_case(7)
-    model = GaussianSensorModel(values, deviation, weight)
-    for bad in (0.0, -1.0, np.nan, np.ones(SENSORS + 1), np.r_[deviation[:-1], np.inf]):
-        with pytest.raises(InvalidModelError, match="positive noise standard deviation"):
-            GaussianSensorModel(values, bad, weight)
-    for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1)):
-        with pytest.raises(InvalidModelError, match="relative model error"):
-            GaussianSensorModel(values, deviation, weight, model_error=bad)
-    with pytest.raises(InvalidModelError, match="'outside' or 'inside'"):
-        GaussianSensorModel(values, deviation, weight, average="both")
-    with pytest.raises(InvalidObservationError, match=f"expected {SENSORS} sensor values"):
-        model.log_likelihood(observation[:-1], 0)
-    observation[3] = -np.inf
-    with pytest.raises(InvalidObservationError, match=r"\(3,\) is infinite"):
-        model.log_likelihood(observation, 0)
-    observation[3] = 0.0
-    with pytest.raises(InvalidModelError, match="control indices between 0 and 1"):
-        model.log_likelihood(observation, 2)
-    with pytest.raises(InvalidModelError, match=r"\(steps, sensors\)"):
-        model.log_likelihood_sequence(observation[None], [0, 1])
-    with pytest.raises(InvalidModelError, match="one belief for each observation"):
-        model.predictive_check(known_control(np.full(STATES, 0.25), 0, CONTROLS), observation[None])
+_, VALUES, WEIGHT, DEVIATION, OBSERVATION = random_case(7)
+HOLDING = GaussianSensorModel(VALUES, DEVIATION, WEIGHT)
+UNIFORM = known_control(np.full(STATES, 0.25), 0, CONTROLS)
+REFUSED = [
+    *((lambda bad=bad: GaussianSensorModel(VALUES, bad, WEIGHT), "positive noise standard deviation")
+      for bad in (0.0, -1.0, np.nan, np.ones(SENSORS + 1), np.r_[DEVIATION[:-1], np.inf])),
+    *((lambda bad=bad: GaussianSensorModel(VALUES, 1.0, WEIGHT, model_error=bad), "relative model error")
+      for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1))),
+    (lambda: GaussianSensorModel(VALUES, DEVIATION, WEIGHT, average="both"), "'outside' or 'inside'"),
+    (lambda: HOLDING.log_likelihood(OBSERVATION[:-1], 0), f"expected {SENSORS} sensor values"),
+    (lambda: HOLDING.log_likelihood(np.r_[OBSERVATION[:3], -np.inf, 0.0, 0.0], 0), r"\(3,\) is infinite"),
+    (lambda: HOLDING.log_likelihood(OBSERVATION, 2), "control indices between 0 and 1"),
+    (lambda: HOLDING.log_likelihood_sequence(OBSERVATION[None], [0, 1]), r"\(steps, sensors\)"),
+    (lambda: HOLDING.predictive_check(UNIFORM, OBSERVATION[None]), "one belief for each observation"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "sentence"), REFUSED)
+def test_bad_input_is_refused(make, sentence):
+    with pytest.raises((InvalidModelError, InvalidObservationError), match=sentence):
+        make()

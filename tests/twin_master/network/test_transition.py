@@ -115,18 +115,6 @@ def test_prediction_and_plan_follow():
     np.testing.assert_allclose(one.action_value, other.action_value, rtol=1e-11)
 
 
-def test_row_forward_and_expected_are_those_of_the_table():
-    rng = np.random.default_rng(6)
-    product, table = both(rng)
-    matrix = table.transition.matrix
-    for state in (0, 7, 23):
-        np.testing.assert_allclose(product.transition.row(1, state), matrix[1, state], rtol=1e-14)
-        np.testing.assert_array_equal(table.transition.row(1, state), matrix[1, state])
-    vector = rng.normal(size=24)
-    np.testing.assert_allclose(product.transition.forward(0, vector), vector @ matrix[0], rtol=1e-12)
-    np.testing.assert_allclose(product.transition.expected(0, vector), matrix[0] @ vector, rtol=1e-12)
-
-
 def test_factors_share_a_table_where_that_is_small_and_blocks_where_it_costs_no_more(monkeypatch):
     worse = worsening_table(5, 0.1)
     sizes = {

@@ -21,7 +21,7 @@ from twin_master.scenario.schema import Reference
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import groups_of, tables_of
 from twin_master.store.summary import Figure, control_changes, filtered_rms_error, find_fallback, summarise
-from twin_master.store.writing import read_run, store_mission, write_run, write_summary
+from twin_master.store.writing import read_run, write_run, write_summary
 
 
 @pytest.fixture(scope="module")
@@ -93,15 +93,6 @@ def test_tables_are_in_the_units_of_their_headers(result: MissionResult) -> None
     decisions = list(csv.DictReader(tables["decisions"].splitlines()))
     assert decisions[0]["control"] == "3g"
     assert decisions[36]["error_reward"] == ""
-
-
-def test_the_store_calls_the_writer_of_the_field(result: MissionResult, tmp_path: Path) -> None:
-    asked: list[Path] = []
-    store_mission(tmp_path, result, {}, asked.append)
-    assert asked == [tmp_path / "wing.vtu"]
-    assert sorted(path.name for path in (tmp_path / "csv").iterdir()) == [
-        "decisions.csv", "estimated.csv", "health.csv", "observed.csv", "policy.csv", "true.csv",
-    ]  # fmt: skip
 
 
 def test_summary_keeps_each_figure_beside_its_reference(tmp_path: Path) -> None:
@@ -195,9 +186,7 @@ def test_every_figure_is_one_that_a_reference_can_name(each: MissionResult) -> N
     assert tuple(figure.key for figure in figures) == each.scenario.figure_names
 
 
-def test_figures_stand_beside_the_references_of_the_scenario(
-    each: MissionResult,
-) -> None:
+def test_figures_stand_beside_the_references_of_the_scenario(each: MissionResult) -> None:
     references = (
         Reference(figure="fallback_delay", value="1 or 2", source="somewhere"),
         Reference(figure="mean_reward_error", value=-0.4, source="elsewhere"),

@@ -75,11 +75,6 @@ def moved(path: Path) -> None:
     path.rename(path.parent / "old" / "log")
 
 
-def copied(path: Path) -> None:
-    shutil.copy(path, path.with_name(f"{path.name}.1"))
-    os.truncate(path, 0)
-
-
 ROTATIONS: dict[str, Rotation] = {
     "create": logrotate("create"),
     "dated": dated,
@@ -87,7 +82,6 @@ ROTATIONS: dict[str, Rotation] = {
     "copytruncate": logrotate("copytruncate"),
     "python": renamed,
     "moved": moved,
-    "copied": copied,
 }
 
 
@@ -97,13 +91,29 @@ def new(messages: Iterator[tuple[Message | Refused | None, str]]) -> list[int | 
     return [fed.turn if isinstance(fed, Message) and fed.turn is not None else text for fed, text in came]
 
 
+Feeding = Iterator[tuple[Message | Refused | None, str]]
+Begun = Callable[..., tuple[Path, Feeding]]
+
+
+@pytest.fixture
+def begun_log(base: Watch, tmp_path: Path) -> Begun:
+    """What begins a log with some turns, and reads them."""
+
+    def begin(*turns: int) -> tuple[Path, Feeding]:
+        path = tmp_path / "log.csv"
+        path.write_text(HEADER + "".join(map(row, turns)))
+        messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+        assert new(messages) == [*turns]
+        return path, messages
+
+    return begin
+
+
 @pytest.mark.parametrize("header", [HEADER, ""], ids=["header", "no header"])
 @pytest.mark.parametrize("rotation", ROTATIONS)
-def test_no_row_is_lost_in_a_rotation(base: Watch, tmp_path: Path, rotation: str, header: str) -> None:
-    path, rotate, cut = tmp_path / "log.csv", ROTATIONS[rotation], rotation in ("copytruncate", "copied")
-    path.write_text(HEADER + row(0) + row(1))
-    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
-    assert new(messages) == [0, 1]
+def test_no_row_is_lost_in_a_rotation(begun_log: Begun, rotation: str, header: str) -> None:
+    rotate, cut = ROTATIONS[rotation], rotation == "copytruncate"
+    path, messages = begun_log(0, 1)
     append(path, row(2) + row(3)[:4])  # not read before it is rotated
     if cut:
         rotate(path)
@@ -122,24 +132,10 @@ def test_no_row_is_lost_in_a_rotation(base: Watch, tmp_path: Path, rotation: str
         assert new(messages) == [turn, turn + 1]
 
 
-def test_several_rotations_between_two_looks(base: Watch, tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text(HEADER + row(0))
-    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
-    assert new(messages) == [0]
-    for turn in (1, 2, 3):
-        append(path, row(turn))
-        renamed(path)
-    append(path, HEADER.replace("strain_1,strain_2", "strain_2,strain_1") + row(4))
-    assert new(messages) == [1, 2, 3, 4]
-
-
 @pytest.mark.parametrize("way", ["logging", "copytruncate"])
-def test_a_writer_that_does_not_wait_for_its_reader(base: Watch, tmp_path: Path, way: str) -> None:
-    path, turns = tmp_path / "log.csv", 4000
-    path.write_text(HEADER)
+def test_a_writer_that_does_not_wait_for_its_reader(begun_log: Begun, way: str) -> None:
+    (path, messages), turns = begun_log(), 4000
     handler = RotatingFileHandler(path, maxBytes=2000 if way == "logging" else 0, backupCount=1000)
-    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
 
     def write() -> None:
         for turn in range(turns):
@@ -155,27 +151,24 @@ def test_a_writer_that_does_not_wait_for_its_reader(base: Watch, tmp_path: Path,
         found += new(messages)
     writer.join()
     assert found + new(messages) == list(range(turns))
-    assert len(list(tmp_path.glob("log.csv.*"))) >= (30 if way == "logging" else 8)
+    assert len(list(path.parent.glob("log.csv.*"))) >= (30 if way == "logging" else 8)
 
 
-def test_columns_of_a_new_file_are_read_again(base: Watch, tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text(HEADER + row(0))
-    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
-    assert new(messages) == [0]
-    renamed(path)
-    append(path, "strain_2,step\n1e-4,1\n")
-    message, _ = next(messages)
+def test_columns_of_a_new_file_are_read_again(begun_log: Begun) -> None:
+    """Also behind several rotations between two looks."""
+    path, messages = begun_log(0)
+    for turn in (1, 2, 3):
+        append(path, row(turn))
+        renamed(path)
+    append(path, "strain_2,step\n1e-4,4\n")
+    *turns, message = (next(messages)[0] for _ in range(4))
     assert isinstance(message, Message)
-    assert (message.turn, message.observed[1], np.isnan(message.observed[0])) == (1, 1e-4, True)
+    assert (message.turn, message.observed[1], np.isnan(message.observed[0])) == (4, 1e-4, True)
+    assert [told.turn for told in turns if isinstance(told, Message)] == [1, 2, 3]
 
 
-def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file(
-    base: Watch, tmp_path: Path
-) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text(HEADER)
-    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file(begun_log: Begun) -> None:
+    path, messages = begun_log()
     for character in row(0)[:-1]:
         append(path, character)
         assert new(messages) == []
@@ -186,11 +179,8 @@ def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file
     assert new(messages) == ["1,2e", 1, 2]
 
 
-def test_a_cut_without_a_copy_is_told(base: Watch, tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text(HEADER + row(0) + row(1))
-    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
-    assert new(messages) == [0, 1]
+def test_a_cut_without_a_copy_is_told(begun_log: Begun) -> None:
+    path, messages = begun_log(0, 1)
     size = path.stat().st_size
     path.write_text(HEADER + "".join(map(row, range(2, 9))))  # longer than before: it is known by its rows
     refused, _ = next(messages)
@@ -201,14 +191,12 @@ def test_a_cut_without_a_copy_is_told(base: Watch, tmp_path: Path) -> None:
     assert new(messages) == list(range(2, 9))
 
 
-def test_a_copy_in_the_place_of_a_log_is_read_on(base: Watch, tmp_path: Path) -> None:
+def test_a_copy_in_the_place_of_a_log_is_read_on(begun_log: Begun) -> None:
     """As rsync does it: another file, which begins with the same rows."""
-    path = tmp_path / "log.csv"
-    path.write_text(HEADER + row(0) + row(1))
-    messages = CsvFeed(path, base.scenario, follow=True).messages(None)
-    assert new(messages) == [0, 1]
-    (tmp_path / "fresh").write_text(path.read_text() + row(2))
-    (tmp_path / "fresh").rename(path)
+    path, messages = begun_log(0, 1)
+    fresh = path.with_name("fresh")
+    fresh.write_text(path.read_text() + row(2))
+    fresh.rename(path)
     assert new(messages) == [2]
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 import json
 import random
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -100,7 +100,7 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
 @pytest.mark.parametrize(
     ("sent", "reason"),
     [
-        ({"turn": 5, "strain": [1e-4] * 24}, "contradicts what was received of turn 5"),
+        ({"turn": 55, "strain": [1e-4] * 24}, "contradicts what was received of turn 55"),
         ({"turn": 58, "control": "2g"}, "contradicts the control of turn 58"),
         ({"turn": 30}, "turn 30 is 29 turns late, and `watch.lag` is 20"),
         ({"turn": 10**9}, "ahead of the next one, 60, and `watch.longest_gap` is 30"),
@@ -121,9 +121,6 @@ def test_what_is_refused_changes_nothing(
     knowledge: Knowledge, strains: np.ndarray, tmp_path: Path, sent: dict[str, object], reason: str
 ) -> None:
     clean = [message(turn, row) for turn, row in enumerate(strains)]
-    if sent.get("turn") == 5:
-        sent = sent | {"turn": 55}
-        reason = reason.replace("turn 5", "turn 55")
     line = json.dumps(sent).encode() + b"\n"
     twin, intake = watched(knowledge, [*clean, line], tmp_path / "rejected.jsonl")
     assert same(twin, watched(knowledge, clean)[0])
@@ -176,18 +173,22 @@ def test_a_flood_and_messages_of_ten_megabytes_are_counted_and_forgotten(
     assert max(map(len, content)) < 1200
 
 
-def test_an_observation_that_no_state_allows_is_refused_and_its_turn_predicted_through(
-    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path
-) -> None:
-    noise = replace(
-        knowledge
-    )  # the likelihood of 0.4 underflows nowhere: a certain prior makes it impossible
-    twin, intake = watched(
-        noise, [message(0, strains[0]), message(1, np.full(24, 0.4)), message(2, strains[2])], tmp_path / "r"
-    )
-    assert twin.turns == 3
-    assert np.isfinite(twin.smoothed()).all()
-    assert intake.counts.received == 3
+@pytest.fixture(scope="module")
+def timed(knowledge: Knowledge) -> Knowledge:
+    """Of turns that are told by the clock."""
+    section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
+    return replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
+
+
+def at(time: float, row: np.ndarray) -> bytes:
+    return json.dumps({"time": time, "control": "3g", "strain": row.tolist()}).encode() + b"\n"
+
+
+def taken_up(knowledge: Knowledge, state: object, line: bytes) -> Intake:
+    feed = feeds.JsonLinesFeed(knowledge.scenario, io.BytesIO(line))
+    intake = Intake(knowledge.scenario, feed, RejectedFile(None))
+    intake.restore(json.loads(json.dumps(state)))
+    return intake
 
 
 @pytest.mark.parametrize(
@@ -199,62 +200,31 @@ def test_an_observation_that_no_state_allows_is_refused_and_its_turn_predicted_t
     ],
 )
 def test_a_clock_that_is_set_after_the_first_turn_spoils_none(
-    knowledge: Knowledge, strains: np.ndarray, times: list[float]
+    timed: Knowledge, strains: np.ndarray, times: list[float]
 ) -> None:
-    section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
-    timed = replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
-    lines = [
-        json.dumps({"time": time, "control": "3g", "strain": row.tolist()}).encode() + b"\n"
-        for time, row in zip(times, strains, strict=False)
-    ]
+    lines = [at(time, row) for time, row in zip(times, strains, strict=False)]
     twin, intake = watched(timed, lines)
     assert (twin.turns, intake.counts.rejected, intake.counts.missing) == (8, 0, 0)
-    clean = watched(timed, [message(turn, row) for turn, row in enumerate(strains[:8])])[0]
-    assert twin.save_state() == clean.save_state()
+    assert same(twin, watched(timed, [message(turn, row) for turn, row in enumerate(strains[:8])])[0])
     # Two turns have agreed about the time: another such clock is refused, also by a watch that is taken up.
-    wrong = json.dumps({"time": 9e9, "strain_1": 1e-4}).encode() + b"\n"
-    feed = feeds.JsonLinesFeed(timed.scenario, io.BytesIO(wrong))
-    again = Intake(timed.scenario, feed, RejectedFile(None))
-    again.restore(json.loads(json.dumps(intake.state())))
+    again = taken_up(timed, intake.state(), b'{"time": 9e9, "strain_1": 1e-4}\n')
     assert again.read(twin) is None
     assert again.counts.rejected == 1
-
-
-def test_a_watch_taken_up_after_its_first_turn_may_set_its_clock(
-    knowledge: Knowledge, strains: np.ndarray
-) -> None:
-    section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
-    timed = replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
-    lines = [
-        json.dumps({"time": time, "strain": row.tolist()}).encode() + b"\n"
-        for time, row in zip((0.0, 1.7e9), strains, strict=False)
-    ]
-    twin, intake = watched(timed, lines[:1])
-    again = Intake(
-        timed.scenario, feeds.JsonLinesFeed(timed.scenario, io.BytesIO(lines[1])), RejectedFile(None)
-    )
-    again.restore(json.loads(json.dumps(intake.state())))
-    reading = again.read(twin)
+    twin, intake = watched(timed, lines[:1])  # taken up after its first turn the clock may still be set
+    reading = taken_up(timed, intake.state(), lines[1]).read(twin)
     assert reading is not None
     assert reading.revises is None
     np.testing.assert_array_equal(reading.observed, strains[1])
 
 
-def test_times_stand_for_turns(knowledge: Knowledge, strains: np.ndarray) -> None:
-    section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
-    timed = replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
-    lines = []
-    for turn, row in enumerate(strains[:10]):
-        record = json.loads(message(turn, row))
-        del record["turn"]
-        lines.append(
-            json.dumps(record | {"time": 1.7e9 + 0.5 * turn + 0.1 * (turn % 3 - 1)}).encode() + b"\n"
-        )
-    twin, intake = watched(timed, [*lines[:4], *lines[5:]])
+def test_times_stand_for_turns(timed: Knowledge, strains: np.ndarray) -> None:
+    times = [1.7e9 + 0.5 * turn + 0.1 * (turn % 3 - 1) for turn in range(10)]
+    lines = [at(time, row) for time, row in zip(times, strains, strict=False)]
+    del lines[4]
+    twin, intake = watched(timed, lines)
     assert (twin.turns, intake.counts.missing) == (10, 1)
     np.testing.assert_array_equal(twin.observed(9), strains[9])
-    early = json.dumps({"time": 1.6e9, "strain_1": 1e-4}).encode() + b"\n"
-    endless = json.dumps({"time": 1.7e308, "strain_1": 1e-4}).encode() + b"\n"
+    early, endless = (b'{"time": %s, "strain_1": 1e-4}\n' % time for time in (b"1.6e9", b"1.7e308"))
     assert watched(timed, [*lines, early, endless])[1].counts.rejected == 2
 
 
@@ -288,10 +258,10 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
     rows[12] = "12,3g"
     path.write_text("﻿step,control," + names + "\r\n" + "\r\n".join(rows), encoding="utf-8")
 
-    def messages() -> Iterator[feeds.Fed]:
-        return feeds.CsvFeed(path, knowledge.scenario).messages(None)
+    def messages(place: Any = None) -> list[Message | Refused | None]:
+        return [fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(place)]
 
-    found = [fed[0] for fed in messages()]
+    found = messages()
     assert len(found) == TURNS
     refused = [turn for turn, fed in enumerate(found) if isinstance(fed, Refused)]
     assert refused == [11, 12]
@@ -304,22 +274,19 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
             np.testing.assert_allclose(fed.observed[~lost], strains[turn][~lost], rtol=1e-15)
     feed = feeds.CsvFeed(path, knowledge.scenario)
     assert len(list(islice(feed.messages(None), 50))) == 50
-    assert len(list(feeds.CsvFeed(path, knowledge.scenario).messages(feed.place))) == TURNS - 50
+    assert len(messages(feed.place)) == TURNS - 50
     path.write_text("time,strain_2,strain_1_microstrain\n0.5,0.6,5\n,1e-4,inf\n,nan,5\n", encoding="utf-8")
-    units, infinite, fine = (fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(None))
-    assert isinstance(units, Message)
-    assert isinstance(infinite, Message)
-    assert isinstance(fine, Message)
+    units, infinite, fine = (cast(Message, found) for found in messages())
     assert units.unreadable == {1: "0.6; give its unit, such as `strain_2_microstrain`"}
     assert (infinite.observed[1], infinite.unreadable) == (1e-4, {0: '"inf"'})
     np.testing.assert_allclose(fine.observed[:2], [5e-6, np.nan], rtol=1e-15)
     path.write_text("turn,_rain,strain_1\n12.0,wet,1e-4\n12.5,wet,1e-4\n", encoding="utf-8")
-    whole, half = (fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(None))
+    whole, half = messages()
     assert isinstance(whole, Message)
     assert (whole.turn, whole.observed[0]) == (12, 1e-4)
     assert "no number" in str(half)
     path.write_bytes(b'strain_1\n"' + b"x" * 200_000 + b'"\na\r"b\n\xff\n')
-    assert all(isinstance(fed[0], Refused) for fed in feeds.CsvFeed(path, knowledge.scenario).messages(None))
+    assert all(isinstance(found, Refused) for found in messages())
     for twice in ("strain_1,strain_1_1", "turn,step,strain_1"):
         path.write_text(f"{twice}\n", encoding="utf-8")
         with pytest.raises(Exception, match="two columns say the same"):

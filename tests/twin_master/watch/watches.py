@@ -104,8 +104,7 @@ class Mosquitto:
     def start(self) -> None:
         (self.folder / "mosquitto.conf").write_text("\n".join([*self.lines, *self.further, ""]))
         self.process = subprocess.Popen(
-            ["mosquitto", "-c", str(self.folder / "mosquitto.conf")],
-            stderr=subprocess.DEVNULL,
+            ["mosquitto", "-c", str(self.folder / "mosquitto.conf")], stderr=subprocess.DEVNULL
         )
         for _ in range(400):
             try:
