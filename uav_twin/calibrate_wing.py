@@ -80,7 +80,7 @@ def calibrate_wing(
     from calibration.dynamics.ringdown import Frequencies
     from calibration.paper.table_1 import HEADINGS
     from calibration.result.file import check_folder
-    from calibration.wing.calibrate import calibrate_wing as calibrate
+    from calibration.wing.calibrate import calibrate
     from calibration.wing.lab_data import Targets, published_data, read_lab_folder
     from calibration.wing.page import write_wing_folder
     from fe.wing.design import load_design

@@ -49,10 +49,10 @@ def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool
 
 def assembled_of_any(file: Path, memory_limit: float | None) -> "DesignedStructure":
     """Return the full model of a mesh or of matrices; `memory_limit` in GiB."""
-    from fe.structure.operators import load_any
+    from fe.structure.operators import assemble_structure
 
     with terminal.progress().stage("Reading and assembling"):
-        return load_any(located(file), _bytes(memory_limit))
+        return assemble_structure(located(file), _bytes(memory_limit))
 
 
 def reduced(file: Path, memory_limit: float | None) -> "ReducedModel":

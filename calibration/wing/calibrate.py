@@ -90,7 +90,7 @@ class WingCalibration:
         return save_calibration(self.result, path)
 
 
-def calibrate_wing(
+def calibrate(
     lab: LabData | str | Path | None = None,
     design: WingDesign | None = None,
     *,

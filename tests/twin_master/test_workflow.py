@@ -31,7 +31,8 @@ from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import lock_run_folder
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import RunOutcome
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 ROOT = Path(__file__).parents[2]
 SAME = ("run.nc", "config.json", "summary.json", "csv/health.csv", "csv/observed.csv", "csv/decisions.csv")

@@ -39,7 +39,8 @@ from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 from uav_twin import cli
 
 ROOT = Path(__file__).parents[3]

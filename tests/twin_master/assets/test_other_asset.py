@@ -18,7 +18,8 @@ from twin_master.assets.resolution import Overrides
 from twin_master.mission.loop import CheckpointFile
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 HERE = Path(__file__).with_name("heat_exchanger")
 

@@ -22,7 +22,8 @@ from fe.structure.operators import load_and_assemble
 from scenarios import scenario_files, structure_files
 from twin_master.errors import TwinMasterError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 PATH = scenario_files()["bracket"]
 

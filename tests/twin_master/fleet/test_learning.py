@@ -26,7 +26,8 @@ from twin_master.fleet.posterior import (
     refined,
     shared,
 )
-from twin_master.fleet.reading import attention, fleet_groups
+from twin_master.fleet.reading import attention
+from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import write_fleet_report
 from twin_master.mission.preparation import kept_knowledge
 from twin_master.network.inference import filter_sequence

@@ -23,7 +23,7 @@ from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.reading import load_scenario
 from twin_master.viewer.flight import Flight
 from twin_master.watch.replay import gap_of
-from twin_master.workflow import resume_run
+from twin_master.workflow import resume as resume_run
 from uav_twin.cli import app
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
