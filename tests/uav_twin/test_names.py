@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 import uav_twin
+from tests.conftest import synthetic_calibration
+from tests.discrepancy.rigs import measured
 from uav_twin import _HOMES
 
 ROOT = Path(__file__).parents[2]
@@ -94,6 +96,41 @@ def test_the_command_names_it_too(tmp_path: Path) -> None:
     assert found.stdout == ""
     assert found.stderr.count("\n") == 1
     assert f"{tmp_path / 'fe.py'} hides the package `fe` of uav-twin" in found.stderr
+
+
+def test_records_show_themselves_in_a_few_words(library_file: Path) -> None:
+    from calibration.wing.calibrate import WingCalibration
+    from discrepancy.models.fmu import FmuModel
+    from discrepancy.models.interface import Model
+    from discrepancy.models.wing import WingModel
+    from discrepancy.verdict import Verdict, VerdictKind
+    from discrepancy.workflow import Investigation
+
+    campaign, model = measured()
+    verdict = Verdict(VerdictKind.NOTHING_MISSING, "Nothing.", 0.9, 0.0)
+    wing = synthetic_calibration()
+    knowledge = uav_twin.prepare_twin("level_turns", {"strain_library": library_file})
+    shown: list[tuple[object, tuple[str, ...]]] = [
+        (campaign, (campaign.name, "trials=", "channels=")),
+        (model, ("LumpedModel", "parameters=")),
+        (verdict, ("nothing missing", "0.9")),
+        (Investigation(campaign, model, (), verdict), ("Verdict(", model.name)),
+        (wing, (wing.asset, "samples=40")),
+        (WingCalibration(wing, wing, "joint", *[None] * 4), ("Calibration(", "joint")),  # type: ignore[arg-type]
+        (uav_twin.load_scenario("level_turns"), ("level_turns.toml",)),
+        (knowledge, ("level_turns", "GraphicalModel(", "GaussianSensorModel(")),
+        (knowledge.model, ("states=", "controls=2 (2g, 3g)")),
+        (knowledge.sensor_model, ("draws=", "sensors=")),
+        (knowledge.twin(), ("turns=0", "GraphicalModel(")),
+    ]
+    for record, words in shown:
+        text = repr(record)
+        assert text.startswith(f"{type(record).__name__}(")
+        assert len(text) < 400
+        assert "array(" not in text
+        for word in words:
+            assert word in text, text
+    assert FmuModel.__repr__ is WingModel.__repr__ is Model.__repr__
 
 
 def test_a_model_from_tables_is_the_same_as_from_its_parts() -> None:
