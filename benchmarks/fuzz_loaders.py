@@ -38,7 +38,7 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.files.patch import read_patch
 from discrepancy.files.residuals import read_residuals
-from discrepancy.files.verdict import read_verdict
+from discrepancy.files.verdict import read_verdict_file
 from discrepancy.models.fmu_file import load_fmu_model
 from discrepancy.models.lumped import LumpedModel
 from fe.runtime.patch_arrays import PatchArrays
@@ -106,7 +106,7 @@ LOADERS: dict[str, Loader] = {
     "effects": Loader("effects.toml", lambda path: load_catalogue([path]), TEXT),
     "patch, analysis": Loader("verdict/patch.json", read_patch, TEXT),
     "patch, packing": Loader("verdict/patch.json", load_patch, TEXT),
-    "verdict": Loader("verdict/verdict.json", read_verdict, TEXT),
+    "verdict": Loader("verdict/verdict.json", read_verdict_file, TEXT),
     "residuals": Loader("verdict/residuals.nc", read_residuals, BINARY),
     "run, store": Loader("run/run.nc", lambda path: read_run(path.parent), BINARY),
     "run, report": Loader("run/run.nc", lambda path: read_record(path.parent), BINARY),

@@ -21,7 +21,7 @@ from discrepancy.files.patch import (
     write_patch,
 )
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
-from discrepancy.files.verdict import VERDICT_NAME, StoredVerdict, read_verdict
+from discrepancy.files.verdict import VERDICT_NAME, StoredVerdict, read_verdict_file
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
 from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
@@ -115,7 +115,7 @@ def apply_verdict(
     if file.suffix != ".json":
         restore_folder(file)
         file = file / VERDICT_NAME
-    stored = read_verdict(file)
+    stored = read_verdict_file(file)
     found = _found(stored, file, member)
     choice = model_of(stored.origin, file, progress)
     patch = changed(found, origin=stored.origin).upon(choice.built_in)

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from math import nan
 
+from reporting.words import brief
+
 from .document_types import Number, Patch
 
 
@@ -428,3 +430,7 @@ class Verdict:
     windows: tuple[GapWindow, ...] = ()
     parameters: tuple[CalibratedParameter, ...] = ()
     force: ForceAtPort | None = None
+
+    def __repr__(self) -> str:
+        effects = [effect.identifier for effect in self.effects]
+        return brief(self, kind=self.kind.value, probability=self.probability, effects=effects)

@@ -43,7 +43,7 @@ from discrepancy.sentences import said
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, SilentProgress
-from reporting.words import be, listing
+from reporting.words import be, brief, listing
 
 from .errors import CampaignDataError
 from .force_told import seen_force
@@ -105,6 +105,9 @@ class Investigation:
     fit: CandidateFit | None = None
     seconds: dict[str, float] | None = None
     missing: MissingForce | None = None
+
+    def __repr__(self) -> str:
+        return brief(self, campaign=self.campaign.name, model=self.model.name, verdict=self.verdict)
 
 
 def investigate(

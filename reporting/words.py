@@ -1,9 +1,12 @@
 """Numbers beside their nouns and their uncertainties, names of parameters, and reasons, for sentences."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from math import floor, isfinite, log10
 from typing import Any
+
+LONGEST_FACT = 60
+"""Letters of a fact that `brief` tells."""
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:
@@ -19,6 +22,25 @@ def counted(count: int, noun: str, plural: str | None = None) -> str:
         Of any other number; `noun` with an "s" if left out.
     """
     return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
+
+
+def brief(record: object, **facts: object) -> str:
+    """Return a record in one line, for `__repr__`: its class, and facts by name.
+
+    Long text is cut; of a collection of names its length and the first three are told.
+    """
+    return f"{type(record).__name__}({', '.join(f'{name}={_short(fact)}' for name, fact in facts.items())})"
+
+
+def _short(fact: object) -> str:
+    if isinstance(fact, float):
+        return f"{fact:.4g}"
+    if isinstance(fact, Mapping | list | tuple):
+        first = [_short(item) for item in list(fact)[:3]] + ["..."] * (len(fact) > 3)
+        return f"{len(fact)} ({', '.join(first)})" if first else "none"
+    if isinstance(fact, str) and len(fact) > LONGEST_FACT:
+        return f"{fact[: LONGEST_FACT - 3]}..."
+    return str(fact)
 
 
 def be(count: int) -> str:

@@ -92,9 +92,9 @@ def run(
     policy: Policy = None,
 ) -> None:
     """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
+    from twin_master import workflow
     from twin_master.assets.resolution import Overrides
     from twin_master.scenario.reading import load_scenario
-    from twin_master.workflow import new_run, resume_run
 
     scenario, ssp = _flown(scenario, with_scenario)
     overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt)
@@ -116,12 +116,12 @@ def run(
                 "a run is continued with what its folder holds: give nothing beside it that would change it.",
                 param_hint="--resume",
             )
-        folder, fly = resume, partial(resume_run, resume, loaded)
+        folder, fly = resume, partial(workflow.resume, resume, loaded)
     else:
         if loaded is None:
             raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
-        fly = partial(new_run, loaded, folder, overrides, policy=policy, replace=replace)
+        fly = partial(workflow.fly, loaded, folder, overrides, policy=policy, replace=replace)
     with shown(view) as begun:
         outcome = _interruptible(lambda: fly(begun=begun, **told), folder)
         if json:

@@ -19,8 +19,8 @@ from twin_master.assets.asset_source import AssetSource, calibrated_with
 from twin_master.assets.mismatch import Misfit, find_misfit
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import NotResumableError
+from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.loop import CheckpointFile, fly
 from twin_master.mission.opening import begin_folder, file_record, restore, resume_folder
 from twin_master.mission.planning import read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
@@ -56,7 +56,7 @@ class _Clock:
         self.stages[name] = time.perf_counter() - begin
 
 
-def new_run(
+def fly(
     scenario: LoadedScenario | str | Path,
     folder: Path | str | None = None,
     overrides: Overrides | Mapping[str, Any] | None = None,
@@ -125,7 +125,7 @@ def _policy_file(policy: ArrayLike | BeliefPolicy | Path, scenario: Scenario) ->
     return kept.getvalue()
 
 
-def resume_run(
+def resume(
     folder: Path | str,
     loaded: LoadedScenario | None = None,
     *,
@@ -292,8 +292,8 @@ def _fly(
     truth = knowledge.truth(scenario.mission.seed)
     asset = source.open()
     try:
-        with CheckpointFile(folder, hash_record(config)) as kept:
-            flight = fly(
+        with loop.CheckpointFile(folder, hash_record(config)) as kept:
+            flight = loop.fly(
                 scenario,
                 knowledge.twin(),
                 knowledge.plant(truth, asset),

@@ -1,12 +1,221 @@
-"""`uav-twin calibrate ...`."""
+"""`uav-twin calibrate`, all three steps of a wing in order, and `calibrate campaign`: any model."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from uav_twin import calibrate_campaign, calibrate_ringdown, calibrate_simulate
-from uav_twin.calibrate_wing import calibrate_wing
+from reporting import terminal
+from uav_twin.calibrate_laboratory import calibrate_ringdown, calibrate_simulate
+
+if TYPE_CHECKING:
+    from calibration.result.record import Calibration
+
+
+def calibrate_campaign(
+    campaign: Annotated[Path, typer.Argument(help="Folder with campaign.toml.", show_default=False)],
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="The model file of an FMU or a structure, a lumped model, a wing design: as of `discrepancy "
+            "run`.",
+            show_default="the shipped wing",
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for calibration.nc and report.")] = None,
+    asset: Annotated[
+        str | None, typer.Option(help="Name of what was measured.", show_default="that of the campaign")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=100, max=100_000, help="Samples that are kept.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all samples.")] = 0,
+    json: terminal.Json = False,
+    no_report: terminal.NoReport = False,
+) -> None:
+    """Posterior of the parameters of any model, an FMU or a structure too, from a campaign."""
+    from calibration.result.file import check_folder
+    from calibration.result.folder import write_calibration_folder
+    from calibration.result.record import check_name
+    from discrepancy.campaign.reading import read_campaign
+    from discrepancy.model_choice import choose_model
+    from discrepancy.parameters.calibration import calibrate_parameters
+    from uav_twin.discrepancy_run import one_thread
+
+    one_thread()
+    data = read_campaign(campaign)
+    name = check_name(data.name if asset is None else asset)
+    if out is not None:
+        check_folder(out, name, wing=False)
+    progress = terminal.progress()
+    choice = choose_model(model, progress)
+    result = calibrate_parameters(data, choice, asset=name, samples=samples, seed=seed, progress=progress)
+    written = None if out is None else write_calibration_folder(result, out, progress, report=not no_report)
+    show(result, written, json=json, report=not no_report)
+
+
+def show(result: "Calibration", written: Path | None, *, json: bool, report: bool) -> None:
+    """Say what a calibration found, and where it was written."""
+    if json:
+        terminal.print_json({"calibration": None if written is None else str(written)} | _record(result))
+        return
+    _show(result)
+    if written is None:
+        terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
+        return
+    terminal.say(f"Calibration: {written}")
+    if report:
+        from calibration.result.folder import REPORT_NAME
+
+        terminal.say(f"Report: {written.with_name(REPORT_NAME)}")
+
+
+def _record(result: "Calibration") -> dict[str, Any]:
+    """Return the calibration as plain data."""
+    from dataclasses import asdict
+
+    from reporting.record_json import plain
+
+    def posterior(name: str) -> dict[str, Any]:
+        return {
+            "posterior_mean": result.mean(name),
+            "posterior_deviation": result.standard_deviation(name),
+            "interval_90": list(result.interval(name)),
+        }
+
+    return {
+        "asset": result.asset,
+        "model": result.model,
+        "campaign" if result.design is None else "laboratory": result.source,
+        "procedure": result.procedure,
+        "explained": result.explained,
+        "seed": result.seed,
+        "parameters": [
+            asdict(prior) | posterior(prior.name) | {"prior_left": result.kept_share(prior.name)}
+            for prior in result.priors
+        ],
+        "quantities": [asdict(figure) | posterior(figure.name) for figure in result.quantities],
+        "correlation": result.correlation.tolist(),
+        "information_nat": result.information,
+        "readings": plain(result.readings),
+        "channels": plain(result.channels),
+        "findings": list(result.findings),
+    }
+
+
+def _show(result: "Calibration") -> None:
+    from calibration.result import text
+
+    def table(name: str, rows: "list[tuple[str, ...]]") -> None:
+        terminal.print_table(text.WORDS.headings(name), rows)
+
+    terminal.say(text.headline(result))
+    table("parameters", text.parameter_rows(result))
+    for line in text.correlation_lines(result):
+        terminal.say(line)
+    if result.readings:
+        table("readings", text.reading_rows(result))
+    table("channels", text.channel_rows(result))
+    for sentence in result.findings:
+        terminal.say(f"- {sentence}")
+
+
+class ProcedureName(StrEnum):
+    """Whose samples are kept."""
+
+    joint = "joint"
+    paper = "paper"
+
+
+Data = Annotated[
+    Path | None,
+    typer.Option(help="Lab folder with step1, step2, step3, or some of them; published figures otherwise."),
+]
+Out = Annotated[Path | None, typer.Option(help="Folder for calibration.nc, report, table and figures.")]
+Asset = Annotated[str | None, typer.Option(help="Name of this wing.", show_default="that of the design")]
+Procedure = Annotated[
+    ProcedureName,
+    typer.Option(help="Keep samples of the joint posterior, or of the paper's steps one after another."),
+]
+Design = Annotated[Path | None, typer.Option(help="The wing as drawn; the shipped design by default.")]
+Measured = Annotated[
+    bool | None,
+    typer.Option(
+        "--measured/--published",
+        help="Aim step 3 at the ring-down records of --data or at the published figures.",
+        show_default="measured where there are records",
+    ),
+]
+Fitted = Annotated[
+    bool,
+    typer.Option("--fitted", help="Fit the frequencies of the records too; spectral peaks by default."),
+]
+
+
+def calibrate_wing(
+    context: typer.Context,
+    data: Data = None,
+    out: Out = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all samples.")] = 0,
+    asset: Asset = None,
+    procedure: Procedure = ProcedureName.joint,
+    design: Design = None,
+    measured: Measured = None,
+    fitted: Fitted = False,
+    json: terminal.Json = False,
+    no_report: terminal.NoReport = False,
+) -> None:
+    """Tailor the model to one wing: planform, stiffness, masses and damping, in this order.
+
+    A lab folder may hold one step alone; the sub-commands fit ring-downs, make a lab folder of a virtual
+    wing, and calibrate any model from a campaign.
+    """
+    given = (data, out, asset, design, measured)
+    if context.invoked_subcommand is not None:
+        if (
+            any(value is not None for value in given)
+            or seed
+            or fitted
+            or no_report
+            or json
+            or procedure is not ProcedureName.joint
+        ):
+            raise typer.BadParameter(
+                f"options go behind the command: calibrate {context.invoked_subcommand} ..."
+            )
+        return
+    if measured and data is None:
+        raise typer.BadParameter("--measured needs --data with ring-down records.")
+    if fitted and (data is None or measured is False):
+        raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
+    from calibration.dynamics.ringdown import Frequencies
+    from calibration.paper.table_1 import HEADINGS
+    from calibration.result.file import check_folder
+    from calibration.wing.calibrate import calibrate
+    from calibration.wing.lab_data import Targets, published_data, read_lab_folder
+    from calibration.wing.page import write_wing_folder
+    from fe.wing.design import load_design
+
+    drawn = load_design(design)
+    name = drawn.name if asset is None else asset
+    if out is not None:
+        check_folder(out, name, wing=True)
+    targets: Targets | None = None if measured is None else "measured" if measured else "published"
+    frequencies = Frequencies.FITTED if fitted else Frequencies.PEAKS
+    lab = published_data() if data is None else read_lab_folder(data, targets, frequencies)
+    if not json:
+        for origin in lab.origins:
+            terminal.say(f"Step {origin.step}: {origin.text}.")
+    progress = terminal.progress()
+    calibration = calibrate(lab, drawn, asset=name, procedure=procedure.value, seed=seed, progress=progress)
+    if not json:
+        rows = [row.cells for row in calibration.table_1]
+        terminal.print_table(HEADINGS, rows)
+    written = None if out is None else write_wing_folder(calibration, out, progress, report=not no_report)
+    show(calibration.result, written, json=json, report=not no_report)
+
 
 calibrate_app = typer.Typer(no_args_is_help=False)
 calibrate_app.callback(invoke_without_command=True)(calibrate_wing)
-calibrate_app.command("ringdown")(calibrate_ringdown.calibrate_ringdown)
-calibrate_app.command("simulate")(calibrate_simulate.calibrate_simulate)
-calibrate_app.command("campaign")(calibrate_campaign.calibrate_campaign)
+calibrate_app.command("ringdown")(calibrate_ringdown)
+calibrate_app.command("simulate")(calibrate_simulate)
+calibrate_app.command("campaign")(calibrate_campaign)

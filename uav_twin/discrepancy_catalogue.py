@@ -8,6 +8,7 @@ import typer
 
 from reporting import terminal
 from reporting.words import counted
+from uav_twin.options import Effects, ModelFile
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -19,10 +20,7 @@ if TYPE_CHECKING:
 
 def effects(
     show: Annotated[str | None, typer.Option(metavar="ID", help="Everything about one effect.")] = None,
-    add: Annotated[
-        list[Path] | None,
-        typer.Option("--effects", help="A TOML file of further effects; may be given several times."),
-    ] = None,
+    add: Effects = None,
 ) -> None:
     """List the effects that can be named."""
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
@@ -73,10 +71,7 @@ def example(
         str, typer.Argument(help="static, ringdown, flight, laboratory or complete.", show_default=False)
     ],
     out: Annotated[Path, typer.Argument(help="The folder to write.", show_default=False)],
-    model: Annotated[
-        str | None,
-        typer.Option(help="As of `discrepancy run`.", show_default="the shipped wing"),
-    ] = None,
+    model: ModelFile = None,
     seed: Annotated[
         int, typer.Option(min=0, max=2**63 - 1, help="Seed of noise, zeros, gains and releases.")
     ] = 0,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
+from uav_twin.options import Effects, ModelFile
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -17,13 +18,8 @@ if TYPE_CHECKING:
 
 def check(
     campaign: Annotated[Path, typer.Argument(help="Folder with campaign.toml.", show_default=False)],
-    model: Annotated[
-        str | None,
-        typer.Option(help="As of `discrepancy run`.", show_default="the shipped wing"),
-    ] = None,
-    effects: Annotated[
-        list[Path] | None, typer.Option(help="A TOML file of further effects; may be given several times.")
-    ] = None,
+    model: ModelFile = None,
+    effects: Effects = None,
     json: terminal.Json = False,
 ) -> None:
     """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""

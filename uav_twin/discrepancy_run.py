@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
+from uav_twin.options import Effects
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -40,9 +41,6 @@ Model = Annotated[
 ]
 Out = Annotated[Path | None, typer.Option(help="Folder of the verdict.", show_default="verdicts/CAMPAIGN")]
 Replace = Annotated[bool, typer.Option("--replace", help="Replace the folder of an earlier verdict.")]
-Effects = Annotated[
-    list[Path] | None, typer.Option(help="A TOML file of further effects; may be given several times.")
-]
 Calibrate = Annotated[
     int | None,
     typer.Option(

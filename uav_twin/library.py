@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
+from uav_twin.options import Replace
 
 library_app = typer.Typer(no_args_is_help=True, help="Sample FMUs into observation libraries.")
 
@@ -50,7 +51,7 @@ def sample(
     settle: Settle = 0,
     workers: Workers = None,
     resume: Resume = False,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
+    replace: Replace = False,
 ) -> None:
     """Ask an FMU for its observation at every draw, state and control; write an observation library."""
     from twin_master.assets.resolution import Overrides

@@ -1,11 +1,13 @@
-"""What a simulation of an FMU or of a system takes from the command line, says, draws and leaves."""
+"""`uav-twin fmu simulate`, and what simulations of an FMU or a system take, say, draw and leave."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from reporting import terminal
+from uav_twin.options import Replace, StepTimeout
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,7 +30,6 @@ InterpolationName = Annotated[
 InProcess = Annotated[
     bool, typer.Option("--in-process", help="Faster, without protection from crashes and endless steps.")
 ]
-Replace = Annotated[bool, typer.Option("--replace", help="Replace the files if they exist.")]
 
 _MOST_PANELS, _MOST_LINES = 8, 10
 
@@ -76,15 +77,28 @@ def interpolated(binding: "Binding", kind: str | None) -> "Binding":
     return binding.with_interpolation(cast("Interpolation", kind))
 
 
-def say(
+def finish(
     asset: "FmiAsset",
     history: "ObservationHistory",
-    file: Path,
-    written: list[Path | None],
+    source: tuple[Path, str],
+    out: Path | None,
+    plot: Path | None,
 ) -> None:
+    """Write and draw what was simulated from `source`, a file and its SHA-256, and say so."""
+    from fmu_asset.door.history_file import write_history
+
+    file, digest = source
+    if out is not None:
+        write_history(out, asset, (file.name, digest), history)
+    if plot is not None:
+        _draw(plot, asset, history)
+    _say(asset, history, file, [path for path in (out, plot) if path is not None])
+
+
+def _say(asset: "FmiAsset", history: "ObservationHistory", file: Path, written: list[Path]) -> None:
     """Say what was simulated; where nothing was written, what stands at the end."""
     end = history.time[-1] if len(history.time) else asset.time
-    where = ", ".join(str(path) for path in written if path is not None)
+    where = ", ".join(map(str, written))
     # The start may be a row of its own.
     steps = int((history.time > asset.binding.binding.start_time).sum())
     terminal.say(f"{where or file}: {steps} steps to t = {end:g} s, every {asset.binding.interval:g} s.")
@@ -109,7 +123,7 @@ def _columns(
     return [*names, *((name, units[name], values) for name, values in history.extra.items())]
 
 
-def draw(path: Path, asset: "FmiAsset", history: "ObservationHistory") -> None:
+def _draw(path: Path, asset: "FmiAsset", history: "ObservationHistory") -> None:
     """Draw the outputs over time, those of one unit in one panel, and write the picture."""
     from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
     from reporting.files import atomic_write_bytes
@@ -131,3 +145,75 @@ def draw(path: Path, asset: "FmiAsset", history: "ObservationHistory") -> None:
         axes[-1].set_xlabel("time [s]")
         figure.tight_layout()
         atomic_write_bytes(path, to_svg(figure) if path.suffix == ".svg" else to_png(figure))
+
+
+def simulate(
+    file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
+    binding: Annotated[
+        Path | None, typer.Option(help="Its binding file; without one, all outputs in the FMU's units.")
+    ] = None,
+    inputs: Annotated[
+        Path | None,
+        typer.Option(help="CSV: `time` (s, where each step begins) and the inputs by the binding's names."),
+    ] = None,
+    out: OutFile = None,
+    stop_time: Annotated[
+        float | None, typer.Option(help="End in seconds; the FMU's own by default, or 1 s after the start.")
+    ] = None,
+    step_size: Annotated[
+        float | None,
+        typer.Option(help="Communication step size in seconds; the FMU's own by default.", min=0.0),
+    ] = None,
+    values: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A parameter (of any kind) or input of the FMU."),
+    ] = None,
+    plot: PlotFile = None,
+    interpolation: InterpolationName = None,
+    in_process: InProcess = False,
+    step_timeout: StepTimeout = None,
+    replace: Replace = False,
+) -> None:
+    """Simulate an FMU: its default experiment, or with --binding and --inputs under histories."""
+    from fmu_asset.archive.fmu_file import read_fmu
+    from fmu_asset.door.binding import load_binding
+    from fmu_asset.door.experiment import default_experiment, fly, fly_histories
+    from fmu_asset.door.history_file import read_histories
+    from fmu_asset.door.session import FmiAsset
+
+    refuse_files(out, plot, replace=replace)
+    _refuse_mixture(
+        binding, inputs, interpolation, others=stop_time is not None or step_size is not None or bool(values)
+    )
+    if binding is not None and inputs is not None:
+        bound = interpolated(load_binding(binding), interpolation)
+        asset = FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)
+        given = read_histories(inputs, asset.binding)
+    else:
+        planned = default_experiment(
+            read_fmu(file), stop_time=stop_time, step_size=step_size, values=values_of(values or [])
+        )
+        asset = FmiAsset(file, planned.binding, isolated=not in_process, step_timeout=step_timeout)
+    with closing(asset):
+        if inputs is not None:
+            history = fly_histories(asset, given, terminal.progress())
+        else:
+            history = fly(asset, planned, terminal.progress())
+        finish(asset, history, (file, asset.description.sha256), out, plot)
+
+
+def _refuse_mixture(
+    binding: Path | None, inputs: Path | None, interpolation: str | None, *, others: bool
+) -> None:
+    """Refuse half of a simulation under histories, and one that is half without."""
+    from fmu_asset.errors import FmuInputError
+
+    if (binding is None) != (inputs is None):
+        raise FmuInputError("--binding and --inputs go together: one names the columns of the other.")
+    if binding is not None and others:
+        raise FmuInputError(
+            "--stop-time, --step-size and --set are for a simulation without --binding, which says these "
+            "itself."
+        )
+    if interpolation is not None and inputs is None:
+        raise FmuInputError("--interpolation says how inputs go on between the rows of --inputs: give these.")

@@ -7,16 +7,15 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
+from uav_twin.options import Replace
 from uav_twin.simulated import (
     InProcess,
     InterpolationName,
     OutFile,
     PlotFile,
-    Replace,
-    draw,
+    finish,
     interpolated,
     refuse_files,
-    say,
     values_of,
 )
 
@@ -37,7 +36,7 @@ def export(
     seed: Annotated[
         int | None, typer.Option(min=0, help="Seed of the run; by default that of the scenario.")
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
+    replace: Replace = False,
 ) -> None:
     """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
     from fmu_asset.errors import SspError
@@ -104,7 +103,6 @@ def simulate(
     from fmu_asset.coupling.asset import CoupledAsset
     from fmu_asset.coupling.system import system_description
     from fmu_asset.door.experiment import default_experiment, fly
-    from fmu_asset.door.history_file import write_history
     from fmu_asset.ssp.check import join_ssp, left_out_sentence
     from fmu_asset.ssp.reader import read_ssp
     from reporting.provenance import hash_file
@@ -126,11 +124,7 @@ def simulate(
             parameters=planned.parameters,
         ) as asset:
             history = fly(asset, planned, terminal.progress())
-            if out is not None:
-                write_history(out, asset, (file.name, hash_file(file)), history)
-            if plot is not None:
-                draw(plot, asset, history)
-    say(asset, history, file, [out, plot])
+            finish(asset, history, (file, hash_file(file)), out, plot)
 
 
 def _warn(sentence: str) -> None:

@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
-from uav_twin.structure_arguments import File, MemoryLimit, assembled, assembled_of_any
-from uav_twin.structure_field import field
-from uav_twin.structure_fmu import fmu
-from uav_twin.structure_reduce import reduce
+from uav_twin.structure_model import File, MemoryLimit, assembled, assembled_of_any, field, fmu, reduce
 
 if TYPE_CHECKING:
     from fe.structure.affine import DesignedStructure

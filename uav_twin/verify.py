@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reporting import terminal
+from uav_twin.options import Design
 
 if TYPE_CHECKING:
     from fe.wing.design import WingDesign
@@ -54,7 +55,7 @@ class Check:
 
 
 def verify(
-    design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
+    design: Design = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the record and the jobs of CalculiX; it must be empty.")
     ] = None,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
+from uav_twin.options import Design
 from uav_twin.verify import verify
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ wing_app.command("verify")(verify)
 @wing_app.callback(invoke_without_command=True)
 def wing(
     context: typer.Context,
-    design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
+    design: Design = None,
     vtu: Annotated[
         Path | None,
         typer.Option(help="Write the undamaged wing at 3g for ParaView, and its modes beside it."),

@@ -18,6 +18,7 @@ from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import Seed, check_count, child_seed
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
+from reporting.words import brief
 
 Float = NDArray[np.float64]
 Procedure = Literal["quadrature", "Gaussian", "several optima", "joint", "paper"]
@@ -204,6 +205,10 @@ class Calibration:
     readings: tuple[Reading, ...] = ()
     measured: xr.Dataset = field(default_factory=xr.Dataset)
     design: WingDesign | None = None
+
+    def __repr__(self) -> str:
+        facts = {"parameters": [prior.name for prior in self.priors], "samples": len(self.samples)}
+        return brief(self, asset=self.asset, model=self.model, **facts)
 
     def __post_init__(self) -> None:
         check_name(self.asset)

@@ -34,6 +34,7 @@ from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance
+from reporting.words import brief
 
 from .disagreements import disagreements
 from .lab_data import LabData, published_data, read_lab_folder
@@ -75,6 +76,9 @@ class WingCalibration:
     static: StaticCalibration
     static_published: StaticCalibration
 
+    def __repr__(self) -> str:
+        return brief(self, procedure=self.procedure, result=self.result)
+
     @property
     def result(self) -> Calibration:
         """What the twin is tailored with."""
@@ -90,7 +94,7 @@ class WingCalibration:
         return save_calibration(self.result, path)
 
 
-def calibrate_wing(
+def calibrate(
     lab: LabData | str | Path | None = None,
     design: WingDesign | None = None,
     *,

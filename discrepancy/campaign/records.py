@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.sampling import is_even, nearly_even
 from discrepancy.errors import CampaignDataError
+from reporting.words import brief
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -410,8 +411,7 @@ class Campaign:
     remarks : tuple of str
         What the reader noticed and did: samples left out and why, a missing noise record.
     loggers : mapping of str to tuple of str
-        Channels and inputs ("force": that of forced trials) that share a clock, by the logger's name; empty
-        where nothing is said, and one logger is taken to record everything.
+        Channels and inputs ("force": of forced trials) that share a clock, by logger; empty: one has all.
     events : tuple of Event
         In the order of the file; those of one name are in different trials.
     """
@@ -425,6 +425,9 @@ class Campaign:
     remarks: tuple[str, ...] = field(default=())
     loggers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
+
+    def __repr__(self) -> str:
+        return brief(self, name=self.name, trials=len(self.trials), channels=self.channels)
 
     def event_times(self, trial: str) -> dict[str, float]:
         """Return the moments in a trial [s] by the names that expressions use."""

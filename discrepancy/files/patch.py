@@ -213,7 +213,7 @@ def read_patch(path: Path) -> StoredPatch:
     Raises
     ------
     VerdictFileError
-        As `read_verdict`.
+        As `read_verdict_file`.
     """
     older = {FIRST_SCHEMA: lambda content: {**content, "model_file": None, "parameters": []}}
     return read_document(path, PATCH_SCHEMA, StoredPatch, older)

@@ -65,7 +65,7 @@ def write_verdict(path: Path, verdict: Verdict, proof: Proof | None, origin: Ori
     return write_document(path, VERDICT_SCHEMA, StoredVerdict(verdict, proof, origin))
 
 
-def read_verdict(path: Path) -> StoredVerdict:
+def read_verdict_file(path: Path) -> StoredVerdict:
     """Read the verdict.json that `write_verdict` wrote; the records are equal, nan included.
 
     Raises
@@ -88,7 +88,7 @@ def _with_later_keys(keys: dict[str, Any], content: dict[str, Any]) -> dict[str,
     return {"model_file": None, **content, "verdict": {**keys, **verdict}}
 
 
-def read_verdict_folder(folder: Path | str) -> VerdictFolder:
+def read_verdict(folder: Path | str) -> VerdictFolder:
     """Read the folder of a verdict.
 
     Parameters
@@ -103,7 +103,7 @@ def read_verdict_folder(folder: Path | str) -> VerdictFolder:
     """
     place = Path(folder)
     restore_folder(place)
-    stored = read_verdict(place / VERDICT_NAME)
+    stored = read_verdict_file(place / VERDICT_NAME)
     patch, residuals = place / PATCH_NAME, place / RESIDUALS_NAME
     return VerdictFolder(
         **vars(stored),

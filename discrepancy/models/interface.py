@@ -13,6 +13,7 @@ from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.memory import Memory
 from fe.runtime.patch import SENSORS, ModelPatch, PortForce, Primitive
+from reporting.words import brief
 
 Place = str | tuple[float, float]
 KEPT = 400
@@ -264,6 +265,10 @@ class Model(ABC):
     shows_ports: ClassVar[bool] = False
     _declared: tuple[ModelParameter, ...] | None = None
     _kept: Memory | None = None
+
+    def __repr__(self) -> str:
+        parameters = [parameter.name for parameter in self.parameters]
+        return brief(self, name=self.name, parameters=parameters, effects=len(self.patch))
 
     # ------------------------------------------------------------ what each model says
 

@@ -213,10 +213,10 @@ def reduced_structure(
     settings, design_hash, path = _place(file, settings)
 
     def build_structure() -> ReducedModel:
-        from fe.structure.operators import load_any
+        from fe.structure.operators import assemble_structure
 
         with (progress or SilentProgress()).stage("Reading the mesh and assembling"):
-            structure = load_any(file, memory_limit)
+            structure = assemble_structure(file, memory_limit)
         return reduced(structure, settings, progress)
 
     return _once(ReducedModel, path, design_hash, build_structure)
@@ -230,10 +230,10 @@ def check_structure(file: Path | str) -> None:
     FiniteElementError
         If the structure cannot be read or modelled.
     """
-    from fe.structure.operators import load_any
+    from fe.structure.operators import assemble_structure
 
     if not _place(Path(file))[2].is_file():
-        load_any(file)
+        assemble_structure(file)
 
 
 def _place(file: Path, settings: "StructureSettings | None" = None) -> tuple["StructureSettings", str, Path]:

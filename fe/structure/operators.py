@@ -156,7 +156,7 @@ def load_and_assemble(
     return assemble(design, mesh, digest, mass_as_stiffness=mass_as_stiffness)
 
 
-def load_any(file: Path | str, memory_limit: float | None = None) -> DesignedStructure:
+def assemble_structure(file: Path | str, memory_limit: float | None = None) -> DesignedStructure:
     """Read a structure file with its mesh or matrices; parameters and errors as of `load_and_assemble`."""
     design, folder = load_structure(file), Path(file).parent
     if isinstance(design, MatrixDesign):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from discrepancy.errors import VerdictFileError
-from discrepancy.files.verdict import read_verdict_folder
+from discrepancy.files.verdict import read_verdict as read_verdict_folder
 from discrepancy.verdict_folder import check_folder
 from reporting.errors import FileNotWrittenError
 from reporting.folders import lock_folder

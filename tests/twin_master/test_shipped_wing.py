@@ -21,7 +21,8 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.reading import load_scenario, parse_scenario
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing"), pytest.mark.usefixtures("no_report")]
 

@@ -30,7 +30,8 @@ from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import lock_run_folder
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import RunOutcome, read_run
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
 ROOT = Path(__file__).parents[2]

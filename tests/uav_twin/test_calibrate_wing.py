@@ -36,7 +36,7 @@ from fmu_asset.door.session import FmiAsset
 from scenarios import scenario_files
 from tests.command_line import call, command, refused, said
 from twin_master.errors import NotResumableError
-from twin_master.workflow import resume_run
+from twin_master.workflow import resume as resume_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 

@@ -20,7 +20,7 @@ from tests.command_line import refused, said
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
-from twin_master.workflow import new_run
+from twin_master.workflow import fly as new_run
 
 TRUTH = 1.04
 NOISE = np.array([0.04, 0.05, 0.06, 0.015])

@@ -23,7 +23,7 @@ from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.watch.opening import begin_watch
-from twin_master.workflow import new_run
+from twin_master.workflow import fly as new_run
 
 TRUTH = {"e": 0.96}
 BRACKET = scenario_files()["bracket"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from discrepancy.files.patch import read_patch
-from discrepancy.files.verdict import read_verdict
+from discrepancy.files.verdict import read_verdict_file
 from tests.command_line import command, refused, said
 
 RIG = ("--model", "single_mass_rig")
@@ -32,7 +32,7 @@ def test_from_an_example_to_a_verdict(campaign: Path, tmp_path: Path) -> None:
     assert "Hold out a trial" in shown or "held out" in shown
     out = tmp_path / "verdict"
     shown = said("discrepancy", "run", str(campaign), *RIG, "--out", str(out), "--calibrate", "1")
-    stored = read_verdict(out / "verdict.json")
+    stored = read_verdict_file(out / "verdict.json")
     assert f"Verdict: {stored.verdict.kind.value}" in shown
     assert "seating_offset" in stored.verdict.inclusion
     assert stored.origin.command == (

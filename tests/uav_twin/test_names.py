@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import pydoc
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,8 @@ import numpy as np
 import pytest
 
 import uav_twin
+from tests.conftest import synthetic_calibration
+from tests.discrepancy.rigs import measured
 from uav_twin import _HOMES
 
 ROOT = Path(__file__).parents[2]
@@ -27,7 +30,6 @@ def python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 def test_every_name_is_there_and_documented() -> None:
     assert 15 <= len(uav_twin.__all__) <= 45
-    assert sorted(_HOMES) == sorted(uav_twin.__all__)
     assert set(uav_twin.__all__) <= set(dir(uav_twin))
     # The import of a module of the command line would take the place of a name like it.
     assert not {path.stem for path in Path(uav_twin.__file__).parent.glob("*.py")} & {*uav_twin.__all__}
@@ -39,16 +41,21 @@ def test_every_name_is_there_and_documented() -> None:
         assert f"`{name}`" in page, name
 
 
-def test_type_checkers_are_told_the_same_homes() -> None:
-    tree = ast.parse(Path(uav_twin.__file__).read_text(encoding="utf-8"))
-    (told,) = (node for node in tree.body if isinstance(node, ast.If))
-    homes = {}
-    for line in told.body:
+def test_every_name_of_the_list_is_read_and_found_under_its_own_name() -> None:
+    tree = ast.parse(Path(uav_twin.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    told = {}
+    for line in tree.body[1:]:
         assert isinstance(line, ast.ImportFrom)
-        for alias in line.names:
-            renamed = alias.asname is not None and alias.asname != alias.name
-            homes[alias.asname or alias.name] = f"{line.module}:{alias.name}" if renamed else line.module
-    assert homes == _HOMES
+        (alias,) = line.names
+        assert alias.asname == alias.name  # which type checkers take as handed on
+        told[alias.name] = line.module
+    assert told == _HOMES
+    for name in uav_twin.__all__:
+        assert getattr(uav_twin, name).__name__ == name
+        assert (
+            f"class {name}" in (text := pydoc.plaintext.document(getattr(uav_twin, name)))
+            or f"{name}(" in text
+        )
 
 
 def test_the_import_is_lazy_and_an_unknown_name_is_refused(tmp_path: Path) -> None:
@@ -89,6 +96,41 @@ def test_the_command_names_it_too(tmp_path: Path) -> None:
     assert found.stdout == ""
     assert found.stderr.count("\n") == 1
     assert f"{tmp_path / 'fe.py'} hides the package `fe` of uav-twin" in found.stderr
+
+
+def test_records_show_themselves_in_a_few_words(library_file: Path) -> None:
+    from calibration.wing.calibrate import WingCalibration
+    from discrepancy.models.fmu import FmuModel
+    from discrepancy.models.interface import Model
+    from discrepancy.models.wing import WingModel
+    from discrepancy.verdict import Verdict, VerdictKind
+    from discrepancy.workflow import Investigation
+
+    campaign, model = measured()
+    verdict = Verdict(VerdictKind.NOTHING_MISSING, "Nothing.", 0.9, 0.0)
+    wing = synthetic_calibration()
+    knowledge = uav_twin.prepare_twin("level_turns", {"strain_library": library_file})
+    shown: list[tuple[object, tuple[str, ...]]] = [
+        (campaign, (campaign.name, "trials=", "channels=")),
+        (model, ("LumpedModel", "parameters=")),
+        (verdict, ("nothing missing", "0.9")),
+        (Investigation(campaign, model, (), verdict), ("Verdict(", model.name)),
+        (wing, (wing.asset, "samples=40")),
+        (WingCalibration(wing, wing, "joint", *[None] * 4), ("Calibration(", "joint")),  # type: ignore[arg-type]
+        (uav_twin.load_scenario("level_turns"), ("level_turns.toml",)),
+        (knowledge, ("level_turns", "GraphicalModel(", "GaussianSensorModel(")),
+        (knowledge.model, ("states=", "controls=2 (2g, 3g)")),
+        (knowledge.sensor_model, ("draws=", "sensors=")),
+        (knowledge.twin(), ("turns=0", "GraphicalModel(")),
+    ]
+    for record, words in shown:
+        text = repr(record)
+        assert text.startswith(f"{type(record).__name__}(")
+        assert len(text) < 400
+        assert "array(" not in text
+        for word in words:
+            assert word in text, text
+    assert FmuModel.__repr__ is WingModel.__repr__ is Model.__repr__
 
 
 def test_a_model_from_tables_is_the_same_as_from_its_parts() -> None:

@@ -16,7 +16,7 @@ from reporting.toml_file import parse_toml
 from tests import command_line
 from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
-from twin_master.workflow import new_run
+from twin_master.workflow import fly as new_run
 from uav_twin import assemble_structure, reduced_structure
 
 DECK = stiffened_skin()

@@ -333,11 +333,11 @@ Figures = dict[str, dict[str, "Estimated | int"]]
 
 def _figures(folders: list[Path]) -> Figures:
     """Return the figures of each group; with the folder's name where there are several folders."""
-    from twin_master.fleet.reading import fleet_groups, group_figures
+    from twin_master.fleet.reading import group_figures, open_fleet
 
     found = {}
     for folder in folders:
-        for name, group in fleet_groups(folder).items():
+        for name, group in open_fleet(folder).items():
             found[name if len(folders) == 1 else f"{folder}: {name}"] = group_figures(group)
     return found
 

@@ -123,7 +123,7 @@ def _mean(values: Float) -> Estimated:
     return Estimated(float(np.mean(values)), error)
 
 
-def fleet_groups(folder: Path) -> "dict[str, xr.Dataset]":
+def open_fleet(folder: Path) -> "dict[str, xr.Dataset]":
     """Return the groups of a fleet by their names.
 
     Raises

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.progress import Progress, SilentProgress
+from reporting.words import brief
 from twin_master.assets.asset_source import AssetSource, structural_table
 from twin_master.assets.interface import Asset
 from twin_master.assets.parameter import ParameterDraws
@@ -64,6 +65,11 @@ class Knowledge:
     sensor_model: GaussianSensorModel
     rewards: RewardModel
     plan: PlannedPolicy
+
+    def __repr__(self) -> str:
+        return brief(
+            self, mission=self.scenario.mission.name, model=self.model, sensor_model=self.sensor_model
+        )
 
     @property
     def planning_reward(self) -> Float:

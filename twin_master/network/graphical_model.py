@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reporting.words import brief
 from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import distribution, stochastic_matrix
 from twin_master.network.transition import TransitionModel
@@ -194,6 +195,9 @@ class GraphicalModel:
     controls: tuple[str, ...]
     prior: Float
     transition: TransitionModel
+
+    def __repr__(self) -> str:
+        return brief(self, states=self.states.size, controls=self.controls)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "controls", tuple(self.controls))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
+from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.quantity import QuantityModel
 from twin_master.network.sensor_kernels import log_densities
@@ -121,6 +122,10 @@ class GaussianSensorModel(QuantityModel):
     """Noise and model error of each state, control and sensor (S, U, G), SI, independent; read-only."""
     total_standard_deviation: Float
     """The same with what a sensor changes by within the interval of a state (S, U, G), SI; read-only."""
+
+    def __repr__(self) -> str:
+        draws, states, controls, sensors = self.value_per_draw.shape
+        return brief(self, draws=draws, states=states, controls=controls, sensors=sensors)
 
     def __init__(
         self,

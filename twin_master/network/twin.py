@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
+from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network import graphical_model
 from twin_master.network.estimator import (
@@ -40,8 +41,7 @@ DEFAULT_LAG = 50
 def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> GraphicalModel:
     """Return states, controls, prior and transitions of a scenario: Kapteyn et al. 2021, eqs. (28)-(29).
 
-    The factors of the state move independently given the control, and are independent before the first
-    observation.
+    Its factors move independently given the control, and are independent before the first observation.
 
     Parameters
     ----------
@@ -154,9 +154,8 @@ class Twin:
     prediction_steps : int
         How far to predict.
     decide_on : {"filtered", "predicted"}
-        The next control is the mode of policy(U | D) averaged over p(D_t | o_0..o_t), so that the policy
-        acts on the state last observed, as in the paper's graph; or over p(D_{t+1} | o_0..o_t), one step
-        ahead, as in the authors' published code.
+        The next control is the mode of policy(U | D) averaged over p(D_t | o_0..o_t), the state last seen, as
+        in the paper's graph; or over p(D_{t+1} | o_0..o_t), as in the authors' published code.
     lag : int or None
         How many turns back the twin smooths and may be revised; None keeps all turns.
     first_control : int or str
@@ -199,13 +198,15 @@ class Twin:
         self.decide_on = decide_on
         self._on_belief = on_belief
         self.lag = lag
-        # One turn more than is smoothed: what the oldest of them followed from.
-        self._seen: deque[_Seen] = deque(maxlen=None if lag is None else lag + 2)
+        self._seen: deque[_Seen] = deque(maxlen=None if lag is None else lag + 2)  # with the turn before
         self._turns = 0
         self._proposed = self._index_of(first_control)
         self._safest: Float | None = None
         if safest is not None:
             self._safest = np.eye(len(model.controls))[self._index_of(safest)]
+
+    def __repr__(self) -> str:
+        return brief(self, name=self.name, model=self.model, turns=self._turns, lag=self.lag)
 
     @property
     def model(self) -> GraphicalModel:

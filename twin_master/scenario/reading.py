@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from reporting.section import shown
 from reporting.toml_file import read_toml
+from reporting.words import brief
 from scenarios import scenario_files
 from twin_master.errors import ScenarioError, UnknownScenarioError
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME
@@ -64,6 +65,9 @@ class LoadedScenario:
     path: Path
     content_hash: str
     remark: str = ""
+
+    def __repr__(self) -> str:
+        return brief(self, name=self.scenario.mission.name, file=self.path.name)
 
 
 def find_scenario(name: str) -> Path:

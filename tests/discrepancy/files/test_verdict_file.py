@@ -26,7 +26,8 @@ from discrepancy.files.patch import (
     write_patch,
 )
 from discrepancy.files.residuals import read_residuals, write_residuals
-from discrepancy.files.verdict import VERDICT_SCHEMA, StoredVerdict, read_verdict, write_verdict
+from discrepancy.files.verdict import VERDICT_SCHEMA, StoredVerdict, write_verdict
+from discrepancy.files.verdict import read_verdict_file as read_verdict
 from discrepancy.judgement.proof import prove
 from discrepancy.verdict import (
     CalibratedParameter,

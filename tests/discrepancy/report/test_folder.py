@@ -12,7 +12,7 @@ import pytest
 from discrepancy.catalogue.library import library
 from discrepancy.files.patch import read_patch
 from discrepancy.files.residuals import read_residuals
-from discrepancy.files.verdict import read_verdict
+from discrepancy.files.verdict import read_verdict_file as read_verdict
 from discrepancy.judgement.separability import Separability
 from discrepancy.report.figures import ReportInput, draw, report_figures
 from discrepancy.report.page import render_report

@@ -15,7 +15,7 @@ from fe.full.statics import Factorisation
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import load_structure
 from fe.structure.field import natural_frequencies, static_responses
-from fe.structure.operators import load_and_assemble, load_any
+from fe.structure.operators import assemble_structure, load_and_assemble
 from tests.calculix_decks import (
     Deck,
     Point,
@@ -67,7 +67,7 @@ def test_shells_and_beams_are_calculixs_own(
     forces = [(deck.node[corner], up), (deck.node[corner], across), (deck.node[middle], up)]
     ends = deck.node[gauge[0]], deck.node[gauge[1]]
     file = write_structure(tmp_path, lambda **changes: build(kind, **changes), tables(deck, forces, ends))
-    structure = load_any(file)
+    structure = assemble_structure(file)
     for e, loss in ((1.0, 0.0), (1.07, 0.7)):
         other = build(kind, skin=e, patch=e * (1.0 - loss))
         stiffness = structure.stiffness({"e": e}, {"z1": loss})
@@ -158,7 +158,7 @@ def write_chain(folder: Path, changes: dict[str, str] | None = None) -> Path:
 
 def test_a_chain_answers_as_by_hand(tmp_path: Path) -> None:
     """Forces over springs: extensions add up; e = 2 is nominal, z1 takes from the middle spring alone."""
-    chain = load_any(write_chain(tmp_path))
+    chain = assemble_structure(write_chain(tmp_path))
     found = static_responses(chain)
     assert found["push"].output == pytest.approx([-1e-3 * (1 / 200 + 1 / 100 + 1 / 50)], rel=1e-12)
     assert found["push"].strain == pytest.approx([1 / 100 / 20], rel=1e-12)
@@ -223,28 +223,28 @@ def test_every_format_is_the_same_structure(
     write: Callable[[Path, str, FloatArray], str], tmp_path: Path
 ) -> None:
     """Those that name nodes need no file of unknowns, and a part may name fewer of them."""
-    wanted = load_any(write_chain(tmp_path))
+    wanted = assemble_structure(write_chain(tmp_path))
     changes = {
         f'"{name}.mtx"': f'"{write(tmp_path, name, matrix)}"'
         for name, matrix in (("k", STIFFNESS), ("m", MASS), ("middle", MIDDLE))
     }
     if write in (as_abaqus, as_dmig):
         changes['unknowns = "rows.dof"'] = ""
-    found = load_any(write_chain(tmp_path, changes))
+    found = assemble_structure(write_chain(tmp_path, changes))
     for values in ({}, {"e": 2.2, "z1": 0.5, "push": 3.0}):
         for ours, theirs in zip(found.at(values), wanted.at(values), strict=True):
             assert np.abs(ours - theirs).max() <= 1e-9 * np.abs(theirs).max()
 
 
 def test_a_whole_may_be_a_sum_and_a_part_a_difference(tmp_path: Path) -> None:
-    wanted = load_any(write_chain(tmp_path))
+    wanted = assemble_structure(write_chain(tmp_path))
     io.mmwrite(tmp_path / "rest.mtx", sparse.coo_array(STIFFNESS - MIDDLE))
     io.mmwrite(tmp_path / "soft.mtx", sparse.coo_array(STIFFNESS - 0.75 * MIDDLE))
     changes = {
         '"k.mtx"': '["rest.mtx", "middle.mtx"]',
         'matrix = "middle.mtx"': 'changed = "soft.mtx"\ntimes = 0.25',
     }
-    found = load_any(write_chain(tmp_path, changes))
+    found = assemble_structure(write_chain(tmp_path, changes))
     values = {"e": 1.9, "z1": 0.3}
     np.testing.assert_allclose(
         found.at(values)[0].toarray(), wanted.at(values)[0].toarray(), rtol=1e-12, atol=1e-9
@@ -253,7 +253,7 @@ def test_a_whole_may_be_a_sum_and_a_part_a_difference(tmp_path: Path) -> None:
 
 def test_vectors_stand_for_loads_and_outputs(tmp_path: Path) -> None:
     """In the order of the rows, or by node and component; a mass may be a matrix of its own."""
-    wanted = load_any(write_chain(tmp_path))
+    wanted = assemble_structure(write_chain(tmp_path))
     (tmp_path / "push.txt").write_text("0\n0\n1\n")
     (tmp_path / "gauge.csv").write_text("4, 1, -0.05\n7, 1, 0.05\n")
     np.save(tmp_path / "end.npy", np.array([0.0, 0.0, -1.0]))
@@ -264,7 +264,7 @@ def test_vectors_stand_for_loads_and_outputs(tmp_path: Path) -> None:
         "node = 9\ndirection = [-3, 0, 0]": 'vector = "end.npy"',
         "node = 7\nmass": 'matrix = "pump.mtx"\nmass',
     }
-    found = load_any(write_chain(tmp_path, changes))
+    found = assemble_structure(write_chain(tmp_path, changes))
     for ours, theirs in (
         (found.load("push"), wanted.load("push")),
         (found.gauge_output.toarray(), wanted.gauge_output.toarray()),
@@ -283,10 +283,10 @@ def test_a_support_holds_what_the_matrices_leave_free(tmp_path: Path) -> None:
     io.mmwrite(tmp_path / "k.mtx", sparse.coo_array(free))
     words = r"leaves free, or nearly: 1; in one node \d, component 1 moves most\. Hold"
     with pytest.raises(FiniteElementError, match=words):
-        load_any(file)
+        assemble_structure(file)
     held = file.read_text(encoding="utf-8") + '[[support]]\nnodes = [4]\nhold = ["x"]\n'
     file.write_text(held, encoding="utf-8")
-    found = static_responses(load_any(file))["push"]
+    found = static_responses(assemble_structure(file))["push"]
     assert found.output == pytest.approx([-1e-3 * (1 / 100 + 1 / 50)], rel=1e-12)
     # a row of nothing, as a solid's turns in Nastran, is left out
     io.mmwrite(tmp_path / "k.mtx", sparse.coo_array(wide))
@@ -294,7 +294,7 @@ def test_a_support_holds_what_the_matrices_leave_free(tmp_path: Path) -> None:
         wide[:3, :3] = matrix
         io.mmwrite(tmp_path / f"{name}.mtx", sparse.coo_array(wide))
     (tmp_path / "rows.dof").write_text("4 1\n7,1\n 9.1\n9.4\n")
-    assert static_responses(load_any(file))["push"].output == pytest.approx(found.output, rel=1e-12)
+    assert static_responses(assemble_structure(file))["push"].output == pytest.approx(found.output, rel=1e-12)
 
 
 def changed(matrix: FloatArray, **entries: float) -> FloatArray:
@@ -362,7 +362,7 @@ def test_what_is_no_structure_is_refused_in_a_sentence(
         else:
             io.mmwrite(tmp_path / name, sparse.coo_array(changes[name]), symmetry="general")
     with pytest.raises(FiniteElementError, match=sentence) as found:
-        load_any(file)
+        assemble_structure(file)
     assert "\n" not in str(found.value)
 
 
@@ -372,7 +372,7 @@ def test_rows_that_share_a_name_have_no_weight(tmp_path: Path) -> None:
     (tmp_path / "rows.dof").write_text("9.1\n7.1\n9.1\n")
     words = r"load\[2\]: several rows of the matrices carry one name.* as a vector"
     with pytest.raises(FiniteElementError, match=words):
-        load_any(file)
+        assemble_structure(file)
 
 
 def test_a_mesh_is_asked_for_where_one_is_needed(tmp_path: Path) -> None:
@@ -382,8 +382,8 @@ def test_a_mesh_is_asked_for_where_one_is_needed(tmp_path: Path) -> None:
 
 def test_the_hash_is_of_the_content_of_every_file(tmp_path: Path) -> None:
     file = write_chain(tmp_path)
-    first = load_any(file).design_hash
-    assert load_any(file).design_hash == first
+    first = assemble_structure(file).design_hash
+    assert assemble_structure(file).design_hash == first
     assert set(load_structure(file).files) == {"k.mtx", "m.mtx", "rows.dof", "middle.mtx"}
     io.mmwrite(tmp_path / "m.mtx", sparse.coo_array(2.0 * MASS))
-    assert load_any(file).design_hash != first
+    assert assemble_structure(file).design_hash != first

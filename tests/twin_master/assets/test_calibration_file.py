@@ -31,7 +31,7 @@ from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.run_folder import to_json
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Calibration
-from twin_master.workflow import new_run
+from twin_master.workflow import fly as new_run
 
 MakeCalibration = Callable[..., Calibrated]
 TEXT = scenario_files()["level_turns"].read_text(encoding="utf-8")

@@ -23,7 +23,8 @@ from twin_master.fleet.plan import ensemble
 from twin_master.mission.truth import Plant, Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
 COUPLED = """[asset]

@@ -21,7 +21,8 @@ from twin_master.library.grid import SamplingGrid
 from twin_master.library.request import grid_of_scenario
 from twin_master.library.sampling import sample_library
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 sys.path.insert(0, str(Path(__file__).parent))
 from pump_mission import PATH, pump_table, small_pump

@@ -13,7 +13,8 @@ from twin_master.mission.loop import CheckpointFile
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import read_run
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
 

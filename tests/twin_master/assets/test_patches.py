@@ -29,7 +29,8 @@ from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import RunOutcome, read_run
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 from uav_twin import cli
 
 TEXT = (

@@ -19,7 +19,7 @@ from twin_master.assets.resolution import Overrides
 from twin_master.library.request import grid_of_scenario
 from twin_master.library.sampling import sample_library
 from twin_master.store.writing import read_run
-from twin_master.workflow import new_run
+from twin_master.workflow import fly as new_run
 
 sys.path.insert(0, str(Path(__file__).parent))
 from pump_mission import small_pump

@@ -21,7 +21,8 @@ from tests.twin_master.runs import check_same, cut_off_after
 from twin_master.errors import TwinMasterError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.store.writing import read_run
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 PATH = scenario_files()["bracket"]
 

@@ -18,7 +18,8 @@ from twin_master.network.identified import packed_row
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.store.writing import read_run
 from twin_master.watch.message import MessageReader, Refused
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 PATH = scenario_files()["bracket"]
 TWO = {

@@ -17,11 +17,12 @@ from twin_master.errors import FleetError, NotResumableError, RunFolderExistsErr
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet, seed_range
-from twin_master.fleet.reading import Estimated, fleet_groups, group_figures
+from twin_master.fleet.reading import Estimated, group_figures
+from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.store import FleetStore
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import kept_knowledge
-from twin_master.workflow import new_run
+from twin_master.workflow import fly as new_run
 from uav_twin.cli import app
 
 

@@ -16,7 +16,8 @@ from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
-from twin_master.fleet.reading import attention, fleet_groups
+from twin_master.fleet.reading import attention
+from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import write_fleet_report
 from twin_master.mission.preparation import kept_knowledge
 from twin_master.network.inference import filter_sequence

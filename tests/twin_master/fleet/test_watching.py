@@ -30,7 +30,8 @@ from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import ensemble, load_fleet
-from twin_master.fleet.reading import attention, fleet_groups, group_figures, leaving
+from twin_master.fleet.reading import attention, group_figures, leaving
+from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.standing import WatchedAsset
 from twin_master.fleet.view import fleet_view, serve_fleet

@@ -15,7 +15,7 @@ from twin_master.report.page import render_page
 from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.tables import Noticing
-from twin_master.workflow import resume_run
+from twin_master.workflow import resume as resume_run
 from uav_twin.cli import app
 
 TEXT = scenario_files()["level_turns_learning"].read_text()

@@ -15,12 +15,13 @@ from tests.twin_master.runs import check_same
 from twin_master.environment import ScenarioEnvironment
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble
-from twin_master.fleet.reading import fleet_groups
+from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.store import ENDED
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import read_run
-from twin_master.workflow import new_run, resume_run
+from twin_master.workflow import fly as new_run
+from twin_master.workflow import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
 

@@ -36,7 +36,7 @@ from twin_master.scenario.reading import load_scenario
 from twin_master.viewer.flight import Flight
 from twin_master.viewer.messages import Request, Teller, parse_request
 from twin_master.viewer.scene import LATEST, scene_of
-from twin_master.workflow import new_run
+from twin_master.workflow import fly as new_run
 
 TURNS = 50
 TOLD = {
