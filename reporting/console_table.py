@@ -32,17 +32,18 @@ def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width:
 
     cells = [(*row, *[""] * (len(headings) - len(row))) for row in rows]
     kept = [at for at in range(len(headings)) if not cells or any(row[at] for row in cells)]
+    first = next(iter(kept), 0)
+    if width < WIDE:
+        longest_words = [LONGEST_NAME if at == first else LONGEST_WORD for at in range(len(headings))]
+        cells = [tuple(map(broken, row, longest_words)) for row in cells]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for at in kept:
-        # The first column names the row; the others make room for it.
-        table.add_column(headings[at], overflow="fold", no_wrap=at == kept[0] and width >= NARROWEST)
+        # The first column names the row; the others make room for it, unless it would take more than half.
+        longest = max((len(line) for row in cells for line in row[at].split("\n")), default=0)
+        kept_whole = at == first and width >= NARROWEST and longest <= width // 2
+        table.add_column(headings[at], overflow="fold", no_wrap=kept_whole)
     for row in cells:
-        table.add_row(
-            *(
-                row[at] if width >= WIDE else broken(row[at], LONGEST_NAME if at == kept[0] else LONGEST_WORD)
-                for at in kept
-            )
-        )
+        table.add_row(*(row[at] for at in kept))
     return table
 
 

@@ -45,3 +45,15 @@ def test_columns_without_any_entry_are_left_out() -> None:
     rows = [("mass ratio", "", "1"), ("length", "", "2")]
     assert "unit" not in "".join(printed(("parameter", "unit", "value"), rows, 80))
     assert "unit" in "".join(printed(("parameter", "unit", "value"), [("length", "m", "2")], 80))
+
+
+@pytest.mark.parametrize("width", [80, 100])
+def test_a_long_title_does_not_break_the_numbers_beside_it(width: int) -> None:
+    rows = [
+        ("posterior mean of the Young modulus factor of the wing box", "1.008", "1.0073 (1)"),
+        ("filtered rms error of z1", "4.1592 points", "3.8 points (2)"),
+        ("asset, per turn", "0.281 ms (largest 3.14 ms)", ""),
+    ]
+    lines = printed(("figure", "this run", "reference"), rows, width)
+    for number in ("1.008", "1.0073 (1)", "4.1592 points", "3.8 points (2)"):
+        assert sum(number in line for line in lines) == 1, lines

@@ -115,7 +115,7 @@ def _add_flown(page: Page, folder: Path, records: list[dict[str, Any]], most: in
     status = np.concatenate([group["status"].values for group in groups.values()])
     failures = _failures(folder)
     if failures:
-        _add_failures(page, failures, "They stand in fleet.json once the fleet has flown.",
+        _add_failures(page, failures, "All of them stand in fleet.json once the fleet has flown.",
                       WORDS.say("lost", failed=len(failures), assets=len(status)))  # fmt: skip
     if ended := int(np.sum(status == ENDED)):
         page.add_notice(WORDS.say("short", ended=ended, assets=len(status)))

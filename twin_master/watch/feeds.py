@@ -81,7 +81,7 @@ class CsvFeed(_FileFeed):
                 with path.open("rb") as file:
                     return self._take_columns(_cells(file.readline(LARGEST_MESSAGE)))
             except (OSError, ValueError) as error:
-                errors.append(MissionInputError(f"{path} cannot be read as CSV: {error}."))
+                errors.append(MissionInputError(f"{path} cannot be read as CSV: {str(error).rstrip('.')}."))
             except MissionInputError as error:
                 errors.append(error)
         raise errors[0] from None
