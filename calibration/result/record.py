@@ -376,7 +376,7 @@ class Calibration:
 
     def mean_state(self) -> DigitalState:
         """Return the digital state of a wing at the posterior mean, healthy."""
-        return self._state(self.samples.mean(axis=0))
+        return self._state(np.array([self.mean(figure.name) for figure in self.figures]))
 
     def states(self) -> tuple[DigitalState, ...]:
         """Return one digital state of a wing for each sample, healthy and of the tailored planform."""

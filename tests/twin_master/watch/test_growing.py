@@ -19,6 +19,7 @@ from tests.twin_master.watch.watches import begun, lines, write_csv
 from twin_master.mission.turns import History
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
+from twin_master.watch.growing import RECOGNISED_BY
 from twin_master.watch.intake import Counts
 from twin_master.watch.message import Message, Refused
 
@@ -189,6 +190,17 @@ def test_a_cut_without_a_copy_is_told(begun_log: Begun) -> None:
         "yet is lost"
     )
     assert new(messages) == list(range(2, 9))
+
+
+def test_a_log_that_lost_its_end_is_told_of(begun_log: Begun) -> None:
+    """It still begins as before, and is known by its size alone."""
+    turns = [*range(3 * RECOGNISED_BY)]
+    path, messages = begun_log(*turns)
+    size, kept = path.stat().st_size, turns[: 2 * RECOGNISED_BY]
+    path.write_text(HEADER + "".join(map(row, kept)))
+    refused, _ = next(messages)
+    assert f"cut at byte {size}" in str(refused)
+    assert new(messages) == kept
 
 
 def test_a_copy_in_the_place_of_a_log_is_read_on(begun_log: Begun) -> None:
