@@ -37,7 +37,7 @@ def _draw_record(axes: Axes, fit: RingDownFit) -> None:
     axes.plot(time, fit.record.signal * 1e3, ".", color=OBSERVED, ms=2.2, label="measured")
     axes.plot(time, fit.fitted * 1e3, color=PAST, lw=0.9, label="two modes")
     for mode, colour, style in zip(fit.modes, (PRESENT, PREDICTION), ("--", ":"), strict=True):
-        envelope = mode.amplitude * np.exp(-mode.decay_rate * (time - time[0])) * 1e3
+        envelope = mode.amplitude * np.exp(mode.pole.real * (time - time[0])) * 1e3
         label = f"envelope, {mode.frequency:.2f} Hz"
         axes.plot(time, envelope, color=colour, lw=0.9, ls=style, label=label)
     axes.set_xlim(0.0, min(2.0, float(time[-1])))
