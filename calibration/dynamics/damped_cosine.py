@@ -162,7 +162,7 @@ class DampedCosines:
         orthogonal = np.linalg.qr(self._basis(self._waves(pole)))[0]
         return np.asarray(self._signal - orthogonal @ (orthogonal.T @ self._signal)).ravel()
 
-    def fit(self, start: ComplexArray, *, frequencies_fitted: bool = True) -> Solution:
+    def fit(self, start: NDArray[np.complexfloating], *, frequencies_fitted: bool = True) -> Solution:
         """Return the waves nearest to the record, begun at these poles."""
         count, damped = start.size, start.imag
         scale = np.concatenate([start.real, damped] if frequencies_fitted else [start.real])

@@ -109,8 +109,8 @@ def identify_modes(
             f"the record has {len(record)} samples; {needed} are needed to tell modes and their covariance: "
             "record longer, or take a smaller sampling rate."
         )
-    way = _ambient if kind == "ambient" else _decay
-    found, covariances = way(record, sampling_rate, lags, len(limits))
+    way = partial(_ambient, modes=len(limits)) if kind == "ambient" else _decay
+    found, covariances = way(record, sampling_rate, lags)
     strongest = [found.strongest(low, high) for low, high in limits]
     chosen = {mode: pole for mode, pole in enumerate(strongest) if pole is not None}
     shape = len(limits), 1 + record.shape[1]
@@ -250,7 +250,8 @@ class _Subspace:
         eigenvalue, _, shape = self._modal(self._left[:, within] + self._left[:, beyond] @ mixed)
         pole = np.log(eigenvalue) * self._rate
         nearest = np.argmin(np.abs(pole - poles[:, None]), axis=1)
-        return _Poles(pole[nearest], shape.T[nearest], *np.ones((2, len(poles))), 1)
+        ones = np.ones(len(poles))
+        return _Poles(np.asarray(pole[nearest], dtype=np.complex128), shape.T[nearest], ones, ones, 1)
 
 
 def _ambient(record: FloatArray, rate: float, lags: int, modes: int) -> _Found:
@@ -297,7 +298,7 @@ def _long_blocks(each: FloatArray, duration: float, memory: float) -> FloatArray
     return np.asarray(each[: count * together].reshape(count, together, *each.shape[1:]).mean(axis=1))
 
 
-def _decay(record: FloatArray, rate: float, lags: int, _: int) -> _Found:
+def _decay(record: FloatArray, rate: float, lags: int) -> _Found:
     size = len(record) - 2 * lags
     whole = np.stack([record[lag : lag + size].T @ record[:size] / size for lag in range(1, 2 * lags + 1)])
     start, _ = _Subspace(whole, rate).poles(LARGEST_ORDER)
