@@ -33,8 +33,7 @@ from fe.runtime.patch import (
     Primitive,
     RunOffset,
 )
-from fe.runtime.sensor_stream import needs_structure
-from fe.runtime.sensors import check_channels
+from fe.runtime.sensors import check_channels, needs_structure
 from fmu_asset.errors import PatchFileError
 from reporting.json_file import parse_json
 

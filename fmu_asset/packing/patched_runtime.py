@@ -10,7 +10,7 @@ from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.sensor_stream import needs_structure
+from fe.runtime.sensors import needs_structure
 from fe.runtime.transient import ModalIntegrator
 from fmu_asset.errors import PatchFileError
 from fmu_asset.slaves.behaviour import StructureBehaviour

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from fe.runtime.patch import ModelPatch
 from fe.runtime.patched_wing import PatchedWing
-from fe.runtime.sensor_stream import Sample, SensorStream, needs_structure
+from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_structure
 from fe.runtime.transient import ModalIntegrator
 
 from .base import UnacceptableValuesError
@@ -74,23 +74,30 @@ class Acting:
             From the sample before, `duration` earlier.
         end, begun : float
             Time of the sample, and of the start [s].
-        release, dynamic
-            As of `SensorStream`.
+        release : float
+            Amplitude of the release at the start [m]; zero: none, and decaying lines do nothing.
+        dynamic : bool
+            Whether this is a motion; else high-pass and lines do nothing.
 
         Raises
         ------
         UnacceptableValuesError
             If a reading is not finite.
         """
-        stream = SensorStream(
-            patch=self.patch, channels=self.channels, dynamic=dynamic, start=begun, release=release
+        record = SensorRecord(
+            channels=self.channels,
+            kind="flight" if not dynamic else "ringdown" if release else "forced",
+            time=np.array([end - begun if dynamic else end]),
+            start=begun,
+            temperature=np.array([self.temperature]),
+            release=release,
         )
-        transverse, shear = (None, None) if across is None else across
-        sample = Sample(values, end, self.temperature, transverse, shear)
-        shown, filters = stream.read(sample, memory, duration)
+        transverse, shear = (None, None) if across is None else across[:, np.newaxis]
+        filters = FilterMemory(memory, duration)
+        (shown,), _ = apply_sensors(self.patch, record, values[np.newaxis], None, transverse, shear, filters)
         if not math.isfinite(float(shown.sum())):
             raise UnacceptableValuesError("With the effects that are on, an output is not finite.")
-        return shown.tolist(), filters
+        return shown.tolist(), filters.after
 
 
 class Effects:
