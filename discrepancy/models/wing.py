@@ -185,7 +185,7 @@ class WingModel(StructuralModel):
     def _made_rows(self, outputs: Outputs, component: int) -> FloatArray:
         places = f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction"
         named = ("tip_displacement", "load_point_displacement", places)
-        gauges = f"strain[1] to strain[{self.wing.gauge_count}]"
+        gauges = f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]"
         check_outputs("The wing", self, outputs, (gauges, *named))
         rows = [self.wing.output_row(output, component) for output, _ in outputs]
         return np.array(rows, dtype=np.float64).reshape(len(rows), self.wing.size)

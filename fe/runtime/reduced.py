@@ -27,6 +27,16 @@ def dense_sum(coefficients: FloatArray, terms: FloatArray) -> FloatArray:
     return np.asarray((coefficients @ terms.reshape(len(terms), -1)).reshape(terms.shape[1:]))
 
 
+def lowest_modes(stiffness: FloatArray, mass: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest frequencies (M,) [Hz] and mass-normalised shapes (n, M) of dense matrices (n, n)."""
+    # M x = K x / omega^2: the stiffness is well conditioned in a basis of modes, the mass is not, and the low
+    # modes are the largest eigenvalues, which keep all their digits.
+    to_standard = np.linalg.inv(np.linalg.cholesky(stiffness))
+    inverse_square, vectors = np.linalg.eigh(to_standard @ mass @ to_standard.T)
+    root = np.sqrt(inverse_square[::-1][:count])
+    return 1.0 / (2.0 * np.pi * root), to_standard.T @ vectors[:, ::-1][:, :count] / root
+
+
 @dataclass(frozen=True, slots=True)
 class StaticResponse:
     """Static response of a structure.
@@ -356,18 +366,13 @@ class ReducedModel(ReducedArrays):
         self.check_validity(vector.tolist())
         stiffness = dense_sum(self.stiffness_coefficients(vector), self.modal_stiffness)
         mass = dense_sum(self.mass_coefficients(vector), self.modal_mass)
-        # M x = K x / omega^2: the stiffness is well conditioned in this basis, the mass is not, and the low
-        # modes are the largest eigenvalues, which keep all their digits.
-        to_standard = np.linalg.inv(np.linalg.cholesky(stiffness))
-        inverse_square, vectors = np.linalg.eigh(to_standard @ mass @ to_standard.T)
-        inverse_square = inverse_square[::-1][: self.mode_count]
-        shape = to_standard.T @ vectors[:, ::-1][:, : self.mode_count] / np.sqrt(inverse_square)
+        frequency, shape = lowest_modes(stiffness, mass, self.mode_count)
         shape = shape * np.where(self.modal_output[-1] @ shape < 0.0, -1.0, 1.0)
         reference = self.followed_shapes @ mass
         size = np.sum(reference * self.followed_shapes, axis=1)[:, np.newaxis]
         assurance = (reference @ shape) ** 2 / size
         return Modes(
-            frequency=1.0 / (2.0 * np.pi * np.sqrt(inverse_square)),
+            frequency=frequency,
             shape=shape,
             output=self.modal_output @ shape,
             participation=self.modal_load @ shape,
