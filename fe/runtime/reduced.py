@@ -5,7 +5,7 @@ NumPy and relative imports only: this file is copied into the FMU. The equations
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
 
@@ -126,28 +126,22 @@ class ReducedModel(ReducedArrays):
     nominal, and healthy.
     """
 
-    _online: OnlineArrays = field(init=False, repr=False, compare=False)
-    _limits: tuple[tuple[float, float], ...] = field(init=False, repr=False, compare=False)
-    _pairs: tuple[tuple[tuple[int, int], ...], ...] = field(init=False, repr=False, compare=False)
+    @cached_property
+    def _online(self) -> OnlineArrays:
+        return OnlineArrays(self)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        limits = tuple((float(low), float(high)) for low, high in self.validity_box)
-        # places of a term's two factors among (1, what is chosen, what the losses leave)
+    @cached_property
+    def _pairs(self) -> tuple[list[list[int]], list[list[int]]]:
+        """Places of the two factors of each stiffness term and load among those of `_coefficients`."""
         parameters, regions, masses = len(self.parameters), len(self.regions), len(self.masses)
-        (scale, region), (control, mass) = self.stiffness_factors.T, self.load_factors.T
-        stiffness = np.stack((scale, np.where(region > 0, len(self.chosen) + region, 0)), axis=1)
-        load = np.stack(
-            (
-                np.where(control > 0, parameters + regions + masses + control, 0),
-                np.where(mass > 0, parameters + regions + mass, 0),
-            ),
-            axis=1,
+        # a factor that is counted from one, and after which others it comes; none is the one in front
+        losses, controls = parameters + regions, parameters + regions + masses
+        of_stiffness, of_load = (0, len(self.chosen)), (controls, losses)
+        stiffness, load = (
+            np.where(factors > 0, factors + np.array(offsets), 0).tolist()
+            for factors, offsets in ((self.stiffness_factors, of_stiffness), (self.load_factors, of_load))
         )
-        pairs = tuple(tuple(map(tuple, places.tolist())) for places in (stiffness, load))
-        object.__setattr__(self, "_online", OnlineArrays(self))
-        object.__setattr__(self, "_limits", limits)
-        object.__setattr__(self, "_pairs", pairs)
+        return stiffness, load
 
     def __repr__(self) -> str:
         return (
@@ -161,10 +155,10 @@ class ReducedModel(ReducedArrays):
         """Number of strain gauges G."""
         return len(self.gauges)
 
-    @property
+    @cached_property
     def validity(self) -> Mapping[str, tuple[float, float]]:
         """Least and largest value for which the model was made, by name (SI units)."""
-        return dict(zip(self.chosen, self._limits, strict=True))
+        return dict(zip(self.chosen, map(tuple, self.validity_box.tolist()), strict=True))
 
     def vector(
         self,
@@ -228,7 +222,7 @@ class ReducedModel(ReducedArrays):
         OutsideModelError
             If one lies outside; the sentence names it and its range.
         """
-        for name, value, (low, high) in zip(self.chosen, values, self._limits, strict=True):
+        for (name, (low, high)), value in zip(self.validity.items(), values, strict=True):
             if not low <= value <= high:
                 raise OutsideModelError(
                     f"{name} must lie between {low:g} and {high:g}, the range of the reduced model of "

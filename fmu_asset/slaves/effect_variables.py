@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES
 
@@ -39,19 +38,15 @@ UNITS = (
 """Units of effects beside those of `variables`."""
 
 
-@dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """One number of an effect: its variable, and where it stands in the effect's primitives."""
 
     name: str
     primitive: int
     key: str
-    value: float
-    unit: str
-    whole: bool
 
 
-def numbers_of(effect: Mapping[str, Any]) -> tuple[Number, ...]:
+def numbers_of(effect: Mapping[str, Any]) -> list[Number]:
     """Return the numbers of an effect in the order of its primitives.
 
     A number is called `effect.<id>.<key>`; where several primitives of the effect have one of that name,
@@ -63,23 +58,16 @@ def numbers_of(effect: Mapping[str, Any]) -> tuple[Number, ...]:
         `id`, and `primitives` as `ModelPatch.to_list` gives them.
     """
     found = [
-        (number, key, value, primitive)
+        (number, key)
         for number, primitive in enumerate(effect["primitives"])
         for key, value in primitive.items()
-        if isinstance(value, int | float) and not isinstance(value, bool)
+        if isinstance(value, int | float)
     ]
-    often = Counter(key for _, key, _, _ in found)
-    return tuple(
-        Number(
-            name=f"effect.{effect['id']}.{key}" + (f"[{number + 1}]" if often[key] > 1 else ""),
-            primitive=number,
-            key=key,
-            value=float(value),
-            unit=_unit(primitive, key),
-            whole=isinstance(value, int),
-        )
-        for number, key, value, primitive in found
-    )
+    often = Counter(key for _, key in found)
+    return [
+        Number(f"effect.{effect['id']}.{key}" + (f"[{number + 1}]" if often[key] > 1 else ""), number, key)
+        for number, key in found
+    ]
 
 
 def _unit(primitive: Mapping[str, Any], key: str) -> str:
@@ -93,12 +81,6 @@ def _unit(primitive: Mapping[str, Any], key: str) -> str:
         return "1" if displacement else "1/m"
     moving, _, turning = unit.partition(" or ")
     return (turning if turning and primitive.get("port") == ROTATING_PORT else moving).replace(" ", ".")
-
-
-def needs_temperature(effects: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether an effect depends on temperature."""
-    kinds = {primitive["kind"] for effect in effects for primitive in effect["primitives"]}
-    return bool(kinds & {"thermal_strain", "modulus_temperature"})
 
 
 def switch_of(effect: Mapping[str, Any]) -> str:
@@ -129,18 +111,20 @@ def effect_rows(
             f"Whether the effect {effect['id']} ({kinds.replace('_', ' ')}) acts: 0 off, 1 on",
             unit="1", box=(0.0, 1.0), default=start.get(switch, 0.0), tunable=True,
         )  # fmt: skip
-        for number in numbers_of(effect):
-            primitive = effect["primitives"][number.primitive]
-            place = primitive.get("port") or primitive.get("channel") or ""
+        for name, number, key in numbers_of(effect):
+            primitive = effect["primitives"][number]
+            value, place = primitive[key], primitive.get("port") or primitive.get("channel") or ""
             where = f" at {place}" if place not in ("", "*") else ""
-            text = f"{number.key.replace('_', ' ')} of {str(primitive['kind']).replace('_', ' ')}{where}"
+            text = f"{key.replace('_', ' ')} of {str(primitive['kind']).replace('_', ' ')}{where}"
+            whole = isinstance(value, int)
             table.add(
-                number.name, "parameter", text[:1].upper() + text[1:],
-                kind="Integer" if number.whole else "Real", unit=None if number.whole else number.unit,
-                box=RANGES[number.key] if number.whole else (None, None),
-                default=start.get(number.name, number.value), tunable=True,
+                name, "parameter", text[:1].upper() + text[1:],
+                kind="Integer" if whole else "Real", unit=None if whole else _unit(primitive, key),
+                box=RANGES[key] if whole else (None, None), default=start.get(name, value), tunable=True,
             )  # fmt: skip
-    if needs_temperature(effects):
+    if {"thermal_strain", "modulus_temperature"} & {
+        item["kind"] for effect in effects for item in effect["primitives"]
+    }:
         table.add(
             TEMPERATURE, "input", "Temperature of the wing less the reference temperature",
             unit="K", box=(-100.0, 100.0), default=start.get(TEMPERATURE, 0.0),
@@ -171,8 +155,7 @@ def active_primitives(
         if value[switch_of(effect)] <= 0.5:
             continue
         own = [dict(primitive) for primitive in effect["primitives"]]
-        for number in numbers_of(effect):
-            given = value[number.name]
-            own[number.primitive][number.key] = int(given) if number.whole else given
+        for name, number, key in numbers_of(effect):
+            own[number][key] = type(own[number][key])(value[name])
         rows += own
     return rows

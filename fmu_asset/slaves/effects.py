@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from fe.runtime.patch import ModelPatch
+from fe.runtime.patch import HighPass, ModelPatch
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_structure
 from fe.runtime.transient import ModalIntegrator
@@ -25,8 +23,7 @@ from .effect_variables import TEMPERATURE, active_primitives, effect_rows
 FloatArray = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Acting:
+class Acting(NamedTuple):
     """Effects with the values of their variables.
 
     Attributes
@@ -37,67 +34,17 @@ class Acting:
         What is on.
     temperature : float
         Less the reference temperature [K].
-    channels : tuple of (str, str)
-        As of `Effects`.
+    changes_structure : bool
+        Whether more is on than what sensors make of the readings.
+    filters : list of tuple
+        The chain of filters, whose memory stays where it is the same.
     """
 
     values: tuple[float, ...]
     patch: ModelPatch
     temperature: float
-    channels: tuple[tuple[str, str], ...]
-
-    @cached_property
-    def changes_structure(self) -> bool:
-        """Whether more is on than what sensors make of the readings."""
-        return needs_structure(self.patch)
-
-    @cached_property
-    def filters(self) -> list[tuple[object, ...]]:
-        """The chain of filters, whose memory stays where it is the same."""
-        return [
-            (item["channel"], item["quantity"], item["order"])
-            for item in self.patch.to_list()
-            if item["kind"] == "high_pass"
-        ]
-
-    def shown(
-        self, values: FloatArray, across: FloatArray | None, memory: Sequence[float] | None, duration: float,
-        end: float, *, begun: float, release: float, dynamic: bool,
-    ) -> tuple[list[float], list[float]]:  # fmt: skip
-        """Return what sensors show of the values (C,) of the channels at a time, and what they remember.
-
-        Parameters
-        ----------
-        values, across : (C,), (2, C) ndarray
-            What there is, and strains across and in shear; None: no sensor needs them.
-        memory : sequence of float, optional
-            From the sample before, `duration` earlier.
-        end, begun : float
-            Time of the sample, and of the start [s].
-        release : float
-            Amplitude of the release at the start [m]; zero: none, and decaying lines do nothing.
-        dynamic : bool
-            Whether this is a motion; else high-pass and lines do nothing.
-
-        Raises
-        ------
-        UnacceptableValuesError
-            If a reading is not finite.
-        """
-        record = SensorRecord(
-            channels=self.channels,
-            kind="flight" if not dynamic else "ringdown" if release else "forced",
-            time=np.array([end - begun if dynamic else end]),
-            start=begun,
-            temperature=np.array([self.temperature]),
-            release=release,
-        )
-        transverse, shear = (None, None) if across is None else across[:, np.newaxis]
-        filters = FilterMemory(memory, duration)
-        (shown,), _ = apply_sensors(self.patch, record, values[np.newaxis], None, transverse, shear, filters)
-        if not math.isfinite(float(shown.sum())):
-            raise UnacceptableValuesError("With the effects that are on, an output is not finite.")
-        return shown.tolist(), filters.after
+    changes_structure: bool
+    filters: list[tuple[str, str, float]]
 
 
 class Effects:
@@ -131,7 +78,42 @@ class Effects:
         """Return the effects as values of the variables have them; raises `InvalidPatchError`."""
         named = dict(zip(self._names, values, strict=True))
         patch = ModelPatch.from_list(active_primitives(self._effects, named))
-        return Acting(tuple(values), patch, named.get(TEMPERATURE, 0.0), self._channels)
+        filters = [(item.channel, item.quantity, item.order) for item in patch if isinstance(item, HighPass)]
+        return Acting(tuple(values), patch, named.get(TEMPERATURE, 0.0), needs_structure(patch), filters)
+
+    def shown(
+        self, acting: Acting, values: FloatArray, across: FloatArray | None,
+        memory: Sequence[float] | None, duration: float, *, time: float, **record: Any,
+    ) -> tuple[list[float], list[float]]:  # fmt: skip
+        """Return what sensors show of the values (C,) of the channels, and what they remember.
+
+        Parameters
+        ----------
+        acting : Acting
+            The effects.
+        values, across : (C,), (2, C) ndarray
+            What there is, and strains across and in shear; None: no sensor needs them.
+        memory : sequence of float, optional
+            From the sample before, `duration` earlier.
+        time : float
+            Of the sample, as of `SensorRecord` [s].
+        **record
+            The other values of `SensorRecord`.
+
+        Raises
+        ------
+        UnacceptableValuesError
+            If a reading is not finite.
+        """
+        row = SensorRecord(
+            self._channels, time=np.array([time]), temperature=np.array([acting.temperature]), **record
+        )
+        transverse, shear = (None, None) if across is None else across[:, np.newaxis]
+        filters = FilterMemory(memory, duration)
+        (shown,), _ = apply_sensors(acting.patch, row, values[np.newaxis], None, transverse, shear, filters)
+        if not math.isfinite(float(shown.sum())):
+            raise UnacceptableValuesError("With the effects that are on, an output is not finite.")
+        return shown.tolist(), filters.after
 
     def integrator(self, vector: FloatArray, damping: tuple[float, float], acting: Acting) -> ModalIntegrator:
         """Return the wing for patches in time, the last one where nothing changed."""
