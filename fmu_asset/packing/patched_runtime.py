@@ -14,8 +14,7 @@ from fe.runtime.sensors import needs_structure
 from fe.runtime.transient import ModalIntegrator
 from fmu_asset.errors import PatchFileError
 from fmu_asset.slaves.behaviour import StructureBehaviour
-from fmu_asset.slaves.effect_variables import effect_rows, switch_of
-from fmu_asset.slaves.effects import Effects
+from fmu_asset.slaves.effects import Effects, effect_rows, switch_of
 from fmu_asset.slaves.table import structure_table
 
 from .patch_file import Effect
@@ -30,7 +29,7 @@ def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
 
 
 def plain_effects(effects: Sequence[Effect]) -> list[dict[str, Any]]:
-    """Return effects as plain data, as `effect_variables` takes them."""
+    """Return effects as plain data, as `fmu_asset.slaves.effects` takes them."""
     return [{"id": effect.id, "primitives": effect.patch.to_list()} for effect in effects]
 
 

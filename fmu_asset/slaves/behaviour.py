@@ -7,8 +7,11 @@ same for a structure without effects.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +21,8 @@ from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 
-from .base import UnacceptableValuesError
-from .table import MODE_COUNT, Roles
+from .base import Contents, UnacceptableValuesError
+from .table import MODE_COUNT, Roles, structure_table
 from .variables import TRANSIENT, FmuVariable
 
 if TYPE_CHECKING:
@@ -259,3 +262,29 @@ class StructureBehaviour:
             return ModalIntegrator(self._model, vector, *self._damping)
         assert self._acting is not None
         return self._effects.integrator(vector, self._damping, self._acting)
+
+
+def load_contents(resources: Path) -> Contents:
+    """Return what the files that `fmu_asset.packing.structure_fmu` packed describe."""
+    model, start = ReducedModel.load(resources / "reduced_model.npz"), _read(resources / "start.json")
+    own = {name: value for name, value in start.items() if not name.startswith("effect.")}
+    table, roles = structure_table(model, own)
+    later, behaviour = later_outputs(table, roles), partial(StructureBehaviour, model, table, roles)
+    if not (resources / "effects.json").is_file():
+        return Contents(table, behaviour, later)
+    # a plain structure needs nothing of these
+    from fe.runtime.patch_arrays import PatchArrays
+    from fe.runtime.patched_wing import PatchedWing
+
+    from .effects import Effects, effect_rows
+
+    record, arrays = _read(resources / "effects.json"), resources / "patch_arrays.npz"
+    effects, channels = record["effects"], tuple((name, quantity) for name, quantity in record["channels"])
+    wing = PatchedWing(PatchArrays.load(arrays)) if arrays.is_file() else None
+    rows = effect_rows(effects, len(table), start)
+    return Contents(table + rows, lambda: behaviour(Effects(effects, channels, wing)), later)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return record
