@@ -31,17 +31,10 @@ from fe.runtime.patch import (
     RootCompliance,
 )
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.patched_wing import (
-    LOAD_PLACE,
-    MODE_COUNT,
-    ON_MODES,
-    PORTS,
-    PatchedWing,
-    motion_basis,
-    strain_gauge,
-)
+from fe.runtime.patched_wing import MODE_COUNT, ON_MODES, PatchedWing, motion_basis
 from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import wing_names
+from fe.runtime.wing_rows import LOAD_PLACE, PORTS, strain_gauge
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress
 

@@ -19,12 +19,7 @@ from .patch_arrays import PatchArrays
 from .planform_forces import STATION_PORTS
 from .reduced import lowest_modes
 from .state import Losses
-from .wing_rows import EMPTY as EMPTY
-from .wing_rows import LOAD_PLACE as LOAD_PLACE
-from .wing_rows import PORTS as PORTS
-from .wing_rows import Place as Place
-from .wing_rows import WingRows, remaining_skin
-from .wing_rows import strain_gauge as strain_gauge
+from .wing_rows import EMPTY, LOAD_PLACE, WingRows, remaining_skin
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -130,13 +125,6 @@ class PatchedWing(WingRows):
         From `fe.reduction.model_cache.patch_arrays`, or read from a file.
     """
 
-    def __init__(self, arrays: PatchArrays) -> None:
-        super().__init__(arrays)
-        lower = np.tril_indices(self.size)
-        self._strips = np.zeros((len(arrays.strip_of), self.size, self.size))
-        self._strips[:, lower[0], lower[1]] = arrays.strip_stiffness
-        self._strips[:, lower[1], lower[0]] = arrays.strip_stiffness
-
     def structure(
         self,
         young_modulus_factor: float,
@@ -214,9 +202,11 @@ class PatchedWing(WingRows):
             stiffness += spring * np.multiply.outer(arrays.flap_row, arrays.flap_row)
         skin = remaining_skin(patch, arrays.strip_lines)
         if skin is not None:
-            remaining = skin.of_strips[arrays.strip_of]
-            for part in np.flatnonzero(remaining != 1.0):
-                stiffness += (remaining[part] - 1.0) * theta[arrays.term_of[part]] * self._strips[part]
+            weights = (skin.of_strips[arrays.strip_of] - 1.0) * theta[arrays.term_of]
+            changed = np.flatnonzero(weights)
+            lower = np.zeros_like(stiffness)
+            lower[np.tril_indices(self.size)] = weights[changed] @ arrays.strip_stiffness[changed]
+            stiffness += lower + np.tril(lower, -1).T
         return np.asarray(stiffness)
 
     def at(

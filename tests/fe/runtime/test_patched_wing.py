@@ -25,7 +25,8 @@ from fe.runtime.patch import (
     RootCompliance,
     Washout,
 )
-from fe.runtime.patched_wing import EMPTY, PatchedWing
+from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.wing_rows import EMPTY
 from fe.wing.design import WingDesign
 from fe.wing.operators import (
     AffineOperators,
