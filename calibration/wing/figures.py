@@ -32,9 +32,9 @@ def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Fig
         One for each mode.
     """
     faces = _upper_faces(fields)
-    points = fields.basis.points
+    points = fields.points
     span = float(np.ptp(points[:, 1]))
-    shapes = fields.basis.modal_displacement @ modes.shape
+    shapes = fields.modal_displacement @ modes.shape
     rows = (len(titles) + 1) // 2
     figure, grid = panels(
         rows, 2, 1.5 * rows, 0.015 * rows, 0.0, wspace=0.06, hspace=0.04, left=0.01, right=0.99
@@ -54,13 +54,12 @@ def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Fig
 
 def _upper_faces(fields: WingFields) -> NDArray[np.int64]:
     """Return the corners of the outer faces of the upper skin, (F, 4)."""
-    basis = fields.basis
-    # the skin and the damage regions in it, see `fe.reduction.fields.FieldBasis`
-    skin = basis.cells[basis.region <= len(fields.model.regions)][:, :8]
-    height = basis.points[skin][:, :, 2]
+    # the skin and the damage regions in it, see `fe.reduction.fields.WingFields`
+    skin = fields.cells[fields.region <= len(fields.regions)][:, :8]
+    height = fields.points[skin][:, :, 2]
     skin = skin[height.mean(axis=1) > 0.0]
     candidates = skin[:, np.array(_FACES)]
-    corner = basis.points[candidates]
+    corner = fields.points[candidates]
     normal = np.cross(corner[:, :, 2] - corner[:, :, 0], corner[:, :, 3] - corner[:, :, 1])
     area = np.linalg.norm(normal, axis=2)
     broad = area > 0.5 * area.max(axis=1, keepdims=True)  # the skin is thin: inner and outer face
