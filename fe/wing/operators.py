@@ -72,8 +72,7 @@ def gauge_output(mesh: WingMesh, turned: float = 0.0) -> sparse.csr_array:
             *patch_pieces(distance, gauges.averaging_spanwise, mesh.span_lines), strict=True
         ):
             lead = plan.straight_chord_line * plan.chord(place / plan.semi_span)
-            _, _, lines = mesh.upper_skin_lines(place)
-            behind = patch_pieces(middle + lead, gauges.averaging_chordwise, lines)
+            behind = patch_pieces(middle + lead, gauges.averaging_chordwise, mesh.chord_places(place))
             for chordwise, chord_weight in zip(*behind, strict=True):
                 owner.append(gauge)
                 share.append(span_weight * chord_weight)
