@@ -135,7 +135,7 @@ def _modes(
         ) from None
     load, followed = terms.loads.T @ basis, np.empty((0, basis.shape[1]))
     if followed_load is not None:
-        square, shapes = eigenmodes(stiffness, mass, *terms.nominal, settings.mode_count)
+        square, shapes = eigenmodes((stiffness, mass), *terms.nominal, settings.mode_count)
         followed = shapes[:, most_moved(load[followed_load], square, shapes)].T
     return basis, {
         "modal_stiffness": stiffness,
