@@ -24,16 +24,15 @@ def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Fig
     titles : sequence of str
         One for each mode.
     """
-    basis = fields.basis
-    # the skin and the damage regions in it, see `fe.reduction.fields.FieldBasis`
-    skin = basis.cells[basis.region <= len(fields.model.regions)][:, :8]
-    upper = np.unique(skin[basis.points[skin][:, :, 2].mean(axis=1) > 0.0])
-    points = basis.points[upper]
+    # the skin and the damage regions in it, see `fe.reduction.fields.WingFields`
+    skin = fields.cells[fields.region <= len(fields.regions)][:, :8]
+    upper = np.unique(skin[fields.points[skin][:, :, 2].mean(axis=1) > 0.0])
+    points = fields.points[upper]
     # neighbours seen from above; those at the trailing edge, which is in front, are drawn last
     triangles = Triangulation(points[:, 1], points[:, 0]).triangles
     triangles = triangles[np.argsort(points[triangles, 0].mean(axis=1))]
     span = float(np.ptp(points[:, 1]))
-    shapes = (basis.modal_displacement @ modes.shape)[upper]
+    shapes = (fields.modal_displacement @ modes.shape)[upper]
     rows = (len(titles) + 1) // 2
     figure, grid = panels(
         rows, 2, 1.5 * rows, 0.015 * rows, 0.0, wspace=0.06, hspace=0.04, left=0.01, right=0.99
