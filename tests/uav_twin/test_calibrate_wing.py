@@ -536,6 +536,7 @@ def test_other_refusals(
         (["--fitted"], "--fitted needs --data", 2),
         (["--procedure", "other"], "other", 2),
         (["--seed", "1", "simulate"], "options go behind the command", 2),
+        (["--seed", "0", "simulate"], "options go behind the command", 2),
         (["--data", tmp_path, "ringdown"], "options go behind the command", 2),
     ):
         assert call(monkeypatch, "calibrate", *arguments) == code, arguments
