@@ -33,7 +33,7 @@ begin = time.perf_counter()
 from fe.reduction.model_cache import wing_fields
 from fe.reduction.fields import write_wing_vtu
 wing = wing_fields()
-write_wing_vtu(sys.argv[1], wing, wing.model.vector(stiffness_loss=(0.4, 0.2), load_factor=3.0))
+write_wing_vtu(sys.argv[1], wing, wing.vector(stiffness_loss=(0.4, 0.2), load_factor=3.0))
 print(json.dumps({"wall": time.perf_counter() - begin}))
 """
 STATES = 12

@@ -417,6 +417,10 @@ def coarse_plate(plate_file: Path) -> Structure:
 @pytest.fixture(scope="session")
 def plate_model(coarse_plate: Structure) -> ReducedModel:
     """Its reduced model."""
-    from fe.reduction.model_cache import reduced
+    from fe.reduction.reduced_basis import reduce_structure
+    from fe.reduction.settings import StructureSettings
 
-    return kept("coarse-plate", lambda: reduced(coarse_plate), FE, coarse_plate.design_hash)
+    def reduced() -> ReducedModel:
+        return reduce_structure(coarse_plate, "plate", StructureSettings.of(coarse_plate.design)).model
+
+    return kept("coarse-plate", reduced, FE, coarse_plate.design_hash)

@@ -108,7 +108,7 @@ def write_fields(design: "WingDesign", path: Path) -> tuple[Path, Path]:
     state = DigitalState()
     fields = wing_fields(design, progress=terminal.progress())
     path.parent.mkdir(parents=True, exist_ok=True)
-    vector = fields.model.vector(state.values, state.stiffness_loss, load_factor=3.0)
+    vector = fields.vector(state.values, state.stiffness_loss, load_factor=3.0)
     write_wing_vtu(path, fields, vector)
     modes = path.with_name(f"{path.stem}-modes{path.suffix}")
     write_modes_vtu(modes, fields, vector)

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.full.modes import lowest_eigenpairs
+from fe.full.modes import lowest_eigenpairs, most_moved
 from fe.full.statics import Factorisation
 from fe.runtime.errors import FiniteElementError
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, assemble, point_masses
-from fe.wing.responses import flapwise_bending_modes
 from reporting.progress import Progress, SilentProgress
 
 from .errors import IdentificationError
@@ -160,7 +159,7 @@ def _bases(
     servo = 0.5 * (MASS_TOTAL - REFERENCE_PITOT)
     stiffness, mass = operators.stiffness(), operators.mass(point_masses(servo, REFERENCE_PITOT))
     eigenvalues, shapes = lowest_eigenpairs(stiffness.tocsc(), mass.tocsc(), MODE_COUNT)
-    places = flapwise_bending_modes(operators, shapes, mass)
+    places = most_moved(operators.load_tip, eigenvalues, shapes)
     order = int(places[0]), int(places[1])
     bending = shapes[:, list(order)]
     # What the modes become when e or a mass changes a little.

@@ -5,15 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.full.modes import lowest_eigenpairs, track
+from fe.full.modes import lowest_eigenpairs, most_moved
 from fe.full.statics import Factorisation
 from fe.runtime.state import Losses
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, AffineWing, assemble, point_masses
-from fe.wing.responses import cantilever_bending, cantilever_bending_shapes
 
-from .plate import FIELDS, B, W
-from .sandwich_plate import PlateOperators, assemble_plate
+from .sandwich_plate import assemble_plate
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -128,8 +126,8 @@ def compare_with_plate(
     solid = assemble(design) if box is None else box
     plate = assemble_plate(design, straight_section=straight_section)
     return PlateAgreement(
-        wing_results(solid, design, cantilever_bending_shapes(solid)),
-        wing_results(plate, design, plate_bending_shapes(plate)),
+        wing_results(solid, design),
+        wing_results(plate, design),
         gauges_at_edges(design),
     )
 
@@ -175,7 +173,7 @@ def gauges_at_edges(design: WingDesign) -> BoolArray:
     return found
 
 
-def wing_results(model: AffineWing, design: WingDesign, bending_shapes: FloatArray) -> WingResults:
+def wing_results(model: AffineWing, design: WingDesign) -> WingResults:
     """Evaluate a model.
 
     Parameters
@@ -184,8 +182,6 @@ def wing_results(model: AffineWing, design: WingDesign, bending_shapes: FloatArr
         Box or plate.
     design : WingDesign
         The wing, for its load factor and masses.
-    bending_shapes : (n, 2)
-        First and second bending shape of a uniform cantilever, by which the modes are told apart.
     """
     loads = np.column_stack((model.load_tip, design.lift.load_factor * model.load_lift))
 
@@ -203,7 +199,7 @@ def wing_results(model: AffineWing, design: WingDesign, bending_shapes: FloatArr
     mass = model.mass(point_masses(design.masses.servo, design.masses.pitot))
     values, shapes = lowest_eigenpairs(model.stiffness(), mass, MODES)
     frequency = np.sqrt(values) / (2.0 * np.pi)
-    first, second = frequency[track(bending_shapes, shapes, mass)]
+    first, second = frequency[most_moved(model.load_tip, values, shapes)]
     return WingResults(
         unknowns=model.unknowns,
         tip_stiffness=1.0 / tip,
@@ -217,14 +213,3 @@ def wing_results(model: AffineWing, design: WingDesign, bending_shapes: FloatArr
             [damaged(tuple(loss)) / healthy for loss in DAMAGE * np.eye(len(model.regions))]
         ),
     )
-
-
-def plate_bending_shapes(operators: PlateOperators, count: int = 2) -> FloatArray:
-    """Flapwise bending shapes (n, count) of a uniform cantilever on the plate: w(y) and b = -w'(y)."""
-    points, span = operators.plate.node_points, operators.design.planform.semi_span
-    shapes = []
-    for deflection, slope in cantilever_bending(points[:, 1], span, count):
-        fields = np.zeros((len(FIELDS), len(points)))
-        fields[W], fields[B] = deflection, -slope
-        shapes.append(operators.free_unknowns(fields))
-    return np.stack(shapes, axis=1)

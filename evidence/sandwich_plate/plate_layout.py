@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from skfem import MeshQuad
 
-from fe.wing.design import WingDesign, rib_interval
-from fe.wing.grid import chord_lines, span_lines, web_faces
+from fe.wing.design import WingDesign
+from fe.wing.grid import chord_lines, rib_cells, span_lines, web_cells
 from fe.wing.mesh import straight_edged
 from fe.wing.parts import four_digit_half_thickness, four_digit_slope
 
@@ -51,36 +51,24 @@ class PlateLayout:
         self.design, self._straight_section = design, straight_section
         self.across, along = span_lines(design), chord_lines(design)
         self._along = along
-        root = design.planform.root_chord
         columns, rows = len(along) - 1, len(self.across) - 1
         grid = tensor_mesh(columns, rows)
         self._index_plate = Plate(grid)
         chord = self._chord(self.across)
         lead = -design.planform.straight_chord_line * chord
-        behind = np.array([[line.behind_leading_edge(c) for c in chord] for line in along])
+        behind = np.array([line.at(chord) for line in along])
         i, j = np.rint(grid.p).astype(int)
         self.plate = Plate(MeshQuad(np.stack((behind[i, j] + lead[j], self.across[j])), grid.t))
 
-        place = np.array([line.behind_leading_edge(root) for line in along])
-        middle = 0.5 * (place[1:] + place[:-1])
-        web = np.full(columns, -1)
-        for index in range(len(design.webs)):
-            front, rear = (face.behind_leading_edge(root) for face in web_faces(design, index))
-            web[(middle > front) & (middle < rear)] = index
+        web, rib = web_cells(design, along), rib_cells(design, self.across)
         wall = (np.arange(columns) == 0) & design.skin.closed_leading_edge
-        halfway = 0.5 * (self.across[1:] + self.across[:-1])
-        rib = np.full(rows, -1)
-        for index in range(len(design.ribs)):
-            start, end = rib_interval(design, index)
-            rib[(halfway > start) & (halfway < end)] = index
         column, row = np.floor(grid.p[:, grid.t].mean(axis=1)).astype(int)
         self.stiff_columns = (web >= 0) | wall
         self.web, self.wall = web[column], wall[column]
         self.rib = np.where(self.stiff_columns[column], -1, rib[row])
 
     def _chord(self, distance: FloatArray) -> FloatArray:
-        plan = self.design.planform
-        return np.asarray(plan.root_chord + (plan.tip_chord - plan.root_chord) * distance / plan.semi_span)
+        return self.design.planform.chord(distance / self.design.planform.semi_span)
 
     def chord_fraction(self, places: FloatArray) -> FloatArray:
         """Chord fraction (...,) of places (..., 2)."""
@@ -92,7 +80,7 @@ class PlateLayout:
         """Places (columns + 1,) aft of the straight chord line [m] of the mesh lines at a distance [m]."""
         plan = self.design.planform
         chord = plan.chord(distance / plan.semi_span)
-        behind = np.array([line.behind_leading_edge(chord) for line in self._along])
+        behind = np.array([line.at(chord) for line in self._along])
         return np.asarray(behind - plan.straight_chord_line * chord)
 
     def surface(self, places: FloatArray, depth: float = 0.0) -> Surface:
@@ -119,7 +107,7 @@ class PlateLayout:
         """Height and slope (...,) of a section that is straight between the mesh lines."""
         chord = self._chord(places[..., 1])
         behind = self.chord_fraction(places) * chord
-        lines = np.stack([line.fraction * chord + line.offset for line in self._along], axis=-1)
+        lines = np.stack([line.at(chord) for line in self._along], axis=-1)
         before = np.clip((lines <= behind[..., None]).sum(axis=-1) - 1, 0, lines.shape[-1] - 2)
         start, end = (
             np.take_along_axis(lines, (before + step)[..., None], axis=-1)[..., 0] for step in (0, 1)

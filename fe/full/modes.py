@@ -1,9 +1,8 @@
-"""Lowest eigenmodes of sparse matrices, tracked by their shapes."""
+"""Lowest eigenmodes of sparse matrices, and those that a load moves most."""
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, norm
 
 from fe.runtime.errors import SolutionError
@@ -17,25 +16,17 @@ MODE_RESIDUAL_LIMIT = 1e-12
 """Largest max|K phi - omega^2 M phi| / (|K| max|phi|), in maximum norms, of an accepted mode."""
 
 
-def modal_assurance(first: FloatArray, second: FloatArray, mass: sparse.sparray) -> FloatArray:
-    """Mass-weighted modal assurance criterion (m1, m2) of shapes (n, m1) and (n, m2); 1 for equal shapes."""
-    weighted = mass @ second
-    cross = (first.T @ weighted) ** 2
-    own_first = np.einsum("im,im->m", first, mass @ first)
-    own_second = np.einsum("im,im->m", second, weighted)
-    return np.asarray(cross / np.outer(own_first, own_second))
+def most_moved(load: FloatArray, values: FloatArray, shapes: FloatArray) -> IntArray:
+    """Find the two modes (2,), ascending, that contribute most to the compliance under a load.
 
-
-def track(reference: FloatArray, shapes: FloatArray, mass: sparse.sparray) -> IntArray:
-    """Index (m1,) of the mode in `shapes` (n, m2) that continues each of `reference` (n, m1), m1 <= m2.
-
-    The assignment has the greatest sum of modal assurance criteria, so that crossing modes keep their names.
+    Parameters
+    ----------
+    load : (n,)
+        The load, on what the shapes are of.
+    values, shapes : (m,), (n, m)
+        Squared angular frequencies and mass-normalised shapes.
     """
-    assurance = modal_assurance(reference, shapes, mass)
-    rows, columns = linear_sum_assignment(assurance, maximize=True)
-    result = np.empty(reference.shape[1], dtype=np.int64)
-    result[rows] = columns
-    return result
+    return np.asarray(np.sort(np.argsort((load @ shapes) ** 2 / values)[-2:]))
 
 
 def lowest_eigenpairs(

@@ -3,6 +3,7 @@
 The method and what it reaches are in `docs/reduced_model.md`.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
@@ -11,19 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fe.full.affine import AffineSum
-from fe.full.subspace import (
-    BlockDiagonal,
-    FunctionalBasis,
-    Norm,
-    OrthonormalBasis,
-    conjugate_gradients,
-)
+from fe.full.subspace import FunctionalBasis, Norm
 from fe.runtime.reduced import ReducedModel
 
-from .dual_solutions import DualProblem
+from .dual_solutions import dual_solutions
 from .settings import TOGETHER
-from .terms import ReductionTerms, State
+from .terms import ProjectedBasis, ReductionTerms, State, solved_together
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -53,67 +47,46 @@ class StaticReduction:
 
     def __init__(self, terms: ReductionTerms, norm: Norm, advance: Callable[[int, str], object]) -> None:
         self.terms, self.norm, self.advance = terms, norm, advance
-        self.stiffness = AffineSum(terms.stiffness_terms).matrix
         self.least = terms.least(norm)
         n, count = len(terms.loads), len(terms.stiffness_terms)
-        self.basis = OrthonormalBasis(n, norm, drop=1e-7)
-        self.in_basis = np.empty((count, 0, 0))  # stiffness terms in the basis
+        self.basis = ProjectedBasis(norm, [terms.stiffness_terms], drop=1e-7)
         self.rounding = 0.0
         self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
         self.residual_load = self.residual_basis.extend(terms.loads)
         self.residual_stiffness = np.empty((len(self.residual_load), count, 0))
-        self.dual = terms.duals(
-            DualProblem(terms.stiffness_terms, terms.outputs, norm, self.stiffness, advance)
-        )
-        self.correction = np.swapaxes(self.dual.products, 1, 2) @ self.residual_basis.vectors
+        products, self.duals = dual_solutions(terms, norm, advance)
+        self.dual_products = np.swapaxes(products, 1, 2)
+        self.correction = self.dual_products @ self.residual_basis.vectors
         self.snapshots: list[State] = []
 
     def add_snapshots(self, states: list[State]) -> bool:
         """Solve the full model for all loads at several states and extend the bases."""
-        thetas, loads = [self.terms.theta(state) for state in states], self.terms.loads
+        thetas = [self.terms.theta(state) for state in states]
         # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
         tolerance = SNAPSHOT_TOLERANCE if self.snapshots else FIRST_TOLERANCE
-        solution = conjugate_gradients(
-            BlockDiagonal([self.stiffness(theta) for theta in thetas]),
-            self.norm,
-            np.concatenate([loads] * len(states), axis=1),
-            np.concatenate([self._galerkin(theta) for theta in thetas], axis=1),
-            tolerance=tolerance,
-        )
-        before = self.basis.size
-        self.basis.extend(solution, self.norm.product(solution))
-        new = self.basis.vectors[:, before:]
-        if not new.shape[1]:
+        starts = [self._galerkin(theta) for theta in thetas]
+        solutions = solved_together(self.terms, self.norm, thetas, self.terms.loads, starts, tolerance)
+        (images,) = self.basis.extend(np.concatenate(solutions, axis=1))
+        if not images[0].size:
             return False  # rounding is reached; what the search reached is judged after it
-        self._take_images([np.asarray(term @ new) for term in self.terms.stiffness_terms])
-        if not self.snapshots:
-            self.rounding = self._rounding(thetas[0], self.terms.outputs.T @ solution)
-        self.snapshots.extend(states)
-        return True
-
-    def _take_images(self, images: list[FloatArray]) -> None:
-        """Take the stiffness terms times the last basis vectors, (n, k) each, into what is kept of all."""
-        before, known = self.in_basis.shape[-1], self.residual_basis.vectors.shape[1]
-        basis = self.basis.vectors
-        new = np.stack([basis.T @ image for image in images])
-        older = np.swapaxes(new[:, :before], 1, 2)
-        self.in_basis = np.concatenate((np.concatenate((self.in_basis, older), axis=1), new), axis=2)
+        known = self.residual_basis.vectors.shape[1]
         found = self.residual_basis.extend(np.concatenate(images, axis=1))
+        added = self.dual_products @ self.residual_basis.vectors[:, known:]
+        self.correction = np.concatenate((self.correction, added), axis=2)
         # what was there lies in the basis that was there
         self.residual_load = _with_rows(self.residual_load, len(found))
         self.residual_stiffness = np.concatenate(
             (_with_rows(self.residual_stiffness, len(found)), found.reshape(len(found), len(images), -1)),
             axis=2,
         )
-        added = np.swapaxes(self.dual.products, 1, 2) @ self.residual_basis.vectors[:, known:]
-        self.correction = np.concatenate((self.correction, added), axis=2)
+        if not self.snapshots:
+            self.rounding = self._rounding(thetas[0], self.terms.outputs.T @ solutions[0])
+        self.snapshots.extend(states)
+        return True
 
     def _galerkin(self, theta: FloatArray) -> FloatArray:
         """Return the solutions (n, L) in the present basis."""
-        if not self.basis.size:
-            return np.zeros_like(self.terms.loads)
-        basis = self.basis.vectors
-        stiffness = np.tensordot(theta, self.in_basis, 1)
+        basis, stiffness = self.basis.vectors, np.tensordot(theta, self.basis.inner[0], 1)
         return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.terms.loads))
 
     def _rounding(self, theta: FloatArray, wanted: FloatArray) -> float:
@@ -131,7 +104,7 @@ class StaticReduction:
         """Return the static fields of `ReducedArrays`, and `cross_mass` with the static basis alone."""
         terms, basis = self.terms, self.basis.vectors
         return {
-            "static_stiffness": 0.5 * (self.in_basis + self.in_basis.transpose(0, 2, 1)),
+            "static_stiffness": 0.5 * (self.basis.inner[0] + self.basis.inner[0].transpose(0, 2, 1)),
             "static_load": terms.loads.T @ basis,
             "static_output": terms.outputs.T @ basis,
             "bound_reference": terms.reference[:-1],
@@ -143,9 +116,7 @@ class StaticReduction:
             + 1e-7,
             "rounding_allowance": max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
             "dual_correction": self.correction,
-            "dual_residual": self.dual.factors,
-            "dual_stiffness": self.dual.stiffness,
-            "dual_output": self.dual.output,
+            **self.duals,
         }
 
     def cross_mass(self, modal_basis: FloatArray) -> FloatArray:
@@ -197,7 +168,7 @@ def greedy(
     chosen = [states[int(((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin())]]
     for number in range(1 + ceil((most_snapshots - 1) / TOGETHER)):
         if number:
-            few = len(states) // LOOKED_AT if number > 1 and static.dual.output.size else 0
+            few = len(states) // LOOKED_AT if number > 1 and static.duals["dual_output"].size else 0
             bounds = _bounds(static, model(), states, known, few, wanted)
             history.append(float(bounds.max()))
             if history[-1] <= wanted:
@@ -308,12 +279,10 @@ def fewest_directions(
         for response in static.terms.responses(model, state):
             solutions.append(response.coordinates / np.linalg.norm(response.coordinates))
     directions = np.linalg.svd(np.array(solutions).T, full_matrices=False)[0]
-    low, high = min(2, directions.shape[1]), directions.shape[1]
-    while low < high:
-        middle = (low + high) // 2
-        smaller = compressed(model, directions[:, :middle])
-        if all(static.bound(smaller, state) <= tolerance for state in states):
-            high = middle
-        else:
-            low = middle + 1
-    return np.asarray(directions[:, :low])
+
+    def good(count: int) -> bool:
+        smaller = compressed(model, directions[:, :count])
+        return all(static.bound(smaller, state) <= tolerance for state in states)
+
+    most = directions.shape[1]
+    return directions[:, : bisect_left(range(most), True, min(2, most), key=good)]

@@ -4,16 +4,16 @@ Either the solution at the nearest of several anchors is taken, or those at a fe
 state, as a reduced basis of each output (Rozza, Huynh and Patera 2008).
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
-from fe.full.subspace import BlockDiagonal, Norm, conjugate_gradients
+from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
+
+from .terms import ReductionTerms, solved_together
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -25,104 +25,84 @@ MOST_COLUMNS = 48
 """Columns of approximate dual solutions that are iterated together."""
 
 
-@dataclass(frozen=True)
-class DualData:
-    """Approximate dual solutions: whitened products with X (A or M, n, O), the rest as in `ReducedArrays`."""
+def dual_solutions(
+    terms: ReductionTerms, norm: Norm, advance: Callable[[int, str], object]
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Solve K psi = l for each output l, roughly: the norms of what that leaves are computed, not assumed.
 
-    products: FloatArray
-    factors: FloatArray
-    stiffness: FloatArray
-    output: FloatArray
-
-
-@dataclass(frozen=True)
-class DualProblem:
-    """The dual problems of an affine structure: K psi = l for each of its outputs.
-
-    Attributes
+    Parameters
     ----------
-    terms : tuple of csr (n, n)
-        Stiffness terms.
-    outputs : (n, O) ndarray
-        Outputs.
+    terms : ReductionTerms
+        The full model.
     norm : Norm
-        Energy norm of one stiffness.
-    stiffness : callable
-        The stiffness at coefficients (T,).
+        Energy norm X of one stiffness.
     advance : callable
         Told one more part, and of what.
+
+    Returns
+    -------
+    products : (A or M, n, O) ndarray
+        X times the functions, whitened.
+    arrays : dict of str to ndarray
+        `dual_residual`, `dual_stiffness` and `dual_output` of `ReducedArrays`.
     """
+    states, combined = terms.dual_states()
+    at_once = max(1, MOST_COLUMNS // terms.outputs.shape[1])
+    start, found = norm.riesz(terms.outputs), []
+    for first in range(0, len(states), at_once):
+        chosen = states[first : first + at_once]
+        tolerance = COMBINED_TOLERANCE if combined else DUAL_TOLERANCE
+        found += solved_together(terms, norm, chosen, terms.outputs, [start] * len(chosen), tolerance)
+        advance(len(chosen), "dual solutions")
+    duals, arrays = (_combined if combined else _nearest)(terms, norm, np.stack(found))
+    return np.stack([norm.whitened(norm.product(dual)) for dual in duals]), arrays
 
-    terms: tuple[sparse.csr_array, ...]
-    outputs: FloatArray
-    norm: Norm
-    stiffness: Callable[[FloatArray], Any]
-    advance: Callable[[int, str], object]
 
-    def nearest(self, anchors: list[FloatArray]) -> DualData:
-        """Return the solutions at anchors (T,), with the norms of their residuals elsewhere."""
-        count, terms = self.outputs.shape[1], len(self.terms)
-        # a rough solution will do: the norm of what it leaves is computed, not assumed
-        duals = np.stack(list(self._solutions(anchors, DUAL_TOLERANCE)))
-        factors = np.empty((len(anchors), count, terms, terms))
-        for number, dual in enumerate(duals):
-            images = [np.asarray(term @ dual) for term in self.terms]
-            functionals = np.stack((self.outputs - images[-1], *images[:-1]), axis=2)
-            factors[number] = [self._factor(functionals[:, output]) for output in range(count)]
-        return DualData(self._whitened(duals), factors, np.empty((count, terms, 0, 0)), np.empty((count, 0)))
+def _nearest(
+    terms: ReductionTerms, norm: Norm, duals: FloatArray
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Take the solutions (A, n, O) at anchors alone, with the norms of their residuals elsewhere."""
+    factors = []
+    for dual in duals:
+        *varied, constant = (np.asarray(term @ dual) for term in terms.stiffness_terms)
+        functionals = np.stack((terms.outputs - constant, *varied), axis=2)
+        factors.append([_factor(norm, part) for part in functionals.swapaxes(0, 1)])
+    count = terms.outputs.shape[1]
+    none = np.empty((count, len(terms.stiffness_terms), 0, 0))
+    arrays = {"dual_stiffness": none, "dual_output": np.empty((count, 0))}
+    return duals, {"dual_residual": np.array(factors), **arrays}
 
-    def combined(self, states: list[FloatArray]) -> DualData:
-        """Return the solutions at coefficients (T,), made orthonormal for each output, to be combined."""
-        duals = np.stack(list(self._solutions(states, COMBINED_TOLERANCE)), axis=2)  # (n, O, M)
-        terms, count = len(self.terms), self.outputs.shape[1]
-        kept = 0
-        for dual in duals.transpose(1, 0, 2):
-            square, turn = np.linalg.eigh(dual.T @ self.norm.product(dual))
-            used = np.flatnonzero(square > DEPENDENT**2 * square[-1])[::-1]
-            basis = dual @ (turn[:, used] / np.sqrt(square[used]))
-            dual[:] = 0.0
-            dual[:, : len(used)] = basis
-            kept = max(kept, len(used))
-        duals = duals[:, :, :kept]
-        factors = np.empty((1, count, 1 + terms * kept, 1 + terms * kept))
-        stiffness = np.empty((count, terms, kept, kept))
-        for number, (dual, output) in enumerate(zip(duals.transpose(1, 0, 2), self.outputs.T, strict=True)):
-            images = [np.asarray(term @ dual) for term in self.terms]
-            stiffness[number] = [dual.T @ image for image in images]
-            factors[0, number] = self._factor(np.column_stack((output, *images)))
-        absent = np.asarray(~duals.any(axis=0))
-        stiffness[:, -1] += absent[:, :, np.newaxis] * np.eye(
-            kept
-        )  # a function that is not there gets no part
-        output = np.einsum("no,nom->om", self.outputs, duals)
-        return DualData(self._whitened(duals.transpose(2, 0, 1)), factors, stiffness, output)
 
-    def _factor(self, functionals: FloatArray) -> FloatArray:
-        """Return R (k, k) with |functionals (n, k) @ c| = |R @ c| in the dual norm."""
-        found = np.asarray(np.linalg.qr(self.norm.whitened(functionals), mode="r"))
-        if not np.isfinite(found).all():
-            raise ReductionError(
-                "The dual residuals are not finite; the full model holds a value that is not."
-            )
-        return found
+def _combined(
+    terms: ReductionTerms, norm: Norm, solutions: FloatArray
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Make the solutions (M, n, O) at states orthonormal for each output, to be combined."""
+    bases, kept = [], 0
+    for dual in solutions.transpose(2, 1, 0):
+        square, turn = np.linalg.eigh(dual.T @ norm.product(dual))
+        used = np.flatnonzero(square > DEPENDENT**2 * square[-1])[::-1]
+        bases.append(np.zeros_like(dual))
+        bases[-1][:, : len(used)] = dual @ (turn[:, used] / np.sqrt(square[used]))
+        kept = max(kept, len(used))
+    duals = np.stack(bases)[:, :, :kept]  # (O, n, M)
+    images = [[np.asarray(term @ dual) for term in terms.stiffness_terms] for dual in duals]
+    stiffness = np.array([[dual.T @ part for part in own] for dual, own in zip(duals, images, strict=True)])
+    absent = np.asarray(~duals.any(axis=1))
+    stiffness[:, -1] += absent[:, :, np.newaxis] * np.eye(kept)  # a function that is not there gets no part
+    factors = [
+        _factor(norm, np.column_stack((output, *own)))
+        for output, own in zip(terms.outputs.T, images, strict=True)
+    ]
+    return duals.transpose(2, 1, 0), {
+        "dual_residual": np.array([factors]),
+        "dual_stiffness": stiffness,
+        "dual_output": np.einsum("no,onm->om", terms.outputs, duals),
+    }
 
-    def _whitened(self, duals: FloatArray) -> FloatArray:
-        """Return X times dual functions (M, n, O), whitened."""
-        return np.stack([self.norm.whitened(self.norm.product(dual)) for dual in duals])
 
-    def _solutions(self, states: list[FloatArray], tolerance: float) -> Iterator[FloatArray]:
-        """Yield the solutions (n, O) at coefficients (T,), one state after another."""
-        at_once = max(1, MOST_COLUMNS // self.outputs.shape[1])
-        start = self.norm.riesz(self.outputs)
-        for first in range(0, len(states), at_once):
-            chosen = states[first : first + at_once]
-            duals = conjugate_gradients(
-                BlockDiagonal([self.stiffness(theta) for theta in chosen]),
-                self.norm,
-                np.concatenate([self.outputs] * len(chosen), axis=1),
-                np.concatenate([start] * len(chosen), axis=1),
-                tolerance=tolerance,
-            )
-            for dual in np.split(duals, len(chosen), axis=1):
-                yield dual
-                self.advance(1, "dual solutions")
+def _factor(norm: Norm, functionals: FloatArray) -> Any:
+    """Return R (k, k) with |functionals (n, k) @ c| = |R @ c| in the dual norm."""
+    found = np.linalg.qr(norm.whitened(functionals), mode="r")
+    if not np.isfinite(found).all():
+        raise ReductionError("The dual residuals are not finite; the full model holds a value that is not.")
+    return found

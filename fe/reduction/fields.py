@@ -4,16 +4,15 @@ No equation of the full model is solved here: the reduced solution is spread ove
 basis, which takes milliseconds.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fe.elements.kinds import HEXAHEDRA_20
 from fe.runtime.errors import ReducedModelFileError
-from fe.runtime.kept_arrays import KeptArrays
 from fe.runtime.reduced import ReducedModel
 from fe.structure.field import centre_strains, write_vtu
 
@@ -29,8 +28,8 @@ _CELLS = HEXAHEDRA_20.file_type
 
 
 @dataclass(frozen=True, repr=False)
-class FieldBasis(KeptArrays):
-    """The bases of a reduced model on the nodes and cells of the mesh.
+class WingFields(ReducedModel):
+    """A reduced model with its bases on the nodes and cells of the mesh; `wing_fields` gives it.
 
     Attributes
     ----------
@@ -61,56 +60,31 @@ class FieldBasis(KeptArrays):
                 "The cells of a field basis have nodes that are not there; build the basis anew."
             )
 
-
-@dataclass(frozen=True)
-class WingFields:
-    """A reduced model with its field basis; `fe.reduction.model_cache.wing_fields` gives it.
-
-    Attributes
-    ----------
-    model : ReducedModel
-        The reduced model.
-    basis : FieldBasis
-        Its bases on the mesh.
-    """
-
-    model: ReducedModel
-    basis: FieldBasis
-
-    def __post_init__(self) -> None:
-        sizes = (self.basis.static_displacement.shape[-1], self.basis.modal_displacement.shape[-1])
-        wanted = (self.model.static_stiffness.shape[-1], self.model.modal_stiffness.shape[-1])
-        if sizes != wanted or self.basis.design_hash != self.model.design_hash:
-            raise ReducedModelFileError(
-                f"The field basis, for {sizes} basis vectors, does not belong to the reduced model, which "
-                f"has {wanted}; build both anew."
-            )
+    @property
+    def model(self) -> ReducedModel:
+        """The reduced model alone."""
+        return ReducedModel(**_content(self))
 
 
-def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBasis:
-    """Spread the bases of a reduction over the mesh.
+def _content(model: ReducedModel) -> dict[str, Any]:
+    """Return what a reduced model holds, by the names of its fields."""
+    return {item.name: getattr(model, item.name) for item in fields(ReducedModel) if item.init}
 
-    Parameters
-    ----------
-    operators : AffineOperators
-        The full model.
-    reduction : Reduction
-        What was made of it.
-    """
+
+def field_basis(operators: "AffineOperators", reduction: "Reduction") -> WingFields:
+    """Spread the bases of a reduction of the full model over its mesh."""
     mesh = operators.wing_mesh
-
-    def spread(vectors: FloatArray) -> FloatArray:
-        return np.asarray(operators.expansion @ vectors)
-
-    static = spread(reduction.static_basis)
-    modal = spread(reduction.modal_basis)
-    return FieldBasis(
-        design_hash=operators.design_hash,
+    static, modal = (
+        np.asarray(operators.expansion @ basis).reshape(-1, 3, basis.shape[1])
+        for basis in (reduction.static_basis, reduction.modal_basis)
+    )
+    return WingFields(
+        **_content(reduction.model),
         points=mesh.points,
         cells=mesh.cells,
         region=mesh.region,
-        static_displacement=static.reshape(-1, 3, static.shape[1]),
-        modal_displacement=modal.reshape(-1, 3, modal.shape[1]),
+        static_displacement=static,
+        modal_displacement=modal,
     )
 
 
@@ -118,7 +92,7 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
     """Write displacement, strain and damage of the wing at rest as a VTU file.
 
     Point data: `displacement` [m]. Cell data, at the centres of the cells: `strain` (xx, yy, zz, yz, xz, xy),
-    `spanwise_strain` (yy, positive where compressed, as the gauges), `region` (as in `FieldBasis`),
+    `spanwise_strain` (yy, positive where compressed, as the gauges), `region` (as in `WingFields`),
     `stiffness_loss` (fraction).
 
     Parameters
@@ -137,18 +111,18 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
     OSError
         If the file cannot be written.
     """
-    coordinates, basis = wing.model.static_response(vector).coordinates, wing.basis
-    displacement, loss = basis.static_displacement @ coordinates, np.zeros(len(basis.region))
-    strain = centre_strains(HEXAHEDRA_20, basis.points, basis.cells, displacement)
-    for number, name in enumerate(wing.model.regions, start=1):
-        loss[basis.region == number] = vector[wing.model.chosen.index(name)]
+    displacement = wing.static_displacement @ wing.static_response(vector).coordinates
+    loss = np.zeros(len(wing.region))
+    for number, name in enumerate(wing.regions, start=1):
+        loss[wing.region == number] = vector[wing.chosen.index(name)]
+    strain = centre_strains(HEXAHEDRA_20, wing.points, wing.cells, displacement)
     cells = {
         "strain": strain,
         "spanwise_strain": -strain[:, 1],
-        "region": basis.region,
+        "region": wing.region,
         "stiffness_loss": loss,
     }
-    write_vtu(path, basis.points, (_CELLS, basis.cells), {"displacement": displacement}, cells)
+    write_vtu(path, wing.points, (_CELLS, wing.cells), {"displacement": displacement}, cells)
 
 
 def write_modes_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> None:
@@ -157,10 +131,9 @@ def write_modes_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> N
     Point data: `mode_1_5.632Hz` and so on, mass-normalised displacements [kg^-1/2]. Cell data: `region`.
     Parameters and errors are those of `write_wing_vtu`.
     """
-    modes, basis = wing.model.modes(vector), wing.basis
-    shapes = basis.modal_displacement @ modes.shape
+    modes = wing.modes(vector)
     named = {
-        f"mode_{number + 1}_{frequency:.3f}Hz": np.ascontiguousarray(shapes[:, :, number])
-        for number, frequency in enumerate(modes.frequency)
+        f"mode_{number}_{frequency:.3f}Hz": wing.modal_displacement @ shape
+        for number, (frequency, shape) in enumerate(zip(modes.frequency, modes.shape.T, strict=True), start=1)
     }
-    write_vtu(path, basis.points, (_CELLS, basis.cells), named, {"region": basis.region})
+    write_vtu(path, wing.points, (_CELLS, wing.cells), named, {"region": wing.region})

@@ -4,60 +4,31 @@ First a working basis is grown by Davidson corrections until the modes of sample
 in it; then the modes of many states, computed in the working basis, are compressed by singular values.
 """
 
-from collections.abc import Callable
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import eigh
 
-from fe.full.affine import AffineSum, affine_sum
-from fe.full.subspace import Norm, OrthonormalBasis
+from fe.full.affine import affine_sum
+from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
 
 from .settings import TOGETHER, ModalSettings
-from .terms import ModalState, ReductionTerms
+from .terms import ModalState, ProjectedBasis, ReductionTerms
 
 FloatArray = npt.NDArray[np.float64]
 
 START_ITERATIONS = 4
 
 
-class _WorkingBasis:
-    """Basis orthonormal in the reference norm, with the projected terms."""
-
-    def __init__(self, system: ReductionTerms, norm: Norm) -> None:
-        self.system, self.norm = system, norm
-        self.sums = tuple(AffineSum(terms).matrix for terms in (system.stiffness_terms, system.mass_terms))
-        self.basis = OrthonormalBasis(system.stiffness_terms[0].shape[0], norm, drop=1e-6)
-        self.stiffness = np.empty((len(system.stiffness_terms), 0, 0))
-        self.mass = np.empty((len(system.mass_terms), 0, 0))
-
-    def extend(self, vectors: FloatArray) -> None:
-        """Add vectors (n, k) and project the terms on them."""
-        before = self.basis.size
-        self.basis.extend(vectors, self.norm.product(vectors))
-        new = self.basis.vectors[:, before:]
-        for name, terms in (("stiffness", self.system.stiffness_terms), ("mass", self.system.mass_terms)):
-            old = getattr(self, name)
-            grown = np.empty((len(terms), self.basis.size, self.basis.size))
-            grown[:, :before, :before] = old
-            for row, term in zip(grown, terms, strict=True):
-                row[:, before:] = self.basis.vectors.T @ (term @ new)
-                row[before:, :] = row[:, before:].T
-            setattr(self, name, grown)
-
-    def modes(self, theta: FloatArray, mass_theta: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return squared angular frequencies (count,) and coefficients (k, count) of the first modes."""
-        return eigenmodes(self.stiffness, self.mass, theta, mass_theta, count)
-
-
 def eigenmodes(
-    stiffness: FloatArray, mass: FloatArray, theta: FloatArray, mass_theta: FloatArray, count: int
+    terms: Sequence[FloatArray], theta: FloatArray, mass_theta: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the first modes of projected terms: squared angular frequencies and mass-normalised shapes."""
-    values, vectors = eigh(
-        np.tensordot(theta, stiffness, 1), np.tensordot(mass_theta, mass, 1), subset_by_index=[0, count - 1]
-    )
+    """Return squared angular frequencies and mass-normalised shapes of the first modes of projected terms."""
+    pair = (np.tensordot(values, part, 1) for values, part in zip((theta, mass_theta), terms, strict=True))
+    values, vectors = eigh(*pair, subset_by_index=[0, count - 1])
     return np.asarray(values), np.asarray(vectors)
 
 
@@ -95,7 +66,7 @@ def modal_basis(
         raise ReductionError(
             f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
         )
-    working = _WorkingBasis(system, norm)
+    working = ProjectedBasis(norm, (system.stiffness_terms, system.mass_terms), drop=1e-6)
     matrix = affine_sum(system.middle_mass, system.mass_terms)
     # inverse iteration on a block; what it leaves is refined below
     vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
@@ -104,37 +75,38 @@ def modal_basis(
     working.extend(vectors)
     sampled = system.sampled_modes()
     for first in range(0, len(sampled), TOGETHER):
-        _refine(working, sampled[first : first + TOGETHER], count, settings, advance)
+        _refine(system, norm, working, sampled[first : first + TOGETHER], count, settings, advance)
     basis = _compress(working, system.compressed_modes(), count, settings)
     stiffness, mass = (
         # What rounding made of the symmetry of large entries is averaged out.
         0.5 * (terms + terms.transpose(0, 2, 1))
-        for terms in (basis.T @ working.stiffness @ basis, basis.T @ working.mass @ basis)
+        for terms in (basis.T @ inner @ basis for inner in working.inner)
     )
-    return working.basis.vectors @ basis, stiffness, mass
+    return working.vectors @ basis, stiffness, mass
 
 
 def _refine(
-    working: _WorkingBasis,
+    system: ReductionTerms,
+    norm: Norm,
+    working: ProjectedBasis,
     states: list[ModalState],
     count: int,
     settings: ModalSettings,
     advance: Callable[[], object],
 ) -> None:
     """Add Davidson corrections X^-1 (K - omega^2 M) phi until all modes of the states are found well."""
-    open_states = [
-        (*state, *(sums(values) for sums, values in zip(working.sums, state, strict=True)))
-        for state in states
-    ]
+    open_states = [(*state, system.stiffness(state[0]), system.mass(state[1])) for state in states]
     largest = np.inf
     for _ in range(settings.most_corrections):
-        modes = [working.modes(theta, mass_theta, count) for theta, mass_theta, _, _ in open_states]
+        modes = [
+            eigenmodes(working.inner, theta, mass_theta, count) for theta, mass_theta, _, _ in open_states
+        ]
         residual = []
         for (_, _, stiffness, mass), (square, coefficients) in zip(open_states, modes, strict=True):
-            shape = working.basis.vectors @ coefficients
+            shape = working.vectors @ coefficients
             residual.append(stiffness @ shape - (mass @ shape) * square)
         residuals = np.concatenate(residual, axis=1)
-        correction = working.norm.riesz(residuals)
+        correction = norm.riesz(residuals)
         # (r, X^-1 r) / (phi, K phi); phi is mass-normalised
         squares = np.concatenate([square for square, _ in modes])
         sizes = np.sqrt(np.einsum("ik,ik->k", residuals, correction) / squares)
@@ -154,10 +126,10 @@ def _refine(
 
 
 def _compress(
-    working: _WorkingBasis, states: list[ModalState], count: int, settings: ModalSettings
+    working: ProjectedBasis, states: list[ModalState], count: int, settings: ModalSettings
 ) -> FloatArray:
     """Return the fewest singular directions (k, Nm) of many states' modes that keep every frequency."""
-    modes = [working.modes(*state, count) for state in states]
+    modes = [eigenmodes(working.inner, *state, count) for state in states]
     kept = settings.mode_count
     snapshots = np.concatenate(
         [shape[:, :kept] / np.linalg.norm(shape[:, :kept], axis=0) for _, shape in modes], axis=1
@@ -165,19 +137,13 @@ def _compress(
     directions, singular, _ = np.linalg.svd(snapshots, full_matrices=False)
     most = int(np.sum(singular > 1e-7 * singular[0]))
 
-    def added_error(size: int) -> float:
-        basis = directions[:, :size]
-        stiffness, mass = basis.T @ working.stiffness @ basis, basis.T @ working.mass @ basis
-        return max(
-            float(np.max(eigenmodes(stiffness, mass, *state, kept)[0] / square[:kept]))
+    def good(size: int) -> bool:
+        smaller = [directions[:, :size].T @ inner @ directions[:, :size] for inner in working.inner]
+        worst = max(
+            float(np.max(eigenmodes(smaller, *state, kept)[0] / square[:kept]))
             for state, (square, _) in zip(states, modes, strict=True)
         )
+        return 0.5 * (worst - 1.0) <= settings.frequency_tolerance
 
-    low, high = kept, most  # the error falls with size, because the bases are nested
-    while low < high:
-        middle = (low + high) // 2
-        if 0.5 * (added_error(middle) - 1.0) <= settings.frequency_tolerance:
-            high = middle
-        else:
-            low = middle + 1
-    return np.asarray(directions[:, :low])
+    # the error falls with size, because the bases are nested
+    return directions[:, : bisect_left(range(most), True, kept, key=good)]

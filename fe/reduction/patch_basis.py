@@ -6,7 +6,6 @@ presence squares the error of a strain). In it, many patched states are solved; 
 their solutions and modes, weighed by what is looked at most, are the basis that is kept.
 """
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from fe.wing.operators import AffineOperators, point_masses
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from reporting.progress import Progress, SilentProgress
 
-from .settings import ReductionSettings
+from .settings import PatchSettings
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -34,40 +33,6 @@ MODES = 8
 SUBSPACE_ITERATIONS = 6
 START_SHAPES = 16
 """Modes from which those of a patched wing are iterated."""
-
-
-@dataclass(frozen=True)
-class PatchSettings:
-    """How far changes may go and how many vectors hold them.
-
-    Attributes
-    ----------
-    ranges : ReductionSettings
-        Ranges of e, the losses and the masses, those of the reduced model.
-    strip_count : int
-        Largest number of strips of the skin; by default each row of cells along the span is one.
-    vectors : int
-        Size n of the basis.
-    states : int
-        Patched states that are solved in the working basis.
-    largest_loss : float
-        Loss of stiffness in a box along the span.
-    compliance_share : float
-        Root compliance, as a share of the tip's compliance.
-    largest_mass : float
-        Point mass [kg].
-    seed : int
-        Of the states.
-    """
-
-    ranges: ReductionSettings = field(default_factory=ReductionSettings)
-    strip_count: int = 64
-    vectors: int = 240
-    states: int = 160
-    largest_loss: float = 0.7
-    compliance_share: float = 0.4
-    largest_mass: float = 0.25
-    seed: int = 1
 
 
 def reduce_patches(

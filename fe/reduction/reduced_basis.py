@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fe.full.affine import affine_sum
+from fe.full.modes import most_moved
 from fe.full.subspace import Norm
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
@@ -134,9 +135,8 @@ def _modes(
         ) from None
     load, followed = terms.loads.T @ basis, np.empty((0, basis.shape[1]))
     if followed_load is not None:
-        square, shapes = eigenmodes(stiffness, mass, *terms.nominal, settings.mode_count)
-        contribution = (load[followed_load] @ shapes) ** 2 / square
-        followed = shapes[:, np.sort(np.argsort(contribution)[-2:])].T
+        square, shapes = eigenmodes((stiffness, mass), *terms.nominal, settings.mode_count)
+        followed = shapes[:, most_moved(load[followed_load], square, shapes)].T
     return basis, {
         "modal_stiffness": stiffness,
         "modal_mass": mass,

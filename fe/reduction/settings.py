@@ -95,6 +95,40 @@ class ReductionSettings(StructureSettings):
         }
 
 
+@dataclass(frozen=True)
+class PatchSettings:
+    """How far changes may go and how many vectors hold them.
+
+    Attributes
+    ----------
+    ranges : ReductionSettings
+        Ranges of e, the losses and the masses, those of the reduced model.
+    strip_count : int
+        Largest number of strips of the skin; by default each row of cells along the span is one.
+    vectors : int
+        Size n of the basis.
+    states : int
+        Patched states that are solved in the working basis.
+    largest_loss : float
+        Loss of stiffness in a box along the span.
+    compliance_share : float
+        Root compliance, as a share of the tip's compliance.
+    largest_mass : float
+        Point mass [kg].
+    seed : int
+        Of the states.
+    """
+
+    ranges: ReductionSettings = field(default_factory=ReductionSettings)
+    strip_count: int = 64
+    vectors: int = 240
+    states: int = 160
+    largest_loss: float = 0.7
+    compliance_share: float = 0.4
+    largest_mass: float = 0.25
+    seed: int = 1
+
+
 def default_anchors(regions: int) -> tuple[int, ...]:
     """Return two approximate dual solutions along each loss, or one where they are combined."""
     return (2 if regions <= MOST_GRID_REGIONS else 1,) * regions

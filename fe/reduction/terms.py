@@ -1,17 +1,18 @@
 """Offline: a structure as its reduction sees it, where it is looked at, and how a reduced model is judged."""
 
 import itertools
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.stats import qmc
 
-from fe.full.subspace import Norm
+from fe.full.affine import AffineSum
+from fe.full.subspace import BlockDiagonal, Norm, OrthonormalBasis, conjugate_gradients
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.structure.affine import AffineStructure
 
-from .dual_solutions import DualData, DualProblem
 from .settings import MOST_GRID_REGIONS, default_anchors, remaining_levels
 
 FloatArray = npt.NDArray[np.float64]
@@ -73,6 +74,9 @@ class ReductionTerms:
         groups = (slice(0, gauges), slice(gauges, count))
         self.stiffness_terms = tuple(matrix for matrix, _ in terms)
         self.mass_terms = structure.mass_terms
+        self.stiffness, self.mass = (
+            AffineSum(part).matrix for part in (self.stiffness_terms, self.mass_terms)
+        )
         self.loads = (
             np.stack(list(columns.values()), axis=1) if columns else np.empty((structure.unknowns, 0))
         )
@@ -97,24 +101,20 @@ class ReductionTerms:
         values, count = np.array(state), len(self.parameters)
         return self._coefficients(values[:count], 1.0 - values[count:])
 
-    def duals(self, problem: DualProblem) -> DualData:
-        """Dual solutions at anchors or, of many regions, of those states that are to be combined."""
-        split, kept = len(self.parameters), [remaining_levels(ends, 1)[0] for ends in self.losses]
-        middle = np.array([*(np.mean(ends) for ends in self.parameters), *kept])
-        if len(self.losses) <= MOST_GRID_REGIONS:
-            levels = map(remaining_levels, self.losses, self.counts)
-            return problem.nearest(
-                [self._coefficients(middle[:split], np.array(left)) for left in itertools.product(*levels)]
-            )
-        ends = np.array([*self.parameters, *(1.0 - np.array(self.losses))])
-        alone = [
-            np.where(row, end, middle)
-            for row, span in zip(np.eye(len(middle)), ends, strict=True)
-            for end in span
-        ]
-        return problem.combined(
-            [self._coefficients(values[:split], values[split:]) for values in (middle, *alone)]
-        )
+    def dual_states(self) -> tuple[list[FloatArray], bool]:
+        """Coefficients (T,) where dual solutions are wanted, and whether they are to be combined."""
+        kept = [remaining_levels(ends, 1)[0] for ends in self.losses]
+        middle, split = np.array([*(np.mean(ends) for ends in self.parameters), *kept]), len(self.parameters)
+        combined = len(self.losses) > MOST_GRID_REGIONS
+        if combined:
+            ends = np.array([*self.parameters, *(1.0 - np.array(self.losses))])
+            one_by_one = zip(np.eye(len(middle)), ends, strict=True)
+            alone = [np.where(row, end, middle) for row, span in one_by_one for end in span]
+            states = [middle, *alone]
+        else:
+            levels = itertools.product(*map(remaining_levels, self.losses, self.counts))
+            states = [np.array([*middle[:split], *left]) for left in levels]
+        return [self._coefficients(values[:split], values[split:]) for values in states], combined
 
     def corners(self) -> list[State]:
         """Corners of parameters and losses: all of a few, else those of `loss_corners`."""
@@ -143,32 +143,23 @@ class ReductionTerms:
     def sampled_modes(self) -> list[ModalState]:
         """Corners under least and largest masses in turns, and a few states inside."""
         at_corners = [
-            (
-                self.theta(state),
-                np.array((1.0, *(ends[(number + place) % 2] for place, ends in enumerate(self.masses)))),
-            )
+            (state, [ends[(number + place) % 2] for place, ends in enumerate(self.masses)])
             for number, state in enumerate(self.corners())
         ]
-        return [*at_corners, *self._modes_inside(SAMPLED_INSIDE)]
+        return self._modal_states(at_corners, SAMPLED_INSIDE)
 
     def compressed_modes(self) -> list[ModalState]:
         """Corners under all least and largest masses, at most 64 of them, and states inside."""
         masses = list(itertools.islice(itertools.product(*self.masses), 64))
-        at_corners = [
-            (self.theta(state), np.array((1.0, *chosen))) for state in self.corners() for chosen in masses
-        ]
-        return [*at_corners, *self._modes_inside(4 * SAMPLED_INSIDE)]
+        return self._modal_states(itertools.product(self.corners(), masses), 4 * SAMPLED_INSIDE)
 
-    def _modes_inside(self, count: int) -> list[ModalState]:
-        """States of a Halton sequence, masses among them."""
+    def _modal_states(self, corners: Iterable[tuple[State, Sequence[float]]], count: int) -> list[ModalState]:
+        """Return states with their masses, and after them `count` of a Halton sequence inside."""
         varied = len(self.parameters) + len(self.losses)
         points = qmc.Halton(varied + len(self.masses), scramble=False).random(1 + count)[1:]
         low, high = np.array(self.masses).reshape(-1, 2).T
-        masses = low + (high - low) * points[:, varied:]
-        return [
-            (self.theta(state), np.array((1.0, *chosen)))
-            for state, chosen in zip(self.inside(points[:, :varied]), masses, strict=True)
-        ]
+        inside = zip(self.inside(points[:, :varied]), low + (high - low) * points[:, varied:], strict=True)
+        return [(self.theta(state), np.array((1.0, *chosen))) for state, chosen in (*corners, *inside)]
 
     def largest_loads(self) -> FloatArray:
         """Largest coefficient (L,) of each load."""
@@ -231,3 +222,66 @@ class ReductionTerms:
             for (values, error), floor in zip(present, least[:, number], strict=True):
                 worst = max(worst, error / max(float(np.abs(values).max()), floor))
         return worst
+
+
+class ProjectedBasis:
+    """A growing basis, orthonormal in a norm, with sparse terms projected on it.
+
+    Parameters
+    ----------
+    norm : Norm
+        The norm.
+    sums : tuple of tuples of csr (n, n)
+        The terms of each sum.
+    drop : float
+        A new vector is dropped if less than this fraction of it is new.
+
+    Attributes
+    ----------
+    inner : list of (T, k, k) ndarray
+        The terms of each sum in the basis.
+    """
+
+    def __init__(self, norm: Norm, sums: Sequence[tuple[sparse.csr_array, ...]], *, drop: float) -> None:
+        self._norm, self._sums = norm, sums
+        self._basis = OrthonormalBasis(sums[0][0].shape[0], norm, drop=drop)
+        self.inner = [np.empty((len(terms), 0, 0)) for terms in sums]
+
+    @property
+    def vectors(self) -> FloatArray:
+        """The basis (n, k)."""
+        return self._basis.vectors
+
+    def extend(self, vectors: FloatArray) -> list[list[FloatArray]]:
+        """Add what is new in vectors (n, m); return the terms of each sum times what was added."""
+        before = self._basis.size
+        self._basis.extend(vectors, self._norm.product(vectors))
+        new, size = self.vectors[:, before:], self._basis.size
+        images = [[np.asarray(term @ new) for term in terms] for terms in self._sums]
+        for number, parts in enumerate(images):
+            grown = np.empty((len(parts), size, size))
+            grown[:, :before, :before] = self.inner[number]
+            for inner, image in zip(grown, parts, strict=True):
+                inner[:, before:] = self.vectors.T @ image
+                inner[before:, :before] = inner[:before, before:].T
+            self.inner[number] = grown
+        return images
+
+
+def solved_together(
+    terms: ReductionTerms,
+    norm: Norm,
+    thetas: list[FloatArray],
+    right: FloatArray,
+    starts: list[FloatArray],
+    tolerance: float,
+) -> list[FloatArray]:
+    """Solve the full model at coefficients (T,) for the same right-hand sides (n, k); returns (n, k) each."""
+    solved = conjugate_gradients(
+        BlockDiagonal([terms.stiffness(theta) for theta in thetas]),
+        norm,
+        np.concatenate([right] * len(thetas), axis=1),
+        np.concatenate(starts, axis=1),
+        tolerance=tolerance,
+    )
+    return np.split(solved, len(thetas), axis=1)

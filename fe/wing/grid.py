@@ -1,6 +1,7 @@
 """Mesh lines of the wing: those that its parts ask for, and lines between them."""
 
 import itertools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,46 +12,88 @@ from fe.runtime.errors import MeshError
 from .design import WingDesign, rib_interval
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 SMALLEST_GAP = 2e-4
 """Two mesh lines that the design asks for may not lie closer than this [m]."""
 _SAME = 1e-9
 
 
-class ChordLine(NamedTuple):
-    """Mesh line along the span: at `fraction` of the local chord, moved aft by `offset` [m]."""
+class MeshLine(NamedTuple):
+    """Mesh line at `fraction` of a length, moved by `offset` [m]: of the local chord, or of nothing."""
 
     fraction: float
     offset: float
-    label: str
+    label: str = "between"
 
-    def behind_leading_edge(self, chord: float) -> float:
-        """Distance [m] from the leading edge where the chord is `chord` [m]."""
-        return self.fraction * chord + self.offset
-
-
-def _merge_lines(wanted: list[tuple[float, str]], what: str) -> list[float]:
-    """Sort, drop exact doubles, refuse lines that nearly coincide."""
-    kept: list[tuple[float, str]] = []
-    for place, label in sorted(wanted):
-        if kept and place - kept[-1][0] <= _SAME:
-            continue
-        if kept and place - kept[-1][0] < SMALLEST_GAP:
-            raise MeshError(
-                f"{label} at {place:.5f} m and {kept[-1][1]} at {kept[-1][0]:.5f} m from the {what} are "
-                f"closer than {SMALLEST_GAP * 1e3:g} mm; move one of them or put them on the same line."
-            )
-        kept.append((place, label))
-    return [place for place, _ in kept]
+    def at(self, length: FloatArray | float) -> FloatArray:
+        """Distance (...,) [m] from the leading edge where the chord is `length` [m]; else from the root."""
+        return np.asarray(self.fraction * length + self.offset)
 
 
-def _subdivide(lines: list[float], size: float) -> list[float]:
-    filled = [lines[0]]
+def _filled(
+    firm: Iterable[MeshLine],
+    wished: Iterable[tuple[MeshLine, float]],
+    lengths: FloatArray,
+    size: float,
+) -> list[MeshLine]:
+    """Return the firm lines, of those wished the ones with room, and lines between, `size` apart at most.
+
+    Parameters
+    ----------
+    firm : iterable of MeshLine
+        What the design asks for; of two on the same place one is kept.
+    wished : iterable of (MeshLine, float)
+        Lines, taken where they cross no other and all others are farther than a distance [m].
+    lengths : (k,) m
+        The chords at root and tip, of which all lines are seen.
+    size : float
+        Largest cell [m] at the first of them.
+
+    Raises
+    ------
+    MeshError
+        If firm lines nearly coincide or cross.
+    """
+    lines: list[MeshLine] = []
+    for line in sorted(firm, key=lambda line: (line.at(lengths)[0], line.label)):
+        if lines:
+            gaps = line.at(lengths) - lines[-1].at(lengths)
+            if np.abs(gaps).max() <= _SAME:
+                continue
+            if gaps.min() < SMALLEST_GAP:
+                raise MeshError(
+                    f"{line.label} and {lines[-1].label} come closer than {SMALLEST_GAP * 1e3:g} mm or cross "
+                    f"between root and tip, at {line.at(lengths)[0]:.5f} m; move one of them or put them on "
+                    "the same line."
+                )
+        lines.append(line)
+    for line, room in wished:
+        gaps = line.at(lengths) - np.array([other.at(lengths) for other in lines])
+        before, behind = (gaps > 0.0).all(axis=1), (gaps < 0.0).all(axis=1)
+        if before.any() and behind.any() and (before | behind).all() and np.abs(gaps).min() > room:
+            lines.append(line)
+    lines.sort(key=lambda line: line.at(lengths)[0])
+    filled = lines[:1]
     for start, end in itertools.pairwise(lines):
-        count = max(1, int(np.ceil((end - start) / size - 1e-9)))
-        filled.extend(start + (end - start) * (n + 1) / count for n in range(count - 1))
+        count = max(1, int(np.ceil((end.at(lengths) - start.at(lengths))[0] / size - 1e-9)))
+        steps = (end.fraction - start.fraction, end.offset - start.offset)
+        filled += [
+            MeshLine(start.fraction + n / count * steps[0], start.offset + n / count * steps[1])
+            for n in range(1, count)
+        ]
         filled.append(end)
     return filled
+
+
+def _beside(design: WingDesign, edges: list[MeshLine]) -> list[tuple[MeshLine, float]]:
+    """Lines on both sides of the edges of defects, where the design asks for small cells."""
+    if design.mesh.edge_size is None:
+        return []
+    edge = design.mesh.edge_size / design.mesh.refinement
+    return [
+        (MeshLine(line.fraction, line.offset + side), 0.5 * edge) for line in edges for side in (-edge, edge)
+    ]
 
 
 def span_lines(design: WingDesign) -> FloatArray:
@@ -61,77 +104,36 @@ def span_lines(design: WingDesign) -> FloatArray:
     MeshError
         If two lines that the design asks for nearly coincide.
     """
-    span = design.planform.semi_span
-    wanted: list[tuple[float, str]] = [(0.0, "the root"), (span, "the tip")]
-    for index in range(len(design.ribs)):
-        start, end = rib_interval(design, index)
-        wanted += [(start, f"the inner face of ribs[{index}]"), (end, f"the outer face of ribs[{index}]")]
-    for index, defect in enumerate(design.defects):
-        wanted += [
-            (defect.span_start, f"the inner edge of defects[{index}]"),
-            (defect.span_end, f"the outer edge of defects[{index}]"),
-        ]
-    firm = _merge_lines(wanted, "root")
-    size = design.mesh.span_size / design.mesh.refinement
-    soft = [band.end * span for band in design.skin.bands]
-    soft += [added.start * span for added in design.added_density]
-    soft += [added.end * span for added in design.added_density]
-    soft += [rod.reach * span for rod in design.rods]
-    for place in sorted(set(soft)):
-        if min(abs(place - line) for line in firm) > 0.1 * design.mesh.span_size:
-            firm.append(place)
-    edge = design.mesh.edge_size
-    if edge is not None:
-        edge /= design.mesh.refinement
-        for defect in design.defects:
-            for place in (defect.span_start, defect.span_end):
-                for beside in (place - edge, place + edge):
-                    if 0.0 < beside < span and min(abs(beside - line) for line in firm) > 0.5 * edge:
-                        firm.append(beside)
-    return np.array(_subdivide(sorted(firm), size))
+    span, mesh = design.planform.semi_span, design.mesh
+    edges = [
+        MeshLine(0.0, place, f"the {side} edge of defects[{index}]")
+        for index, defect in enumerate(design.defects)
+        for place, side in ((defect.span_start, "inner"), (defect.span_end, "outer"))
+    ]
+    ribs = [
+        MeshLine(0.0, place, f"the {side} face of ribs[{index}]")
+        for index in range(len(design.ribs))
+        for place, side in zip(rib_interval(design, index), ("inner", "outer"), strict=True)
+    ]
+    ends = {band.end for band in design.skin.bands} | {rod.reach for rod in design.rods}
+    ends |= {place for added in design.added_density for place in (added.start, added.end)}
+    soft = [(MeshLine(0.0, place * span), 0.1 * mesh.span_size) for place in sorted(ends)]
+    firm = [MeshLine(0.0, 0.0, "the root"), MeshLine(0.0, span, "the tip"), *ribs, *edges]
+    found = _filled(firm, [*soft, *_beside(design, edges)], np.zeros(1), mesh.span_size / mesh.refinement)
+    return np.array([line.offset for line in found])
 
 
-def web_faces(design: WingDesign, index: int) -> tuple[ChordLine, ChordLine]:
+def web_faces(design: WingDesign, index: int) -> tuple[MeshLine, MeshLine]:
     """Front and rear mesh line of a web: the first web lies behind its chord, the last before it."""
     web = design.webs[index]
     front = {0: 0.0, len(design.webs) - 1: -web.thickness}.get(index, -0.5 * web.thickness)
     return (
-        ChordLine(web.chord, front, f"the front of webs[{index}]"),
-        ChordLine(web.chord, front + web.thickness, f"the rear of webs[{index}]"),
+        MeshLine(web.chord, front, f"the front of webs[{index}]"),
+        MeshLine(web.chord, front + web.thickness, f"the rear of webs[{index}]"),
     )
 
 
-def _with_edge_lines(design: WingDesign, firm: list[ChordLine]) -> list[ChordLine]:
-    """Lines beside the edges of the defects, where the chord holds no other line near by."""
-    if design.mesh.edge_size is None:
-        return firm
-    edge = design.mesh.edge_size / design.mesh.refinement
-    chords = design.planform.root_chord, design.planform.tip_chord
-    lines = list(firm)
-    for defect in design.defects:
-        for fraction in (defect.chord_start, defect.chord_end):
-            for offset in (-edge, edge):
-                line = ChordLine(fraction, offset, "beside a defect")
-                gaps = [
-                    [line.behind_leading_edge(c) - other.behind_leading_edge(c) for c in chords]
-                    for other in lines
-                ]
-                ends = [firm[0], firm[-1]]
-                inside = all(
-                    ends[0].behind_leading_edge(c)
-                    < line.behind_leading_edge(c)
-                    < ends[1].behind_leading_edge(c)
-                    for c in chords
-                )
-                # Lines must not cross between root and tip either.
-                if inside and all(
-                    min(map(abs, pair)) > 0.5 * edge and pair[0] * pair[1] > 0.0 for pair in gaps
-                ):
-                    lines.append(line)
-    return sorted(lines, key=lambda line: line.behind_leading_edge(design.planform.root_chord))
-
-
-def chord_lines(design: WingDesign) -> tuple[ChordLine, ...]:
+def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
     """Mesh lines along the span: web faces, defect edges, the leading-edge wall, and lines between.
 
     Raises
@@ -139,42 +141,37 @@ def chord_lines(design: WingDesign) -> tuple[ChordLine, ...]:
     MeshError
         If two lines that the design asks for nearly coincide or cross between root and tip.
     """
-    root, tip = design.planform.root_chord, design.planform.tip_chord
-    wanted = [face for index in range(len(design.webs)) for face in web_faces(design, index)]
+    plan, mesh = design.planform, design.mesh
+    edges = [
+        MeshLine(place, 0.0, f"the {side} edge of defects[{index}]")
+        for index, defect in enumerate(design.defects)
+        for place, side in ((defect.chord_start, "front"), (defect.chord_end, "rear"))
+    ]
+    firm = [*(face for index in range(len(design.webs)) for face in web_faces(design, index)), *edges]
     if design.skin.closed_leading_edge:
-        wanted.append(ChordLine(design.front_chord, -design.skin.thickness, "the leading-edge wall"))
-    for index, defect in enumerate(design.defects):
-        wanted += [
-            ChordLine(defect.chord_start, 0.0, f"the front edge of defects[{index}]"),
-            ChordLine(defect.chord_end, 0.0, f"the rear edge of defects[{index}]"),
-        ]
-    wanted.sort(key=lambda line: line.behind_leading_edge(root))
-    firm: list[ChordLine] = []
-    for line in wanted:
-        if firm:
-            gaps = [line.behind_leading_edge(c) - firm[-1].behind_leading_edge(c) for c in (root, tip)]
-            if max(abs(gap) for gap in gaps) <= _SAME:
-                continue
-            if min(gaps) < SMALLEST_GAP:
-                raise MeshError(
-                    f"{line.label} and {firm[-1].label} come closer than {SMALLEST_GAP * 1e3:g} mm or cross "
-                    f"between root and tip; move one of them or put them on the same chord fraction."
-                )
-        firm.append(line)
-    firm = _with_edge_lines(design, firm)
-    lines = [firm[0]]
-    size = design.mesh.chord_size / design.mesh.refinement * root
-    for start, end in itertools.pairwise(firm):
-        width = end.behind_leading_edge(root) - start.behind_leading_edge(root)
-        count = max(1, int(np.ceil(width / size - 1e-9)))
-        for n in range(1, count):
-            t = n / count
-            lines.append(
-                ChordLine(
-                    start.fraction + t * (end.fraction - start.fraction),
-                    start.offset + t * (end.offset - start.offset),
-                    "between",
-                )
-            )
-        lines.append(end)
-    return tuple(lines)
+        firm.append(MeshLine(design.front_chord, -design.skin.thickness, "the leading-edge wall"))
+    lengths = np.array([plan.root_chord, plan.tip_chord])
+    size = mesh.chord_size / mesh.refinement * plan.root_chord
+    return tuple(_filled(firm, _beside(design, edges), lengths, size))
+
+
+def cells_within(lines: FloatArray, parts: Iterable[tuple[float, float]]) -> IntArray:
+    """Find the part (n,) whose start and end hold the middle of each cell between lines (n + 1,), or -1."""
+    middle = 0.5 * (lines[1:] + lines[:-1])
+    found = np.full(len(middle), -1, dtype=np.int64)
+    for number, (start, end) in enumerate(parts):
+        found[(middle > start) & (middle < end)] = number
+    return found
+
+
+def web_cells(design: WingDesign, along: Iterable[MeshLine]) -> IntArray:
+    """Web (nx,) of each cell between the mesh lines along the span, -1 for none."""
+    root = design.planform.root_chord
+    faces = [web_faces(design, index) for index in range(len(design.webs))]
+    lines = np.array([line.at(root) for line in along])
+    return cells_within(lines, [(float(front.at(root)), float(rear.at(root))) for front, rear in faces])
+
+
+def rib_cells(design: WingDesign, across: FloatArray) -> IntArray:
+    """Rib (ny,) of each cell between the mesh lines across the span, -1 for none."""
+    return cells_within(across, [rib_interval(design, index) for index in range(len(design.ribs))])

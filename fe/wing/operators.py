@@ -31,7 +31,7 @@ from fe.structure.supports import RigidSet, SupportedUnknowns, rigid_motions
 from .design import WingDesign
 from .mesh import SurfacePoint, WingMesh, build_mesh
 from .parts import PointMassPlace
-from .turn_load import Weights, inertia_relief, lift_load
+from .turn_load import STANDARD_GRAVITY, lift_load
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -72,8 +72,7 @@ def gauge_output(mesh: WingMesh, turned: float = 0.0) -> sparse.csr_array:
             *patch_pieces(distance, gauges.averaging_spanwise, mesh.span_lines), strict=True
         ):
             lead = plan.straight_chord_line * plan.chord(place / plan.semi_span)
-            _, _, lines = mesh.upper_skin_lines(place)
-            behind = patch_pieces(middle + lead, gauges.averaging_chordwise, lines)
+            behind = patch_pieces(middle + lead, gauges.averaging_chordwise, mesh.chord_places(place))
             for chordwise, chord_weight in zip(*behind, strict=True):
                 owner.append(gauge)
                 share.append(span_weight * chord_weight)
@@ -205,19 +204,10 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
     """Elasticity (nc, 6, 6) [Pa] in space of every cell, at e = 1 and without damage."""
     design, skin = mesh.design, mesh.design.skin
     local = np.empty((len(mesh.cells), 6, 6))
-    unit = orthotropic_elasticity(
-        1.0,
-        skin.poisson_ratio,
-        skin.transverse_shear_ratio,
-        skin.transverse_shear_ratio,
-        skin.in_plane_shear_ratio,
-    )
-    wall = orthotropic_elasticity(
-        1.0,
-        skin.poisson_ratio,
-        skin.in_plane_shear_ratio,
-        skin.transverse_shear_ratio,
-        skin.transverse_shear_ratio,
+    across, along = skin.transverse_shear_ratio, skin.in_plane_shear_ratio
+    unit, wall = (
+        orthotropic_elasticity(1.0, skin.poisson_ratio, *shears)
+        for shears in ((across, across, along), (along, across, across))
     )
     station = mesh.centres[:, 1] / design.planform.semi_span
     modulus = skin.young_modulus(station)
@@ -330,7 +320,7 @@ def point_mass_weights(mesh: WingMesh, place: PointMassPlace) -> FloatArray:
     return section_displacement(mesh, distance, place.chord)
 
 
-def all_point_mass_weights(mesh: WingMesh) -> Weights:
+def all_point_mass_weights(mesh: WingMesh) -> tuple[tuple[FloatArray, ...], ...]:
     """`point_mass_weights` of the servos, and of the pitots."""
     places = mesh.design.point_masses
     return tuple(
@@ -339,12 +329,22 @@ def all_point_mass_weights(mesh: WingMesh) -> Weights:
     )
 
 
+def nodal_weight(mesh: WingMesh) -> FloatArray:
+    """Weight (nodes,) [N] of structure and nominal point masses."""
+    mass = np.asarray(mesh.mass(np.arange(len(mesh.cells)), cell_density(mesh)).sum(axis=1))
+    masses = mesh.design.masses
+    for own, places in zip((masses.servo, masses.pitot), all_point_mass_weights(mesh), strict=True):
+        mass = mass + own * sum(places, np.zeros(len(mass)))
+    return STANDARD_GRAVITY * mass
+
+
 def turn_load(mesh: WingMesh) -> FloatArray:
-    """Load (full,) [N] of load factor 1: the design's lift, with its relief by the weight."""
-    lift = lift_load(mesh)
-    if mesh.design.lift.inertia_relief:
-        lift = lift + inertia_relief(mesh, cell_density(mesh), all_point_mass_weights(mesh), lift)
-    return lift
+    """Load (full,) [N] of load factor 1: the design's lift, net of the weight where that relieves it."""
+    load = lift_load(mesh)
+    if mesh.design.lift.inertia_relief:  # the weight where it lies, and as much lift against it
+        weight, lift = nodal_weight(mesh), load[2::3].copy()
+        load[2::3] += lift * (weight.sum() / lift.sum()) - weight
+    return load
 
 
 def stiffness_parts(mesh: WingMesh, parts: Iterable[IntArray]) -> Iterator[sparse.csr_array]:

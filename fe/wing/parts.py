@@ -6,7 +6,7 @@ The shape of the section is of the symmetric four-digit family of NACA Report 46
 
 import itertools
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,6 +45,7 @@ def four_digit_slope(chord_fraction: ArrayLike, thickness_ratio: float) -> NDArr
     return np.asarray(5.0 * thickness_ratio * derivative)
 
 
+_Numbers = TypeVar("_Numbers", float, NDArray[np.float64])
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Thickness = Annotated[float, Field(gt=0.0, lt=0.1, description="m")]
 PoissonRatio = Annotated[float, Field(ge=0.0, lt=0.5)]
@@ -61,8 +62,8 @@ class Planform(Part):
     tip_chord: float = Field(gt=0.01, lt=15.0, description="m")
     straight_chord_line: Fraction
 
-    def chord(self, station: float) -> float:
-        """Chord [m] at a fraction of the semi-span."""
+    def chord(self, station: _Numbers) -> _Numbers:
+        """Chord (...,) [m] at fractions (...,) of the semi-span."""
         return self.root_chord + (self.tip_chord - self.root_chord) * station
 
 

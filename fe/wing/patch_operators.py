@@ -17,15 +17,13 @@ from scipy import sparse
 from .design import WingDesign
 from .operators import (
     AffineOperators,
-    all_point_mass_weights,
-    cell_density,
     gauge_output,
+    nodal_weight,
     section_displacement,
     stiffness_parts,
     turn_load,
     upward,
 )
-from .turn_load import nodal_weight
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -100,15 +98,13 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
     restriction = expansion.T.tocsr()
     lines = mesh.span_lines
     stations = np.sort(np.concatenate([lines, 0.5 * (lines[1:] + lines[:-1])]))
-    chords = section_lines(design)
+    plan, chords = design.planform, section_lines(design)
 
     def rows(chord: float, component: int) -> sparse.csr_array:
-        weights = [section_displacement(mesh, place, chord) for place in stations]
-        nodal = sparse.csr_array(np.array(weights))
-        spread = sparse.kron(nodal, sparse.csr_array(np.eye(3)[component : component + 1]))
-        return sparse.csr_array(spread @ expansion)
+        nodal = np.array([section_displacement(mesh, place, chord) for place in stations])
+        return sparse.csr_array(sparse.csr_array(nodal) @ expansion[component::3])
 
-    weight = -upward(nodal_weight(mesh, cell_density(mesh), all_point_mass_weights(mesh)))
+    weight = -upward(nodal_weight(mesh))
     lift = turn_load(mesh)
     if design.lift.inertia_relief:  # the load holds the weight
         lift = lift - weight
@@ -118,10 +114,7 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
     ).tocsr()
 
     along = operators.gauge_output
-    across, diagonal = (
-        sparse.csr_array(gauge_output(mesh, angle) @ expansion) for angle in (0.5 * np.pi, 0.25 * np.pi)
-    )
-
+    across, diagonal = (gauge_output(mesh, angle) @ expansion for angle in (0.5 * np.pi, 0.25 * np.pi))
     edges = strip_edges(lines, strip_count)
     strips = np.searchsorted(edges, mesh.centres[:, 1]) - 1
     skin = np.flatnonzero(mesh.stiffness_term <= len(design.regions))
@@ -150,27 +143,16 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
             "strip_lines": edges,
             "strip_of": found[:, 0],
             "term_of": found[:, 1],
-            **_plain(design, stations, chords),
+            "flap_spring": design.root.flap_spring,
+            **plan.model_dump(),
+            "load_place": plan.semi_span - design.tip_load.distance_from_tip,
+            "stations": stations,
+            "line_chord": np.array(chords),
+            "station_weights": area_shares(stations, plan.root_chord, plan.tip_chord),
+            "gauge_stations": np.array([place for place, _ in design.gauges.positions]),
+            "gauge_length": design.gauges.averaging_spanwise,
         },
         strips=tuple(
             sparse.csr_array(restriction @ (matrix @ expansion)) for matrix in stiffness_parts(mesh, parts)
         ),
     )
-
-
-def _plain(design: WingDesign, stations: FloatArray, chords: tuple[float, ...]) -> dict[str, Any]:
-    """Return what is the same in every basis, but for the strips."""
-    plan = design.planform
-    return {
-        "flap_spring": design.root.flap_spring,
-        "semi_span": plan.semi_span,
-        "root_chord": plan.root_chord,
-        "tip_chord": plan.tip_chord,
-        "straight_chord_line": plan.straight_chord_line,
-        "load_place": plan.semi_span - design.tip_load.distance_from_tip,
-        "stations": stations,
-        "line_chord": np.array(chords),
-        "station_weights": area_shares(stations, plan.root_chord, plan.tip_chord),
-        "gauge_stations": np.array([place for place, _ in design.gauges.positions]),
-        "gauge_length": design.gauges.averaging_spanwise,
-    }

@@ -1,22 +1,18 @@
 """Statics and modes of the full wing: Kapteyn et al. 2021, eqs. (13), (15) and (16)."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
-from fe.full.modes import lowest_eigenpairs, track
+from fe.full.modes import lowest_eigenpairs, most_moved
 from fe.full.statics import Factorisation
 from fe.runtime.state import Losses
 
-from .operators import ROOT_UNKNOWNS, AffineOperators, point_masses
+from .operators import AffineOperators, point_masses
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-_CANTILEVER_WAVE_NUMBERS = (1.8751040687119611, 4.694091132974175, 7.854757438237613)
 
 
 @dataclass(frozen=True)
@@ -108,7 +104,7 @@ class Eigenmodes:
     lift_participation : (m,)
         Product of each shape and the load at load factor 1.
     flapwise_bending : (2,)
-        Indices of the first and second flapwise bending mode.
+        Indices of the first and second flapwise bending mode: those that a force near the tip moves most.
     """
 
     frequency: FloatArray
@@ -118,52 +114,6 @@ class Eigenmodes:
     load_point_displacement: FloatArray
     lift_participation: FloatArray
     flapwise_bending: IntArray
-
-
-def cantilever_bending(
-    distance: FloatArray, span: float, count: int = 2
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield deflection and slope (n,) of the bending shapes of a uniform cantilever, Euler and Bernoulli's.
-
-    Parameters
-    ----------
-    distance : (n,)
-        From the clamp [m].
-    span : float
-        Length [m].
-    count : int
-        Number of shapes, at most 3.
-    """
-    for wave in _CANTILEVER_WAVE_NUMBERS[:count]:
-        s = wave * distance / span
-        ratio = (np.cosh(wave) + np.cos(wave)) / (np.sinh(wave) + np.sin(wave))
-        deflection = np.cosh(s) - np.cos(s) - ratio * (np.sinh(s) - np.sin(s))
-        yield deflection, wave / span * (np.sinh(s) + np.sin(s) - ratio * (np.cosh(s) - np.cos(s)))
-
-
-def cantilever_bending_shapes(operators: AffineOperators, count: int = 2) -> FloatArray:
-    """Flapwise bending shapes (n, count) of a uniform cantilever on the nodes of the wing.
-
-    Plane sections: u_z = w(y), u_y = -z w'(y), with the Euler-Bernoulli shapes w of a clamped-free beam.
-    """
-    points = operators.wing_mesh.points
-    span = operators.wing_mesh.design.planform.semi_span
-    free = operators.expansion[:, : operators.unknowns - ROOT_UNKNOWNS]
-    shapes = np.zeros((operators.unknowns, count))
-    for number, (deflection, slope) in enumerate(cantilever_bending(points[:, 1], span, count)):
-        full = np.zeros(3 * len(points))
-        full[1::3], full[2::3] = -points[:, 2] * slope, deflection
-        # Rows of held unknowns are empty, so that the transpose picks the free ones.
-        shapes[: free.shape[1], number] = free.T @ full
-    return shapes
-
-
-def flapwise_bending_modes(operators: AffineOperators, shapes: FloatArray, mass: sparse.sparray) -> IntArray:
-    """Find the first and second flapwise bending mode among shapes (n, m): indices (2,).
-
-    They are the modes whose modal assurance with the bending shapes of a cantilever is the greatest.
-    """
-    return track(cantilever_bending_shapes(operators), shapes, mass)
 
 
 def eigenmodes(
@@ -205,5 +155,5 @@ def eigenmodes(
         tip_displacement=np.asarray(operators.tip_row @ shapes),
         load_point_displacement=np.asarray(operators.load_tip @ shapes),
         lift_participation=np.asarray(operators.load_lift @ shapes),
-        flapwise_bending=flapwise_bending_modes(operators, shapes, mass),
+        flapwise_bending=most_moved(operators.load_tip, values, shapes),
     )

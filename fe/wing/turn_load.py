@@ -1,4 +1,4 @@
-"""Nodal load of a level turn: lift on the skins, and the weight that relieves it.
+"""Nodal load of a level turn: lift on the skins.
 
 The lift along the span is that of Schrenk's approximation or of a lifting line: the shape of the lift of a
 symmetrically loaded wing as a function that integrates to one over the half-wing; the amount is the design's.
@@ -88,8 +88,6 @@ DISTRIBUTIONS: dict[str, Callable[[Planform], Distribution]] = {
 """Lift distributions by their name in a design."""
 
 
-Weights = tuple[tuple[FloatArray, ...], ...]
-"""Weights (nodes,) of the displacements of point masses: of the servos, and of the pitots."""
 STANDARD_GRAVITY = 9.80665
 """m/s^2."""
 
@@ -123,35 +121,3 @@ def lift_load(mesh: WingMesh) -> FloatArray:
     full[2::3] = design.lift.force * load
     full[0::3] = -design.lift.forward_force * load
     return full
-
-
-def inertia_relief(
-    mesh: WingMesh, density: FloatArray, point_masses: Weights, lift: FloatArray
-) -> FloatArray:
-    """Load (full,) [N] to add at load factor 1: the weight where it lies, and as much lift against it.
-
-    Parameters
-    ----------
-    mesh : WingMesh
-        The wing; its nominal masses count.
-    density : (nc,) kg/m^3
-        Of the cells.
-    point_masses : tuple of two tuples of (nodes,)
-        `point_mass_weights` of the servos, and of the pitot.
-    lift : (full,) N
-        `lift_load`.
-    """
-    weight = nodal_weight(mesh, density, point_masses)
-    added = np.zeros(len(lift))
-    added[2::3] = lift[2::3] * (weight.sum() / lift[2::3].sum()) - weight
-    return added
-
-
-def nodal_weight(mesh: WingMesh, density: FloatArray, point_masses: Weights) -> FloatArray:
-    """Weight (nodes,) [N] of structure and nominal point masses; parameters as of `inertia_relief`."""
-    mass = np.asarray(mesh.mass(np.arange(len(mesh.cells)), density).sum(axis=1))
-    masses = mesh.design.masses
-    for own, places in zip((masses.servo, masses.pitot), point_masses, strict=True):
-        for weights in places:
-            mass = mass + own * weights
-    return STANDARD_GRAVITY * mass

@@ -199,7 +199,7 @@ class _Wing:
             e = scenario.asset.true_parameters.get("young_modulus_factor", mean)
             force = scenario.asset.constant_load.get("tip_force", 0.0)
             values = {**control, "young_modulus_factor": e, "tip_force": force}
-            write_wing_vtu(path, wing, wing.model.vector(values, state))
+            write_wing_vtu(path, wing, wing.vector(values, state))
         except OSError as error:
             raise write_error(error, path) from error
         return True

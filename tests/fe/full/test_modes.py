@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from fe.full.modes import lowest_eigenpairs, modal_assurance, track
+from fe.full.modes import lowest_eigenpairs
 from fe.runtime.errors import SolutionError
 from fe.wing.operators import assemble, point_masses
 from fe.wing.responses import eigenmodes
@@ -30,14 +30,6 @@ def test_participations_are_outputs_of_the_shapes(coarse_operators, coarse_modes
     assert coarse_modes.load_point_displacement == pytest.approx(coarse_operators.load_tip @ shape)
     assert coarse_modes.strain == pytest.approx(coarse_operators.gauge_output @ shape)
     assert np.all(coarse_modes.tip_displacement[coarse_modes.flapwise_bending] > 0.0)
-
-
-def test_tracking_undoes_a_shuffle(coarse_operators, coarse_modes):
-    mass = coarse_operators.mass(point_masses(*MASSES))
-    order = np.array([3, 0, 5, 1, 4, 2])
-    shuffled = -coarse_modes.shape[:, order]
-    assert order[track(coarse_modes.shape, shuffled, mass)] == pytest.approx(np.arange(6))
-    assert modal_assurance(coarse_modes.shape, coarse_modes.shape, mass) == pytest.approx(np.eye(6), abs=1e-8)
 
 
 def test_bending_is_found_wherever_the_lag_mode_lies(coarse_design, coarse_operators, coarse_modes):

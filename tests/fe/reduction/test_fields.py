@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fe.elements.cells import gradients, strain_matrix
-from fe.reduction.fields import FieldBasis, WingFields, field_basis, write_modes_vtu, write_wing_vtu
+from fe.reduction.fields import WingFields, field_basis, write_modes_vtu, write_wing_vtu
 from fe.reduction.reduced_basis import Reduction
 from fe.runtime.errors import OutsideModelError, ReducedModelFileError
 from fe.wing.operators import AffineOperators
@@ -18,13 +18,13 @@ STATE = {"young_modulus_factor": 0.95, "stiffness_loss": (0.3, 0.6), "load_facto
 
 @pytest.fixture(scope="module")
 def wing(coarse_operators: AffineOperators, coarse_reduction: Reduction) -> WingFields:
-    return WingFields(coarse_reduction.model, field_basis(coarse_operators, coarse_reduction))
+    return field_basis(coarse_operators, coarse_reduction)
 
 
 @pytest.fixture(scope="module")
 def written(wing: WingFields, tmp_path_factory: pytest.TempPathFactory) -> meshio.Mesh:
     path = tmp_path_factory.mktemp("vtu") / "wing.vtu"
-    write_wing_vtu(path, wing, wing.model.vector(**STATE))
+    write_wing_vtu(path, wing, wing.vector(**STATE))
     assert [p.name for p in path.parent.iterdir()] == ["wing.vtu"]
     return meshio.read(path)
 
@@ -87,10 +87,10 @@ def test_modes_are_those_of_the_full_model(
     wing: WingFields, coarse_operators: AffineOperators, tmp_path: Path
 ) -> None:
     path = tmp_path / "modes.vtu"
-    write_modes_vtu(path, wing, wing.model.nominal)
+    write_modes_vtu(path, wing, wing.nominal)
     written = meshio.read(path)
     full = eigenmodes(coarse_operators, 1.0, (0.0, 0.0), 0.169, 0.134)
-    assert len(written.point_data) == wing.model.mode_count
+    assert len(written.point_data) == wing.mode_count
     for number, name in enumerate(list(written.point_data)[:3]):
         label, frequency = name.rsplit("_", 1)
         assert label == f"mode_{number + 1}"
@@ -103,14 +103,14 @@ def test_modes_are_those_of_the_full_model(
 
 def test_equal_states_give_equal_files(wing: WingFields, tmp_path: Path) -> None:
     for name in ("one.vtu", "two.vtu"):
-        write_wing_vtu(tmp_path / name, wing, wing.model.vector(**STATE))
+        write_wing_vtu(tmp_path / name, wing, wing.vector(**STATE))
     assert (tmp_path / "one.vtu").read_bytes() == (tmp_path / "two.vtu").read_bytes()
 
 
 def test_bad_states_and_places_leave_no_file(wing: WingFields, tmp_path: Path) -> None:
-    state = wing.model.vector(**STATE)
+    state = wing.vector(**STATE)
     with pytest.raises(OutsideModelError):
-        write_wing_vtu(tmp_path / "wing.vtu", wing, wing.model.vector(load_factor=float("nan")))
+        write_wing_vtu(tmp_path / "wing.vtu", wing, wing.vector(load_factor=float("nan")))
     assert not list(tmp_path.iterdir())
     with pytest.raises(FileNotFoundError):
         write_wing_vtu(tmp_path / "absent" / "wing.vtu", wing, state)
@@ -121,14 +121,14 @@ def test_bad_states_and_places_leave_no_file(wing: WingFields, tmp_path: Path) -
 
 
 def test_basis_comes_back_to_the_last_bit(wing: WingFields) -> None:
-    content = wing.basis.to_bytes()
-    assert FieldBasis.from_bytes(content, "the basis").to_bytes() == content
+    content = wing.to_bytes()
+    assert WingFields.from_bytes(content, "the basis").to_bytes() == content
     for wrong, sentence in ((content[:1000], "the basis"), (wing.model.to_bytes(), "lacks")):
         with pytest.raises(ReducedModelFileError, match=sentence):
-            FieldBasis.from_bytes(wrong, "the basis")
+            WingFields.from_bytes(wrong, "the basis")
     for name in ("points", "cells", "region", "static_displacement", "modal_displacement"):
-        for value in (np.array(1.0), np.array("a"), getattr(wing.basis, name)[:-1, ...]):
+        for value in (np.array(1.0), np.array("a"), getattr(wing, name)[:-1, ...]):
             with pytest.raises(ReducedModelFileError, match="field basis"):
-                replace(wing.basis, **{name: value})
+                replace(wing, **{name: value})
     with pytest.raises(ReducedModelFileError, match="nodes that are not there"):
-        replace(wing.basis, cells=wing.basis.cells + 1)
+        replace(wing, cells=wing.cells + 1)

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from benchmarks.study_regions import bracket, plate, tube
-from fe.reduction.model_cache import reduced, reduced_structure
+from fe.reduction.model_cache import reduced_structure
+from fe.reduction.reduced_basis import reduce_structure
 from fe.reduction.settings import StructureSettings
 from fe.reduction.structure_errors import measured_errors
 from fe.runtime.errors import ReductionError
@@ -30,7 +31,7 @@ def test_four_regions_around_a_hole(coarse_plate: Structure, plate_model: Reduce
 @pytest.mark.parametrize("make", [plate, bracket, tube])
 def test_six_regions_by_default(tmp_path: Path, make: Any) -> None:
     structure = load_and_assemble(make(tmp_path, 6))
-    errors = measured_errors(structure, reduced(structure), 60)
+    errors = measured_errors(structure, reduce_structure(structure, structure.design.name).model, 60)
     assert max(errors.strain, errors.displacement) <= errors.bound < 1e-3
 
 

@@ -451,7 +451,8 @@ def test_softer_is_softer(
     soft = float(row @ wing.structure(*STATE, *MASSES, patch).static(row))
     assert soft >= stiff * (1.0 - 1e-9)
     lever = wing.arrays.load_place
-    assert soft >= stiff + (1.0 - 1e-6) * compliance * lever**2 - 1e-9 * stiff
+    # the full solutions of which the basis is made are good to some 1e-6
+    assert soft >= stiff + (1.0 - 1e-5) * compliance * lever**2 - 1e-9 * stiff
 
 
 @pytest.mark.parametrize(

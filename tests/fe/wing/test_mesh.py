@@ -111,7 +111,7 @@ def test_straight_edges_keep_the_area_and_inertia_of_the_airfoil(shipped_design)
     exact = four_digit_half_thickness(line, ratio)
     for refinement, limit in ((0.25, 1e-3), (1.0, 1e-4)):
         design = shipped_design.changed(mesh={"refinement": refinement})
-        lines = np.array([[entry.behind_leading_edge(0.433)] for entry in chord_lines(design)])
+        lines = np.array([[float(entry.at(0.433))] for entry in chord_lines(design)])
         half = straight_edged(lines, np.array([0.433]), ratio)[:, 0] / 0.433
         inside = (line >= lines[0, 0] / 0.433) & (line <= lines[-1, 0] / 0.433)
         found = np.interp(line[inside], lines[:, 0] / 0.433, half)
