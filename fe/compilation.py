@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 from numba.extending import overload, register_jitable
@@ -17,14 +17,12 @@ __all__ = ["callable_when_compiled", "choose_when_compiled", "compiled"]
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
-ErrorModel = Literal["python", "numpy"]
-"""Whether a division by zero raises, or gives infinity as in NumPy."""
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+"""A division by zero gives infinity, as in NumPy: a loop that might raise is not computed side by side."""
 
 
 def compiled(
-    function: Callable[Parameters, Result],
-    calls: Iterable[Callable[..., Any]] = (),
-    error_model: ErrorModel = "python",
+    function: Callable[Parameters, Result], calls: Iterable[Callable[..., Any]] = ()
 ) -> Callable[Parameters, Result]:
     """Compile `function` with numba when it is first called; it runs without the interpreter lock.
 
@@ -39,16 +37,13 @@ def compiled(
     calls : iterable of callable
         Plain functions of other files that it calls: numba by itself sees changes of its own file only.
         The files of compiled functions that its module names count without being told.
-    error_model : str
-        Of `function`.
     """
-    options: dict[str, Any] = {"nogil": True, "error_model": error_model}
     named = [item.py_func for item in function.__globals__.values() if hasattr(item, "py_func")]
     with _kept_by_sources([inspect.getfile(item) for item in (function, *calls, *named)]):
         try:
-            made = numba.njit(cache=True, **options)(function)
+            made = numba.njit(cache=True, **OPTIONS)(function)
         except RuntimeError:  # numba's way to say that it found no writable folder
-            made = numba.njit(**options)(function)
+            made = numba.njit(**OPTIONS)(function)
     return cast("Callable[Parameters, Result]", made)
 
 
@@ -71,7 +66,6 @@ def _kept_by_sources(files: list[str]) -> Iterator[None]:
 def callable_when_compiled(
     function: Callable[..., Any],
     *,
-    error_model: ErrorModel = "python",
     makes_arrays: bool = True,
     inline: bool = False,
 ) -> Callable[..., Any]:
@@ -81,15 +75,13 @@ def callable_when_compiled(
     ----------
     function : callable
         In the subset of Python that numba knows.
-    error_model : str
-        Of `function`.
     makes_arrays : bool
         If neither it nor what it calls makes an array, numba need not count the references to those that are
         handed on, which takes longer than a short function itself.
     inline : bool
         Make it part of its callers.
     """
-    register_jitable(nogil=True, error_model=error_model, _nrt=makes_arrays, forceinline=inline)(function)
+    register_jitable(**OPTIONS, _nrt=makes_arrays, forceinline=inline)(function)
     return function
 
 

@@ -110,10 +110,10 @@ def simulate(
     refuse_files(out, plot, replace=replace)
     given = _single_numbers(values or [])
     with tempfile.TemporaryDirectory() as folder:
-        system = read_ssp(file, folder)
-        wiring = join_ssp(system, delay or ())
+        structure = read_ssp(file, folder)
+        wiring = join_ssp(structure, delay or ())
         _warn(left_out_sentence(wiring, file))
-        described = system_description(wiring, span=system.span)
+        described = system_description(wiring, span=structure.span)
         planned = default_experiment(described, stop_time=stop_time, step_size=step_size, values=given)
         with CoupledAsset(
             wiring,
@@ -155,7 +155,7 @@ def check(
 
     result = check_ssp(file)
     if json:
-        terminal.print_json({"passed": result.passed} | asdict(result))
+        terminal.print_json({"passed": not result.problems} | asdict(result))
     for problem in result.problems:
         typer.secho(f"problem: {problem}", fg="red", err=True)
     if not json:
@@ -164,7 +164,7 @@ def check(
         terminal.say(
             f"warning: {loop} `uav-twin ssp simulate` does so by --delay, --iterations, --algorithm jacobi."
         )
-    if not result.passed:
+    if result.problems:
         raise typer.Exit(1)
     order = ", ".join(f"{name} ({model})" for name, model in result.components)
     if not json:

@@ -1,198 +1,224 @@
-"""A sum of damped cosines, an offset and a drift: Kapteyn et al. 2021, eq. (22)."""
+"""A sum of damped cosines, an offset and a drift: Kapteyn et al. 2021, eq. (22).
 
+A wave is the real part of A exp(s t) with the pole s = -decay rate + i damped angular frequency [1/s].
+"""
+
+import cmath
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
 _GREATEST_GROWTH = 50.0  # exponent at the end of a record; an iteration may pass through growing waves
-
-
-class Solution(NamedTuple):
-    """The fitted signal at given decay rates and frequencies.
-
-    `amplitude` (K,) holds the complex amplitudes at the first sample [V]; `covariance` (2 K, 2 K) belongs to
-    the K decay rates and then the K angular frequencies [1/s, rad/s], zero for those that were not fitted.
-    """
-
-    amplitude: NDArray[np.complex128]
-    fitted: NDArray[np.float64]
-    residual_deviation: float
-    covariance: NDArray[np.float64]
-
-
-class Search(NamedTuple):
-    """Decay rates (K,) [1/s] and angular frequencies (K,) [rad/s], and half the sum of squares there."""
-
-    decay: NDArray[np.float64]
-    omega: NDArray[np.float64]
-    cost: float
-
-
-class DampedCosines:
-    """K damped cosines against one record.
-
-    The signal is the real part of sum_k A_k g(s_k) exp(s_k t) with s_k = -decay_k + i omega_k, plus a line.
-    A value that is the average over an interval of width w carries g(s) = sinh(s w / 2) / (s w / 2).
-
-    Parameters
-    ----------
-    time, signal : (N,) array
-        The record [s], [V].
-    averaging_width : float
-        w [s]; 0 for samples.
-    """
-
-    def __init__(
-        self, time: NDArray[np.float64], signal: NDArray[np.float64], averaging_width: float
-    ) -> None:
-        self._time = time - time[0]
-        self._signal = signal
-        self._width = averaging_width
-        self._line = np.column_stack([np.ones(time.size), self._time - self._time.mean()])
-
-    def residual(self, decay: NDArray[np.float64], omega: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the residuals [V], (N,), with the best amplitudes, offset and drift."""
-        basis = self._basis(decay, omega)
-        orthogonal = np.linalg.qr(basis)[0]
-        return np.asarray(self._signal - orthogonal @ (orthogonal.T @ self._signal))
-
-    def fitted(
-        self, decay: NDArray[np.float64], omega: NDArray[np.float64], *, frequencies_fitted: bool = True
-    ) -> Search:
-        """Return the decay rates and frequencies nearest to the record, begun at these."""
-        scale = np.concatenate([decay, omega]) if frequencies_fitted else decay
-
-        def residual(unknown: NDArray[np.float64]) -> NDArray[np.float64]:
-            scaled = unknown * scale
-            return self.residual(scaled[: decay.size], scaled[decay.size :] if frequencies_fitted else omega)
-
-        found = least_squares(residual, np.ones(scale.size), method="lm", xtol=1e-12, ftol=1e-14, gtol=1e-14)
-        best = found.x * scale
-        return Search(
-            best[: decay.size], best[decay.size :] if frequencies_fitted else omega, float(found.cost)
-        )
-
-    def solve(
-        self, decay: NDArray[np.float64], omega: NDArray[np.float64], *, frequencies_fitted: bool
-    ) -> Solution:
-        """Return amplitudes, fitted signal and the covariance of decay rates and frequencies."""
-        basis = self._basis(decay, omega)
-        coefficient = np.linalg.lstsq(basis, self._signal, rcond=None)[0]
-        fitted = basis @ coefficient
-        modes = decay.size
-        amplitude = coefficient[0 : 2 * modes : 2] - 1j * coefficient[1 : 2 * modes : 2]
-        slope = np.stack([self._derivative(-d + 1j * w) for d, w in zip(decay, omega, strict=True)])
-        slope = amplitude[:, np.newaxis] * slope
-        columns = [*(-slope).real] + ([*(1j * slope).real] if frequencies_fitted else [])
-        jacobian = np.column_stack([*columns, basis])
-        # Columns of very different size: scale before inverting.
-        size = np.linalg.norm(jacobian, axis=0)
-        inverse = np.linalg.pinv(jacobian / size)
-        freedom = max(self._signal.size - jacobian.shape[1], 1)
-        variance = float(np.sum((self._signal - fitted) ** 2)) / freedom
-        covariance = variance * (inverse @ inverse.T) / np.outer(size, size)
-        whole = np.zeros((2 * modes, 2 * modes))
-        count = len(columns)
-        whole[:count, :count] = covariance[:count, :count]
-        return Solution(amplitude, fitted, variance**0.5, whole)
-
-    def _basis(self, decay: NDArray[np.float64], omega: NDArray[np.float64]) -> NDArray[np.float64]:
-        columns = []
-        for d, w in zip(decay, omega, strict=True):
-            s = -max(d, -_GREATEST_GROWTH / self._time[-1]) + 1j * w
-            wave = self._gain(s) * np.exp(s * self._time)
-            columns += [wave.real, wave.imag]
-        return np.column_stack([*columns, self._line])
-
-    def _gain(self, s: complex) -> complex:
-        half = 0.5 * s * self._width
-        return complex(np.sinh(half) / half) if self._width else 1.0 + 0.0j
-
-    def _derivative(self, s: complex) -> NDArray[np.complex128]:
-        """Return d/ds of g(s) exp(s t)."""
-        half = 0.5 * s * self._width
-        slope = 0.5 * self._width * (np.cosh(half) / half - np.sinh(half) / half**2) if self._width else 0.0
-        return np.asarray((slope + self._gain(s) * self._time) * np.exp(s * self._time))
+_LEAST_VARIANCE = 1e-200  # that a record without noise is not divided by
+_MOST_EVALUATIONS = 300  # of the least squares, for each unknown
 
 
 class RingDownMode(NamedTuple):
     """One damped cosine of a record as a mode: Kapteyn et al. 2021, eqs. (23) and (24).
 
-    With the natural angular frequency w_n = sqrt(s^2 + w_d^2): f = w_n / 2 pi and zeta = s / w_n. Standard
-    errors are propagated to first order with all of the covariance, that between s and w_d too, for
-    independent residuals of equal variance. A frequency that was not fitted has the share of s alone.
+    With the natural angular frequency |s|: f = |s| / 2 pi and zeta = -Re s / |s|. Standard errors are
+    propagated to first order with all of the covariance, that between both parts of s too, for independent
+    residuals of equal variance. A frequency that was not fitted has the share of Re s alone.
 
     Attributes
     ----------
-    decay_rate, omega : float
-        s [1/s], and the damped angular frequency w_d [rad/s].
+    pole : complex
+        s [1/s].
     wave : complex
-        Amplitude at the start of the cropped record [V].
+        Amplitude at the start of the record [V].
     covariance : (2, 2) array
-        Of decay rate and damped angular frequency [1/s^2].
+        Of Re s and Im s [1/s^2].
     """
 
-    decay_rate: float
-    omega: float
+    pole: complex
     wave: complex
-    covariance: NDArray[np.float64]
-
-    @property
-    def natural(self) -> float:
-        """Natural angular frequency [rad/s]."""
-        return math.hypot(self.omega, self.decay_rate)
+    covariance: FloatArray
 
     @property
     def frequency(self) -> float:
         """Natural frequency [Hz]."""
-        return self.natural / (2.0 * math.pi)
+        return abs(self.pole) / (2.0 * math.pi)
 
     @property
     def damping_ratio(self) -> float:
         """Damping ratio [1]."""
-        return self.decay_rate / self.natural
+        return -self.pole.real / abs(self.pole)
 
     @property
     def damped_frequency(self) -> float:
         """Frequency of the damped cosine [Hz]."""
-        return self.omega / (2.0 * math.pi)
+        return self.pole.imag / (2.0 * math.pi)
 
     @property
     def amplitude(self) -> float:
-        """Amplitude at the start of the cropped record [V]."""
+        """Amplitude at the start of the record [V]."""
         return abs(self.wave)
 
     @property
     def phase(self) -> float:
         """Phase there [rad]."""
-        return math.atan2(self.wave.imag, self.wave.real)
+        return cmath.phase(self.wave)
 
     @property
     def frequency_standard_error(self) -> float:
         """Of the natural frequency [Hz]."""
-        return self._error(np.array([self.decay_rate, self.omega]) / self.natural / (2.0 * math.pi))
+        return self._errors[0]
 
     @property
     def damping_ratio_standard_error(self) -> float:
         """Of the damping ratio [1]."""
-        return self._error(np.array([self.omega**2, -self.decay_rate * self.omega]) / self.natural**3)
+        return self._errors[1]
 
-    def _error(self, slope: NDArray[np.float64]) -> float:
-        return math.sqrt(max(float(slope @ self.covariance @ slope), 0.0))
+    @property
+    def _errors(self) -> list[float]:
+        slopes = modal_slopes(self.pole)
+        return [math.sqrt(max(float(slope @ self.covariance @ slope), 0.0)) for slope in slopes]
 
 
-def modes_of(found: Search, solution: Solution) -> tuple[RingDownMode, ...]:
-    """Return the modes of a solution by ascending frequency."""
-    count = found.decay.size
-    return tuple(
-        RingDownMode(
-            float(found.decay[at]),
-            float(found.omega[at]),
-            complex(solution.amplitude[at]),
-            solution.covariance[np.ix_([at, count + at], [at, count + at])],
+def modal_slopes(pole: complex) -> FloatArray:
+    """Return the derivatives (2, 2) of natural frequency [Hz] and damping ratio [1] by Re s and Im s."""
+    real, imaginary, size = pole.real, pole.imag, abs(pole)
+    of_ratio = np.array([-(imaginary**2), real * imaginary]) / size**3
+    return np.array([np.array([real, imaginary]) / size / (2.0 * math.pi), of_ratio])
+
+
+class Solution(NamedTuple):
+    """K waves against C signals of N samples, at given poles.
+
+    Attributes
+    ----------
+    pole : (K,) array
+        s [1/s].
+    amplitude : (K, C) array
+        Complex, at the first sample [V].
+    fitted : (N, C) array
+        [V].
+    deviation : (C,) array
+        Standard deviation of the residuals [V].
+    covariance : (U, U) array
+        Of the K Re s and K Im s, and for each signal of the K Re A, the K Im A, and the line; zero for
+        frequencies that were not fitted.
+    seen : (K,) array
+        Squared amplitudes over their covariance, summed over the signals: what a wave takes off the sum of
+        squares, over its scatter [1].
+    """
+
+    pole: ComplexArray
+    amplitude: ComplexArray
+    fitted: FloatArray
+    deviation: FloatArray
+    covariance: FloatArray
+    seen: FloatArray
+
+    @property
+    def modes(self) -> tuple[RingDownMode, ...]:
+        """The waves as the first signal has them, in the order of the poles."""
+        count = len(self.pole)
+        pairs = [np.ix_([at, count + at], [at, count + at]) for at in range(count)]
+        return tuple(
+            RingDownMode(complex(pole), complex(wave), self.covariance[pair])
+            for pole, wave, pair in zip(self.pole, self.amplitude[:, 0], pairs, strict=True)
         )
-        for at in np.argsort(found.omega)
-    )
+
+
+def damped_waves(pole: ComplexArray, time: ArrayLike) -> ComplexArray:
+    """Return exp(s t), instants [s] by poles."""
+    return np.asarray(np.exp(np.multiply.outer(time, pole)))
+
+
+class DampedCosines:
+    """Damped cosines and a line against one record of one or more signals, each with noise of its own.
+
+    A value that is the average over an interval of width w carries g(s) = sinh(s w / 2) / (s w / 2).
+
+    Parameters
+    ----------
+    time : (N,) array
+        [s].
+    signal : (N,) or (N, C) array
+        [V].
+    averaging_width : float
+        w [s]; 0 for samples.
+    drift : bool
+        Whether the line may slope; an offset alone otherwise.
+    """
+
+    def __init__(
+        self, time: FloatArray, signal: FloatArray, averaging_width: float = 0.0, *, drift: bool = True
+    ) -> None:
+        self._time = time - time[0]
+        self._signal = signal.reshape(len(time), -1)
+        self._width = averaging_width
+        self._line = np.column_stack([np.ones(time.size), self._time - self._time.mean()])[:, : 1 + drift]
+
+    def residual(self, pole: ComplexArray) -> FloatArray:
+        """Return the residuals [V], (N C,), with the best amplitudes, offset and drift."""
+        orthogonal = np.linalg.qr(self._basis(self._waves(pole)))[0]
+        return np.asarray(self._signal - orthogonal @ (orthogonal.T @ self._signal)).ravel()
+
+    def fit(self, start: NDArray[np.complexfloating], *, frequencies_fitted: bool = True) -> Solution:
+        """Return the waves nearest to the record, begun at these poles."""
+        count, damped = start.size, start.imag
+        scale = np.concatenate([start.real, damped] if frequencies_fitted else [start.real])
+
+        def pole(unknown: FloatArray) -> ComplexArray:
+            scaled = unknown * scale
+            return np.asarray(scaled[:count] + 1j * (scaled[count:] if frequencies_fitted else damped))
+
+        found = least_squares(
+            lambda unknown: self.residual(pole(unknown)),
+            np.ones(scale.size),
+            method="lm",
+            xtol=1e-12,
+            ftol=1e-14,
+            gtol=1e-14,
+            max_nfev=_MOST_EVALUATIONS * scale.size,
+        )
+        return self.solve(pole(found.x), frequencies_fitted=frequencies_fitted)
+
+    def solve(self, pole: ComplexArray, *, frequencies_fitted: bool = True) -> Solution:
+        """Return amplitudes, fitted signals and the covariance at these poles."""
+        wave = self._waves(pole)
+        basis = self._basis(wave)
+        coefficient = np.asarray(np.linalg.lstsq(basis, self._signal, rcond=None)[0], dtype=np.float64)
+        count, channels, own = pole.size, self._signal.shape[1], basis.shape[1]
+        amplitude = coefficient[:count] + 1j * coefficient[count : 2 * count]
+        fitted = basis @ coefficient
+        square = np.sum((self._signal - fitted) ** 2, axis=0)
+        half = 0.5 * pole * self._width
+        slope = 0.5 * self._width * (1.0 / np.tanh(half) - 1.0 / half) if self._width else 0.0
+        moved = (self._time[:, None] + slope) * wave
+        covariance = np.zeros((2 * count + channels * own,) * 2)
+        used = np.delete(np.arange(len(covariance)), [] if frequencies_fitted else np.s_[count : 2 * count])
+        freedom = max(self._signal.size - used.size, 1)
+        variance = np.maximum(square * channels / freedom, _LEAST_VARIANCE)
+        information = np.zeros_like(covariance)
+        for channel in range(channels):
+            turned = moved * amplitude[:, channel]
+            columns = np.hstack([turned.real, -turned.imag, basis]) / math.sqrt(variance[channel])
+            rows = np.r_[: 2 * count, np.arange(own) + 2 * count + channel * own]
+            information[np.ix_(rows, rows)] += columns.T @ columns
+        size = np.sqrt(np.diag(information))[used]
+        scaled = information[np.ix_(used, used)] / np.outer(size, size)
+        covariance[np.ix_(used, used)] = np.linalg.pinv(scaled, hermitian=True) / np.outer(size, size)
+        # what is known of the amplitudes of each wave at these poles, (K, 2, 2)
+        spread = np.linalg.pinv(basis.T @ basis)[: 2 * count, : 2 * count].reshape(2, count, 2, count)
+        weight = np.linalg.pinv(np.einsum("ikjk->kij", spread))
+        pair = coefficient[: 2 * count].reshape(2, count, channels)
+        scatter = np.maximum(square / max(len(basis) - own, 1), _LEAST_VARIANCE)
+        seen = np.einsum("ikc,kij,jkc,c->k", pair, weight, pair, 1.0 / scatter)
+        return Solution(pole, amplitude, fitted, np.sqrt(variance), covariance, seen)
+
+    def _waves(self, pole: ComplexArray) -> ComplexArray:
+        s = np.minimum(pole.real, _GREATEST_GROWTH / self._time[-1]) + 1j * pole.imag
+        half = 0.5 * s * self._width
+        return np.asarray((np.sinh(half) / half if self._width else 1.0) * damped_waves(s, self._time))
+
+    def _basis(self, wave: ComplexArray) -> FloatArray:
+        return np.hstack([wave.real, -wave.imag, self._line])

@@ -9,12 +9,11 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from calibration.errors import RingDownError
 
-from .damped_cosine import RingDownMode
+from .damped_cosine import FloatArray, RingDownMode, damped_waves
 from .ringdown import RingDownFit, refuse_growing
 from .trials import RingDownTrials
 
@@ -41,48 +40,35 @@ def _refine(fit: RingDownFit) -> RingDownFit:
     lowest, highest = record.lowest, record.highest
     time = record.time - record.time[0]
     within = time[:, np.newaxis] + np.linspace(-0.5, 0.5, _POINTS) * record.averaging_width
-    damped = np.array([mode.omega for mode in fit.modes])
+    poles, waves = (np.array([getattr(mode, name) for mode in fit.modes]) for name in ("pole", "wave"))
 
-    def residual(scaled: NDArray[np.float64]) -> NDArray[np.float64]:
+    def signal(unknown: FloatArray, when: FloatArray) -> FloatArray:
+        """Return offset, drift and the decaying modes at some instants."""
+        wave = damped_waves(unknown[4:6] + 1j * poles.imag, when) @ (unknown[:2] + 1j * unknown[2:4])
+        return np.asarray(unknown[6] + unknown[7] * when + wave.real)
+
+    def residual(scaled: FloatArray) -> FloatArray:
         unknown = scaled * scale
-        value = _signal(unknown, damped, within)
-        return np.concatenate(
-            [value.min(axis=1) - unknown[8] - lowest, value.max(axis=1) + unknown[8] - highest]
-        )
+        value, half_line = signal(unknown, within), unknown[8]
+        return np.hstack([value.min(axis=1) - half_line - lowest, value.max(axis=1) + half_line - highest])
 
-    start = [part for mode in fit.modes for part in (mode.wave.real, mode.wave.imag, mode.decay_rate)]
     size = float(np.ptp(record.signal))
     half_line = 0.5 * float(np.percentile(highest - lowest, 10.0))
-    scale = np.array([size, size, start[2], size, size, start[5], size, size, size])
-    first = np.array([*start, 0.0, 0.0, half_line]) / scale
+    scale = np.array([size, size, size, size, *np.abs(poles.real), size, size, size])
+    first = np.array([*waves.real, *waves.imag, *poles.real, 0.0, 0.0, half_line]) / scale
     found = least_squares(residual, first, method="lm", xtol=1e-10, ftol=1e-12, diff_step=1e-6)
     unknown = found.x * scale
     # Both extremes of a column see the same signal: they count as one reading.
     variance = float(found.cost) / max(time.size - unknown.size, 1)
     covariance = 2.0 * variance * np.linalg.pinv(found.jac.T @ found.jac) * np.outer(scale, scale)
-    modes = [
+    first_mode, second_mode = (
         RingDownMode(
-            float(unknown[at + 2]), mode.omega, complex(unknown[at], unknown[at + 1]),
-            np.diag([covariance[at + 2, at + 2], 0.0]),
+            complex(unknown[4 + at], pole.imag), complex(unknown[at], unknown[2 + at]),
+            np.diag([covariance[4 + at, 4 + at], 0.0]),
         )
-        for at, mode in zip((0, 3), fit.modes, strict=True)
-    ]  # fmt: skip
-    for number, mode in enumerate(modes, start=1):
-        refuse_growing(mode, number, record.source)
-    return replace(
-        fit,
-        modes=(modes[0], modes[1]),
-        fitted=_signal(unknown, damped, time),
-        residual_deviation=math.sqrt(variance),
-    )
-
-
-def _signal(
-    unknown: NDArray[np.float64], damped: NDArray[np.float64], when: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return offset, drift and the decaying modes of the angular frequencies `damped` at some instants."""
-    value = unknown[6] + unknown[7] * when
-    for number, omega in enumerate(damped.tolist()):
-        cosine, sine, decay = unknown[3 * number : 3 * number + 3]
-        value = value + np.exp(-decay * when) * (cosine * np.cos(omega * when) - sine * np.sin(omega * when))
-    return np.asarray(value)
+        for at, pole in enumerate(poles)
+    )  # fmt: skip
+    modes = first_mode, second_mode
+    refuse_growing(modes, record.source)
+    fitted, deviation = signal(unknown, time), math.sqrt(variance)
+    return replace(fit, modes=modes, fitted=fitted, residual_deviation=deviation)

@@ -7,18 +7,18 @@ Free decay: the same identification as a start, then least squares with the mode
 covariance is that of the least squares, with white noise of its own on each channel.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
 from scipy.special import chdtri
 
 from calibration.errors import ExperimentDataError
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from .damped_cosine import ComplexArray, DampedCosines, FloatArray, Solution, modal_slopes
 
 RecordKind = Literal["ambient", "decay"]
 
@@ -36,7 +36,6 @@ _MOST_LAGS = 40
 _SMALLEST_SHARE = 1e-2  # of the strongest mode, from which one is fitted to a free decay
 _FALSE_MODE = 1e-3
 """Probability that noise alone is taken for a mode, over all frequencies where one could have been found."""
-_MOST_EVALUATIONS = 300  # of the least squares, for each unknown
 
 
 @dataclass(frozen=True)
@@ -102,17 +101,24 @@ def identify_modes(
         sampling rate, or overlaps another.
     """
     record, limits = _checked(acceleration, sampling_rate, bands)
-    lags = int(
-        np.clip(np.ceil(2.0 * sampling_rate / limits.min()), LARGEST_ORDER // record.shape[1] + 2, _MOST_LAGS)
-    )
-    if len(record) < (BLOCKS if kind == "ambient" else 4) * 2 * lags:
+    fewest = LARGEST_ORDER // record.shape[1] + 2
+    lags = int(np.clip(np.ceil(2.0 * sampling_rate / limits.min()), fewest, _MOST_LAGS))
+    needed = (BLOCKS if kind == "ambient" else 4) * 2 * lags
+    if len(record) < needed:
         raise ExperimentDataError(
-            f"the record has {len(record)} samples; {(BLOCKS if kind == 'ambient' else 4) * 2 * lags} are "
-            "needed to tell modes and their covariance: record longer, or take a smaller sampling rate."
+            f"the record has {len(record)} samples; {needed} are needed to tell modes and their covariance: "
+            "record longer, or take a smaller sampling rate."
         )
-    if kind == "ambient":
-        return _ambient(record, sampling_rate, limits, lags)
-    return _decay(record, sampling_rate, limits, lags)
+    way = partial(_ambient, modes=len(limits)) if kind == "ambient" else _decay
+    found, covariances = way(record, sampling_rate, lags)
+    strongest = [found.strongest(low, high) for low, high in limits]
+    chosen = {mode: pole for mode, pole in enumerate(strongest) if pole is not None}
+    shape = len(limits), 1 + record.shape[1]
+    value, covariance = np.full(shape, np.nan), np.full((*shape, shape[1]), np.nan)
+    if chosen:
+        value[[*chosen]] = [found.values(pole) for pole in chosen.values()]
+        covariance[[*chosen]] = covariances([*chosen.values()])
+    return IdentifiedModes(value, covariance)
 
 
 def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -150,17 +156,29 @@ def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[Fl
     return record - record.mean(axis=0), limits
 
 
-@dataclass(frozen=True)
-class _Poles:
-    """Poles of an identified system with positive frequency: s [1/s] (P,), shapes (P, A), shares (P,).
+class _Poles(NamedTuple):
+    """Poles with positive frequency: s [1/s] (P,), shapes (P, A), shares in the record (P,).
 
-    `seen` (P,) is what each takes off the sum of squares over the scatter, which is a chi-square of noise.
+    `seen` (P,) is what each takes off the sum of squares over the scatter, a chi-square where there is noise
+    alone, and `places` at how many frequencies noise could have shown as much.
     """
 
     pole: ComplexArray
     shape: ComplexArray
     share: FloatArray
     seen: FloatArray
+    places: int
+
+    @property
+    def damped(self) -> NDArray[np.bool_]:
+        """Whether each is one of a structure (P,)."""
+        ratio = -self.pole.real / np.abs(self.pole)
+        return np.asarray((ratio > 0.0) & (ratio < LARGEST_RATIO))
+
+    @property
+    def beyond_noise(self) -> NDArray[np.bool_]:
+        """Whether noise alone would hardly show so much anywhere (P,)."""
+        return np.asarray(self.seen > chdtri(2 + 4 * self.shape.shape[1], _FALSE_MODE / self.places))
 
     def values(self, chosen: int) -> FloatArray:
         """Return frequency, damping ratio and relative shape of a pole."""
@@ -168,23 +186,18 @@ class _Poles:
         relative = (self.shape[chosen, 1:] / self.shape[chosen, 0]).real
         return np.array([abs(s) / (2.0 * np.pi), -s.real / abs(s), *relative])
 
-    def strongest(self, low: float, high: float, places: int) -> int | None:
+    def strongest(self, low: float, high: float) -> int | None:
         """Return the pole in a band that the record shows most of; None without one beyond noise."""
-        frequency, ratio = np.abs(self.pole) / (2.0 * np.pi), -self.pole.real / np.abs(self.pole)
-        inside = (frequency >= low) & (frequency <= high) & (ratio > 0.0) & (ratio < LARGEST_RATIO)
+        frequency = np.abs(self.pole) / (2.0 * np.pi)
+        inside = (frequency >= low) & (frequency <= high) & self.damped
         if not inside.any():
             return None
         best = int(np.argmax(np.where(inside, self.share, -1.0)))
-        return best if self.beyond_noise(places)[best] else None
+        return best if self.beyond_noise[best] else None
 
-    def beyond_noise(self, places: int) -> NDArray[np.bool_]:
-        """Return whether noise alone would hardly show so much at any of `places` frequencies (P,)."""
-        freedom = 2 + 4 * self.shape.shape[1]
-        return np.asarray(self.seen > chdtri(freedom, _FALSE_MODE / places))
 
-    def nearest(self, pole: complex) -> int:
-        """Return the pole that is nearest to a given one."""
-        return int(np.argmin(np.abs(self.pole - pole)))
+_Found = tuple[_Poles, Callable[[list[int]], list[FloatArray]]]
+"""Poles, and what gives the covariances of the values of some of them."""
 
 
 class _Subspace:
@@ -209,45 +222,39 @@ class _Subspace:
         eigenvalue, vector = np.linalg.eig(transition.astype(np.complex128))
         return eigenvalue, vector, observability[:count] @ vector
 
-    def poles(self, order: int, variance: FloatArray | None = None) -> tuple[_Poles, float]:
+    def poles(self, order: int, variance: FloatArray | float = 1.0) -> tuple[_Poles, float]:
         """Return the poles of the system of an order, and its mean square misfit over the variance.
 
-        `variance` (2 L, C, C) is that of the correlations; without it the misfit and what each pole takes
-        off it are NaN.
+        `variance` (2 L, C, C) is that of the correlations; without it nothing tells poles from noise.
         """
         eigenvalue, vector, shape = self._modal(self._left[:, :order])
         count = self._correlation.shape[1]
         control = np.sqrt(self._singular[:order])[:, None] * self._right[:count, :order].T
         part = np.linalg.solve(vector, control.astype(np.complex128))
         powers = eigenvalue ** np.arange(len(self._correlation))[:, None]
-        model = np.asarray(np.einsum("cn,ln,nd->lcd", shape, powers, part).real)
-        share = np.linalg.norm(shape, axis=0) * np.linalg.norm(part, axis=1) * np.linalg.norm(powers, axis=0)
+        each = np.einsum("cn,ln,nd->nlcd", shape, powers, part)
         inside = eigenvalue.imag > 0.0
-        seen, misfit = np.full(inside.sum(), np.nan), np.nan
-        if variance is not None:
-            left = self._correlation - model
-            misfit = float(np.mean(left**2 / variance))
-            alone = 2.0 * np.einsum("cn,ln,nd->nlcd", shape[:, inside], powers[:, inside], part[inside]).real
-            seen = np.sum(((left + alone) ** 2 - left**2) / variance, axis=(1, 2, 3))
+        left, alone = self._correlation - each.sum(axis=0).real, 2.0 * each[inside].real
+        seen = np.sum(((left + alone) ** 2 - left**2) / variance, axis=(1, 2, 3))
+        share = np.sqrt(np.sum(np.abs(each[inside]) ** 2, axis=(1, 2, 3)))
         pole = np.asarray(np.log(eigenvalue[inside]) * self._rate, dtype=np.complex128)
-        return _Poles(pole, shape.T[inside], share[inside], seen), misfit
+        found = _Poles(pole, shape.T[inside], share, seen, len(self._correlation))
+        return found, float(np.mean(left**2 / variance))
 
-    def changed(self, change: FloatArray, order: int, step: float) -> _Poles:
-        """Return the poles under a small change of the correlations; singular vectors to first order."""
+    def moved(self, change: FloatArray, order: int, poles: ComplexArray) -> _Poles:
+        """Return poles under a small change of the correlations; singular vectors to first order."""
         within, beyond = slice(None, order), slice(order, None)
-        turned = self._left.T @ (step * self._hankel(change)) @ self._right
+        turned = self._left.T @ self._hankel(change) @ self._right
         s, rest = self._singular[within], self._singular[beyond, None]
         mixed = (turned[beyond, within] * s + rest * turned[within, beyond].T) / (s**2 - rest**2)
         eigenvalue, _, shape = self._modal(self._left[:, within] + self._left[:, beyond] @ mixed)
-        inside = eigenvalue.imag > 0.0
-        return _Poles(
-            np.asarray(np.log(eigenvalue[inside]) * self._rate, dtype=np.complex128),
-            shape.T[inside],
-            *np.ones((2, inside.sum())),
-        )
+        pole = np.log(eigenvalue) * self._rate
+        nearest = np.argmin(np.abs(pole - poles[:, None]), axis=1)
+        ones = np.ones(len(poles))
+        return _Poles(np.asarray(pole[nearest], dtype=np.complex128), shape.T[nearest], ones, ones, 1)
 
 
-def _ambient(record: FloatArray, rate: float, bands: FloatArray, lags: int) -> IdentifiedModes:
+def _ambient(record: FloatArray, rate: float, lags: int, modes: int) -> _Found:
     length = (len(record) - 2 * lags) // BLOCKS
     size = length * BLOCKS
     blocks = record[:size].reshape(BLOCKS, length, -1)
@@ -261,30 +268,27 @@ def _ambient(record: FloatArray, rate: float, bands: FloatArray, lags: int) -> I
     whole = each.mean(axis=0)
     variance = each.var(axis=0, ddof=1) / BLOCKS
     subspace = _Subspace(whole, rate)
-    for order in range(2 * len(bands), LARGEST_ORDER + 1, 2):
+    for order in range(2 * modes, LARGEST_ORDER + 1, 2):
         found, misfit = subspace.poles(order, variance)
         if misfit < 1.0:
             break
-    width = 1 + record.shape[1]
-    value = np.full((len(bands), width), np.nan)
-    covariance = np.full((len(bands), width, width), np.nan)
-    chosen = [found.strongest(low, high, 2 * lags) for low, high in bands]
-    each = _long_blocks(each, length / rate, [found.pole[pole] for pole in chosen if pole is not None])
-    changed = [subspace.changed(one - whole, order, _STEP) for one in each]
-    for mode, pole in enumerate(chosen):
-        if pole is None:
-            continue
-        value[mode] = found.values(pole)
-        moved = np.array([other.values(other.nearest(found.pole[pole])) for other in changed])
-        moved = (moved - value[mode]) / _STEP
-        covariance[mode] = moved.T @ moved / (len(each) * (len(each) - 1))
-    return IdentifiedModes(value, covariance)
+
+    def covariances(chosen: list[int]) -> list[FloatArray]:
+        poles = found.pole[chosen]
+        long = _long_blocks(each, length / rate, float(np.max(-1.0 / poles.real)))
+        moved = [subspace.moved(_STEP * (one - whole), order, poles) for one in long]
+        changes = [
+            (np.array([other.values(at) for other in moved]) - found.values(pole)) / _STEP
+            for at, pole in enumerate(chosen)
+        ]
+        return [change.T @ change / (len(long) * (len(long) - 1)) for change in changes]
+
+    return found, covariances
 
 
-def _long_blocks(each: FloatArray, duration: float, poles: list[complex]) -> FloatArray:
+def _long_blocks(each: FloatArray, duration: float, memory: float) -> FloatArray:
     """Return the correlations of blocks that last as long as the modes remember, by taking some together."""
-    memory = max((-1.0 / pole.real for pole in poles), default=0.0)
-    together = int(np.ceil(memory / duration)) or 1
+    together = int(np.ceil(memory / duration))
     count = len(each) // together
     if count < _FEWEST_BLOCKS:
         raise ExperimentDataError(
@@ -294,112 +298,38 @@ def _long_blocks(each: FloatArray, duration: float, poles: list[complex]) -> Flo
     return np.asarray(each[: count * together].reshape(count, together, *each.shape[1:]).mean(axis=1))
 
 
-def _decay(record: FloatArray, rate: float, bands: FloatArray, lags: int) -> IdentifiedModes:
+def _decay(record: FloatArray, rate: float, lags: int) -> _Found:
     size = len(record) - 2 * lags
     whole = np.stack([record[lag : lag + size].T @ record[:size] / size for lag in range(1, 2 * lags + 1)])
     start, _ = _Subspace(whole, rate).poles(LARGEST_ORDER)
-    ratio = -start.pole.real / np.abs(start.pole)
-    real = (ratio > 0.0) & (ratio < LARGEST_RATIO) & (start.share > _SMALLEST_SHARE * start.share.max())
-    poles = start.pole[real]
-    time = np.arange(len(record)) / rate
+    waves = DampedCosines(np.arange(len(record)) / rate, record, drift=False)
+    poles = start.pole[start.damped & (start.share > _SMALLEST_SHARE * start.share.max())]
     # Most poles of noise are seen at once to be such; those that are left spoil the covariance of the others.
-    poles = poles[_at_poles(record, time, poles)[0].beyond_noise(len(record))]
-    while poles.size:
-        found, basis, left = _at_poles(record, time, _moved(record, time, poles))
-        ratio = -found.pole.real / np.abs(found.pole)
-        real = (ratio > 0.0) & (ratio < LARGEST_RATIO) & found.beyond_noise(len(record))
+    poles = poles[_of(waves.solve(poles)).beyond_noise]
+    while True:
+        solution = waves.fit(poles) if poles.size else waves.solve(poles)
+        found = _of(solution)
+        real = found.damped & found.beyond_noise
         if real.all():
-            covariance = _decay_covariance(time, basis, found.pole, found.shape, left)
-            return _of_decay(found, covariance, bands, len(record))
+            return found, partial(_decay_covariances, solution)
         poles = found.pole[real]
-    shape = (len(bands), 1 + record.shape[1])
-    return IdentifiedModes(np.full(shape, np.nan), np.full((*shape, shape[1]), np.nan))
 
 
-def _waves(pole: ComplexArray, time: FloatArray) -> FloatArray:
-    """Return the real and imaginary waves of P poles and an offset, (N, 2 P + 1)."""
-    wave = np.exp(np.minimum(pole.real, 0.0) * time[:, None] + 1j * pole.imag * time[:, None])
-    return np.hstack([wave.real, -wave.imag, np.ones((len(time), 1))])
+def _of(solution: Solution) -> _Poles:
+    share = np.linalg.norm(solution.amplitude, axis=1)
+    return _Poles(solution.pole, solution.amplitude, share, solution.seen, len(solution.fitted))
 
 
-def _moved(record: FloatArray, time: FloatArray, poles: ComplexArray) -> ComplexArray:
-    """Return the poles whose waves fit best, begun at `poles`."""
-    scale = np.abs(poles)
-
-    def pole_of(unknown: FloatArray) -> ComplexArray:
-        return np.asarray(scale * (unknown[: poles.size] + 1j * unknown[poles.size :]))
-
-    def residual(unknown: FloatArray) -> FloatArray:
-        orthogonal = np.linalg.qr(_waves(pole_of(unknown), time))[0]
-        return np.asarray(record - orthogonal @ (orthogonal.T @ record)).ravel()
-
-    first = np.concatenate([poles.real / scale, poles.imag / scale])
-    most = _MOST_EVALUATIONS * len(first)
-    return pole_of(least_squares(residual, first, method="lm", xtol=1e-10, ftol=1e-10, max_nfev=most).x)
-
-
-def _at_poles(
-    record: FloatArray, time: FloatArray, poles: ComplexArray
-) -> tuple[_Poles, FloatArray, FloatArray]:
-    """Return poles with the amplitudes (P, A) that fit best, their waves, and what is left (N, A)."""
-    basis = _waves(poles, time)
-    coefficient = np.asarray(np.linalg.lstsq(basis, record, rcond=None)[0], dtype=np.float64)
-    amplitude = coefficient[: poles.size] + 1j * coefficient[poles.size : -1]
-    left = record - basis @ coefficient
-    seen = _seen_in_decay(basis, coefficient, left)
-    return _Poles(poles, amplitude, np.linalg.norm(amplitude, axis=1), seen), basis, left
-
-
-def _seen_in_decay(basis: FloatArray, coefficient: FloatArray, left: FloatArray) -> FloatArray:
-    """Return the squared amplitudes of each pole over their covariance, summed over the channels (P,)."""
-    count = len(coefficient) // 2
-    spread = np.linalg.pinv(basis.T @ basis)
-    variance = np.sum(left**2, axis=0) / (len(left) - len(coefficient))
-    seen = np.zeros(count)
-    for pole in range(count):
-        rows = [pole, count + pole]
-        weight = np.linalg.pinv(spread[np.ix_(rows, rows)])
-        seen[pole] = np.sum(np.einsum("ic,ij,jc->c", coefficient[rows], weight, coefficient[rows]) / variance)
-    return seen
-
-
-def _decay_covariance(
-    time: FloatArray, basis: FloatArray, pole: ComplexArray, amplitude: ComplexArray, left: FloatArray
-) -> FloatArray:
-    """Covariance of Re s, Im s, then of Re and Im of the amplitudes and of the offset of each channel."""
-    count, channels = amplitude.shape
-    information = np.zeros((2 * count + channels * (2 * count + 1),) * 2)
-    freedom = left.size - len(information)
-    for channel in range(channels):
-        wave = time[:, None] * (basis[:, :count] - 1j * basis[:, count:-1]) * amplitude[:, channel]
-        own = np.hstack([wave.real, -wave.imag, basis])
-        own = own / (np.sqrt(np.sum(left[:, channel] ** 2) * channels / freedom) or 1.0)
-        begin = 2 * count + channel * (2 * count + 1)
-        rows = np.r_[: 2 * count, begin : begin + 2 * count + 1]
-        information[np.ix_(rows, rows)] += own.T @ own
-    size = np.sqrt(np.diag(information))
-    return np.asarray(np.linalg.pinv(information / np.outer(size, size)) / np.outer(size, size))
-
-
-def _of_decay(found: _Poles, covariance: FloatArray, bands: FloatArray, samples: int) -> IdentifiedModes:
-    count, channels = found.shape.shape
-    value = np.full((len(bands), 1 + channels), np.nan)
-    result = np.full((len(bands), 1 + channels, 1 + channels), np.nan)
-    for mode, (low, high) in enumerate(bands):
-        pole = found.strongest(low, high, samples)
-        if pole is None:
-            continue
-        s, amplitude = found.pole[pole], found.shape[pole]
-        value[mode] = found.values(pole)
-        slope = np.zeros((1 + channels, len(covariance)))
-        size = abs(s)
-        slope[0, [pole, count + pole]] = np.array([s.real, s.imag]) / size / (2.0 * np.pi)
-        slope[1, [pole, count + pole]] = np.array([-(s.imag**2), s.real * s.imag]) / size**3
-        for channel in range(1, channels):
-            ratio = amplitude[channel] / amplitude[0]
-            for which, factor in ((channel, 1.0), (0, -ratio)):
-                change = factor / amplitude[0]
+def _decay_covariances(solution: Solution, chosen: list[int]) -> list[FloatArray]:
+    count, channels = solution.amplitude.shape
+    found = []
+    for pole in chosen:
+        first, *others = solution.amplitude[pole].tolist()
+        slope = np.zeros((1 + channels, len(solution.covariance)))
+        slope[:2, [pole, count + pole]] = modal_slopes(complex(solution.pole[pole]))
+        for channel, other in enumerate(others, start=1):
+            for which, change in ((channel, 1.0 / first), (0, -other / first**2)):
                 place = 2 * count + which * (2 * count + 1) + pole
                 slope[1 + channel, [place, place + count]] = change.real, -change.imag
-        result[mode] = slope @ covariance @ slope.T
-    return IdentifiedModes(value, result)
+        found.append(slope @ solution.covariance @ slope.T)
+    return found

@@ -5,6 +5,7 @@ frequency and decay rate into natural frequency and damping ratio.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -14,7 +15,7 @@ from scipy.signal import decimate, detrend, find_peaks
 
 from calibration.errors import RingDownError
 
-from .damped_cosine import DampedCosines, RingDownMode, modes_of
+from .damped_cosine import DampedCosines, RingDownMode
 from .records import MINIMUM_COUNT, RingDownRecord
 
 FIRST_PEAK = 0.00548
@@ -219,22 +220,21 @@ def fit_ring_down(
     omega = 2.0 * math.pi * np.array(spectral_peaks(record, band))
     model = DampedCosines(record.time, record.signal, record.averaging_width)
     free = procedure is Frequencies.FITTED
-    searches = [model.fitted(ratio * omega, omega, frequencies_fitted=free) for ratio in _STARTING_RATIOS]
-    found = min(searches, key=lambda search: search.cost)
-    solution = model.solve(found.decay, found.omega, frequencies_fitted=free)
-    first, second = modes_of(found, solution)
-    for number, mode in enumerate((first, second), start=1):
-        refuse_growing(mode, number, record.source)
-    return RingDownFit((first, second), record, solution.fitted, solution.residual_deviation, procedure)
+    searches = [model.fit((1j - ratio) * omega, frequencies_fitted=free) for ratio in _STARTING_RATIOS]
+    found = min(searches, key=lambda search: float(search.deviation[0]))
+    first, second = sorted(found.modes, key=lambda mode: mode.pole.imag)
+    refuse_growing((first, second), record.source)
+    return RingDownFit((first, second), record, found.fitted[:, 0], float(found.deviation[0]), procedure)
 
 
-def refuse_growing(mode: RingDownMode, number: int, source: str) -> None:
+def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
     """Raise RingDownError for what is no decaying oscillation."""
-    if not 0.0 < mode.decay_rate < mode.omega:
-        raise RingDownError(
-            f"{source}: mode {number} at {mode.damped_frequency:.3g} Hz is not a decaying oscillation "
-            f"(fitted rate {mode.decay_rate:.3g} 1/s); a ring-down record is needed."
-        )
+    for number, mode in enumerate(modes, start=1):
+        if not 0.0 < -mode.pole.real < mode.pole.imag:
+            raise RingDownError(
+                f"{source}: mode {number} at {mode.damped_frequency:.3g} Hz is not a decaying oscillation "
+                f"(fitted rate {-mode.pole.real:.3g} 1/s); a ring-down record is needed."
+            )
 
 
 def _refuse_steady(record: RingDownRecord) -> None:

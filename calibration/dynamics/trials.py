@@ -1,5 +1,6 @@
 """Several ring-down trials together: averages, and how frequency and damping change with the amplitude."""
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ import numpy as np
 
 from calibration.errors import RingDownError
 
-from .damped_cosine import DampedCosines, modes_of
+from .damped_cosine import DampedCosines, RingDownMode
 from .records import RingDownRecord
 from .ringdown import FIRST_PEAK, Frequencies, RingDownFit, fit_ring_down
 
@@ -62,15 +63,6 @@ class RingDownTrials:
         return Averaged(mean, deviation, deviation / math.sqrt(len(values)))
 
 
-class AmplitudePoint(NamedTuple):
-    """First mode within one window: middle [s], amplitude [V], frequency [Hz], damping ratio [1]."""
-
-    time: float
-    amplitude: float
-    frequency: float
-    damping_ratio: float
-
-
 def fit_trials(
     records: Sequence[RingDownRecord],
     procedure: Frequencies = Frequencies.PEAKS,
@@ -91,8 +83,8 @@ def fit_trials(
 
 def amplitude_dependence(
     fit: RingDownFit, *, window: float = 0.8, step: float = 0.4, first: float = 0.4
-) -> tuple[AmplitudePoint, ...]:
-    """Fit the first mode alone within windows that slide over the record.
+) -> tuple[RingDownMode, ...]:
+    """Fit the first mode alone within windows that slide over the record; amplitudes are those in the middle.
 
     A linear wing gives the same frequency and damping ratio in each. Windows in which the mode no longer
     stands above four times the residuals are left out.
@@ -105,17 +97,15 @@ def amplitude_dependence(
         Length of a window, shift between two, start of the first, when mode 2 has died away [s].
     """
     points = []
-    record, mode = fit.record, fit.modes[0]
+    record = fit.record
     begin = float(record.time[0]) + first
     while begin + window <= float(record.time[-1]):
         inside = (record.time >= begin) & (record.time < begin + window)
         model = DampedCosines(record.time[inside], record.signal[inside], record.averaging_width)
-        found = model.fitted(np.array([mode.decay_rate]), np.array([mode.omega]))
-        solution = model.solve(found.decay, found.omega, frequencies_fitted=True)
-        (seen,) = modes_of(found, solution)
-        amplitude = seen.amplitude * math.exp(-seen.decay_rate * 0.5 * window)
-        if amplitude > 4.0 * solution.residual_deviation:
-            middle = begin + 0.5 * window
-            points.append(AmplitudePoint(middle, amplitude, seen.frequency, seen.damping_ratio))
+        solution = model.fit(np.array([fit.modes[0].pole]))
+        (seen,) = solution.modes
+        seen = seen._replace(wave=seen.wave * cmath.exp(seen.pole * 0.5 * window))
+        if seen.amplitude > 4.0 * float(solution.deviation[0]):
+            points.append(seen)
         begin += step
     return tuple(points)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import chdtri
 
-from calibration.dynamics.damped_cosine import DampedCosines, RingDownMode, modes_of
+from calibration.dynamics.damped_cosine import DampedCosines, RingDownMode
 from calibration.dynamics.ringdown import Frequencies, RingDownFit
 from calibration.dynamics.trials import (
     PUBLISHED_DAMPING_RATIOS,
@@ -165,15 +165,11 @@ def _refit(fit: RingDownFit, delay: float) -> RingDownMode | None:
     record = fit.record
     after = record.time >= record.time[0] + delay
     model = DampedCosines(record.time[after], record.signal[after], record.averaging_width)
-    decay, omega = np.array([(mode.decay_rate, mode.omega) for mode in fit.modes]).T
-    found = model.fitted(decay, omega)
-    rate, damped = float(found.decay[1]), float(found.omega[1])
-    if not (0.0 < rate < damped and abs(damped / omega[1] - 1.0) < _SAME_MODE):
-        return None
-    solution = model.solve(found.decay, found.omega, frequencies_fitted=True)
-    if abs(solution.amplitude[1]) < _VISIBLE * solution.residual_deviation:
-        return None
-    return next(mode for mode in modes_of(found, solution) if mode.omega == damped)
+    solution = model.fit(np.array([mode.pole for mode in fit.modes]))
+    found, before = solution.modes[1], fit.modes[1]
+    same = abs(found.damped_frequency / before.damped_frequency - 1.0) < _SAME_MODE
+    decays = 0.0 < -found.pole.real < found.pole.imag
+    return found if same and decays and found.amplitude >= _VISIBLE * float(solution.deviation[0]) else None
 
 
 PUBLISHED_MODES = modal_readings(

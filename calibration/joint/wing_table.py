@@ -72,7 +72,7 @@ class WingTable:
         if not inside.all():
             row, place = np.argwhere(~inside)[0]
             prior = wing_priors(self.validity)[place]
-            unit = "" if prior.unit == "1" else f" {prior.unit}"
+            unit = f" {prior.figure.shown_unit}".rstrip()
             raise OutsideValidityError(
                 f"the {prior.title} is {points[row, place]:.4g}{unit}, but the model holds for "
                 f"{prior.low:g} to {prior.high:g}{unit}; check the measurements, or build a model with a "

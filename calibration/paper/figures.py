@@ -1,7 +1,5 @@
 """Figure of calibration step 2: the panels of Kapteyn et al. 2021, Fig. 5."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -25,15 +23,33 @@ _MARKERS = ("o", "s", "^", "D", "v", "P")
 _RUN_LINES = ("-", "--", "-.", ":")
 
 
+@publication_style()
 def calibration_figure(result: StaticCalibration) -> Figure:
     """Draw the three panels of Fig. 5: measurements and bands, densities of e, densities of the stiffness."""
-    with publication_style():
-        figure = new_figure(height=4.4)
-        grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0), wspace=0.22, hspace=0.48)
-        figure.subplots_adjust(left=0.062, right=0.985, bottom=0.095, top=0.94)
-        _draw_loads(figure.add_subplot(grid[:, 0]), result)
-        _draw_factor(figure.add_subplot(grid[0, 1]), result)
-        _draw_stiffness(figure.add_subplot(grid[1, 1]), result)
+    figure = new_figure(height=4.4)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0), wspace=0.22, hspace=0.48)
+    figure.subplots_adjust(left=0.062, right=0.985, bottom=0.095, top=0.94)
+    _draw_loads(figure.add_subplot(grid[:, 0]), result)
+    factor, stiffness = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
+    for pair, run in enumerate(np.searchsorted(result.data.run_indices, result.data.run).tolist()):
+        factor.plot(
+            result.particle.likelihood_grid, result.particle.likelihood[pair], color=OBSERVED, lw=0.7,
+            ls=_RUN_LINES[run % len(_RUN_LINES)], label="likelihood of one pair" if pair == 0 else None,
+        )  # fmt: skip
+    _draw_densities(factor, result.before, result.exact, result.particle.posterior)
+    factor.axvline(PAPER_MEAN, color=REFERENCE, lw=0.7, ls=":", label="mean in the paper")
+    factor.set_xlabel("Young's modulus factor $e$", parse_math=True)
+    factor.set_ylabel("probability density")
+    panel_label(factor, "b", "Prior, likelihoods, posterior")
+    after = result.tip_stiffness_exact
+    _draw_densities(stiffness, result.tip_stiffness_prior, after, result.tip_stiffness_particle, 1e-3)
+    stiffness.set_xlabel("tip stiffness $k$ (N/mm)", parse_math=True)
+    stiffness.set_ylabel("probability density (mm/N)")
+    told = f"{after.mean * 1e-3:.4f} ± {after.standard_deviation * 1e-3:.4f} N/mm"
+    stiffness.text(0.99, 0.60, told, transform=stiffness.transAxes, color=PAST, ha="right", fontsize=6.8)
+    panel_label(stiffness, "c", "Quantity of interest")
+    for axes in (factor, stiffness):
+        axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
     return figure
 
 
@@ -41,76 +57,29 @@ def _draw_loads(axes: Axes, result: StaticCalibration) -> None:
     data = result.data
     reach = 1.12 * float(data.displacement.max())
     displacement = np.array([0.0, reach])
-    for posterior, colour, name, opacity in (
-        (result.tip_stiffness_prior, REFERENCE, "prior", 0.35),
-        (result.tip_stiffness_exact, PAST, "posterior", 0.35),
+    for posterior, colour, name, line in (
+        (result.tip_stiffness_prior, REFERENCE, "prior", {"lw": 1.0, "ls": "--"}),
+        (result.tip_stiffness_exact, PAST, "posterior", {"lw": 1.2}),
     ):
-        lower, upper = posterior.interval(0.95)
-        axes.fill_between(
-            displacement * 1e3, lower * displacement, upper * displacement,
-            color=colour, alpha=opacity, lw=0.0, label=f"{name}, 95 % band",
-        )  # fmt: skip
-    axes.plot(
-        displacement * 1e3, result.tip_stiffness_prior.mean * displacement, color=REFERENCE, lw=1.0, ls="--"
-    )
-    axes.plot(displacement * 1e3, result.tip_stiffness_exact.mean * displacement, color=PAST, lw=1.2)
+        lower, upper = (end * displacement for end in posterior.interval(0.95))
+        label = f"{name}, 95 % band"
+        axes.fill_between(displacement * 1e3, lower, upper, color=colour, alpha=0.35, lw=0.0, label=label)
+        axes.plot(displacement * 1e3, posterior.mean * displacement, color=colour, **line)
     for number, index in enumerate(data.run_indices):
         of_run = data.run == index
         axes.errorbar(
             data.displacement[of_run] * 1e3, data.load[of_run],
             xerr=HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3,
             yerr=HALF_WIDTH_95 * data.load_standard_deviation,
-            **_of_run(number), label=f"measured, run {index + 1}", zorder=3 + number,
+            fmt=_MARKERS[number % len(_MARKERS)], color=OBSERVED, mfc="white" if number % 2 else OBSERVED,
+            ms=3.6, mew=0.9, elinewidth=0.8, capsize=1.8, label=f"measured, run {index + 1}",
+            zorder=3 + number,
         )  # fmt: skip
-    axes.set_xlim(0.0, reach * 1e3)
-    axes.set_ylim(0.0, 1.12 * float(data.load.max()))
+    axes.set(xlim=(0.0, reach * 1e3), ylim=(0.0, 1.12 * float(data.load.max())))
     axes.set_xlabel("tip displacement $x$ (mm)", parse_math=True)
     axes.set_ylabel("tip load $f$ (N)", parse_math=True)
     axes.legend(loc="upper left", handlelength=1.5)
     panel_label(axes, "a", "Load and displacement")
-
-
-def _of_run(number: int) -> dict[str, Any]:
-    """Return how the pairs of a loading run are marked."""
-    marker, face = _MARKERS[number % len(_MARKERS)], "white" if number % 2 else OBSERVED
-    line: dict[str, Any] = {"ms": 3.6, "mew": 0.9, "elinewidth": 0.8, "capsize": 1.8}
-    return line | {"fmt": marker, "color": OBSERVED, "mfc": face}
-
-
-def _draw_factor(axes: Axes, result: StaticCalibration) -> None:
-    particle, prior = result.particle, result.prior
-    for pair in range(result.data.count):
-        run = result.data.run_indices.index(int(result.data.run[pair]))
-        axes.plot(
-            particle.likelihood_grid, particle.likelihood[pair], color=OBSERVED, lw=0.7,
-            ls=_RUN_LINES[run % len(_RUN_LINES)], label="likelihood of one pair" if pair == 0 else None,
-        )  # fmt: skip
-    grid = np.linspace(-8.0, 8.0, 2001) * prior.standard_deviation + prior.mean
-    before = ScalarPosterior(grid, prior.density(grid))
-    _draw_densities(axes, before, result.exact, particle.posterior)
-    axes.axvline(PAPER_MEAN, color=REFERENCE, lw=0.7, ls=":", label="mean in the paper")
-    axes.set_xlabel("Young's modulus factor $e$", parse_math=True)
-    axes.set_ylabel("probability density")
-    axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
-    panel_label(axes, "b", "Prior, likelihoods, posterior")
-
-
-def _draw_stiffness(axes: Axes, result: StaticCalibration) -> None:
-    posterior = result.tip_stiffness_exact
-    _draw_densities(axes, result.tip_stiffness_prior, posterior, result.tip_stiffness_particle, 1e-3)
-    axes.set_xlabel("tip stiffness $k$ (N/mm)", parse_math=True)
-    axes.set_ylabel("probability density (mm/N)")
-    axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
-    axes.text(
-        0.99,
-        0.60,
-        f"{posterior.mean * 1e-3:.4f} ± {posterior.standard_deviation * 1e-3:.4f} N/mm",
-        transform=axes.transAxes,
-        color=PAST,
-        ha="right",
-        fontsize=6.8,
-    )
-    panel_label(axes, "c", "Quantity of interest")
 
 
 def _draw_densities(
@@ -129,5 +98,5 @@ def _draw_densities(
     density = np.diff(particle.cumulative(edges)) / np.diff(edges)
     axes.stairs(density / scale, edges * scale, color=PRESENT, lw=0.9, label="posterior, particles")
     reach = 3.6 * prior.standard_deviation
-    axes.set_xlim((prior.mean - reach) * scale, (prior.mean + reach) * scale)
-    axes.set_ylim(0.0, 1.12 * float(exact.density.max()) / scale)
+    ends = (prior.mean - reach) * scale, (prior.mean + reach) * scale
+    axes.set(xlim=ends, ylim=(0.0, 1.12 * float(exact.density.max()) / scale))

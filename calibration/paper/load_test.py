@@ -30,12 +30,8 @@ class StaticCalibration:
         p(e | pairs) by the paper's particle filter.
     exact : ScalarPosterior
         p(e | pairs) with errors in both variables, by quadrature.
-    tip_stiffness_prior, tip_stiffness_particle, tip_stiffness_exact : ScalarPosterior
-        p(k) and p(k | pairs), the quantity of interest of Fig. 5 [N/m].
     alternatives : dict of str to ScalarPosterior
         The exact posterior under other assumptions; those that leave the range of the curve are missing.
-    quality : FitQuality
-        Residuals at the exact posterior mean.
     """
 
     data: LoadDisplacementData
@@ -43,11 +39,35 @@ class StaticCalibration:
     prior: GaussianPrior
     particle: ParticlePosterior
     exact: ScalarPosterior
-    tip_stiffness_prior: ScalarPosterior
-    tip_stiffness_particle: ScalarPosterior
-    tip_stiffness_exact: ScalarPosterior
     alternatives: dict[str, ScalarPosterior]
-    quality: FitQuality
+
+    @property
+    def before(self) -> ScalarPosterior:
+        """The prior on a grid."""
+        grid = np.linspace(-8.0, 8.0, 2001) * self.prior.standard_deviation + self.prior.mean
+        return ScalarPosterior(grid, self.prior.density(grid))
+
+    @property
+    def tip_stiffness_prior(self) -> ScalarPosterior:
+        """p(k), the quantity of interest of Fig. 5 [N/m]."""
+        return push_forward(self.before, self.curve)
+
+    @property
+    def tip_stiffness_exact(self) -> ScalarPosterior:
+        """p(k | pairs) by quadrature [N/m]."""
+        return push_forward(self.exact, self.curve)
+
+    @property
+    def tip_stiffness_particle(self) -> ScalarPosterior:
+        """p(k | pairs) by particles, whose mean and deviation it has [N/m]."""
+        found = push_forward(self.particle.posterior, self.curve)
+        moments = self.particle.stiffness_mean, self.particle.stiffness_standard_deviation
+        return ScalarPosterior(found.grid, found.density, *moments)
+
+    @property
+    def quality(self) -> FitQuality:
+        """Residuals at the exact posterior mean."""
+        return assess_fit(self.data, float(self.curve.stiffness(self.exact.mean)))
 
 
 def calibrate_static(
@@ -58,7 +78,7 @@ def calibrate_static(
     prior: GaussianPrior | None = None,
     particle_count: int = DEFAULT_PARTICLE_COUNT,
 ) -> StaticCalibration:
-    """Find the posterior of e in both ways, and what follows from it.
+    """Find the posterior of e in both ways, and under other assumptions.
 
     Parameters
     ----------
@@ -82,25 +102,18 @@ def calibrate_static(
     prior = prior or GaussianPrior()
     exact = exact_posterior(data, curve=curve, prior=prior)
     particle = particle_filter(data, seed=seed, curve=curve, prior=prior, particle_count=particle_count)
-    prior_grid = np.linspace(-8.0, 8.0, 2001) * prior.standard_deviation + prior.mean
-    stiffness = push_forward(particle.posterior, curve)
-    return StaticCalibration(
-        data=data,
-        curve=curve,
-        prior=prior,
-        particle=particle,
-        exact=exact,
-        tip_stiffness_prior=push_forward(ScalarPosterior(prior_grid, prior.density(prior_grid)), curve),
-        tip_stiffness_particle=ScalarPosterior(
-            stiffness.grid,
-            stiffness.density,
-            mean=particle.stiffness_mean,
-            standard_deviation=particle.stiffness_standard_deviation,
-        ),
-        tip_stiffness_exact=push_forward(exact, curve),
-        alternatives=_alternatives(curve, data, prior),
-        quality=assess_fit(data, float(curve.stiffness(exact.mean))),
+    alternatives = {}
+    assumptions: tuple[tuple[str, Measure, float], ...] = (
+        ("flat in load", "load", 0.0),
+        ("ratio", "ratio", 0.0),  # what the particle filter tends to
+        ("zero offsets", "displacement", data.displacement_standard_deviation),  # that each run shares
     )
+    for name, measure, offset in assumptions:
+        with suppress(OutsideValidityError):
+            alternatives[name] = exact_posterior(
+                data, curve=curve, prior=prior, measure=measure, zero_offset_standard_deviation=offset
+            )
+    return StaticCalibration(data, curve, prior, particle, exact, alternatives)
 
 
 def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPosterior:
@@ -109,21 +122,3 @@ def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPos
     positive = stiffness > 0.0
     density = posterior.density[positive] / curve.slope(posterior.grid[positive])
     return ScalarPosterior(stiffness[positive], density)
-
-
-def _alternatives(
-    curve: StiffnessCurve, data: LoadDisplacementData, prior: GaussianPrior
-) -> dict[str, ScalarPosterior]:
-    """Return the posterior under other assumptions, but for those that lead out of the curve's range."""
-    assumptions: tuple[tuple[str, Measure, float], ...] = (
-        ("flat in load", "load", 0.0),
-        ("ratio", "ratio", 0.0),  # what the particle filter tends to
-        ("zero offsets", "displacement", data.displacement_standard_deviation),  # that each run shares
-    )
-    found = {}
-    for name, measure, offset in assumptions:
-        with suppress(OutsideValidityError):
-            found[name] = exact_posterior(
-                data, curve=curve, prior=prior, measure=measure, zero_offset_standard_deviation=offset
-            )
-    return found

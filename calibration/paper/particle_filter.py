@@ -128,9 +128,9 @@ def particle_filter(
 
     The likelihood of a pair is the paper's: loads and displacements are drawn from the Gaussians of their
     readings; each drawn pair is turned into a stiffness and, through the inverse of eq. (14), into a sample
-    of e, whose kernel density it is. As the number of samples grows, it tends to
-    `errors_in_variables.log_ratio_density`, which is known in closed form. Weights are multiplied in the log
-    domain and normalised; the result repeats bit for bit with the seed.
+    of e, whose kernel density it is. As the number of samples grows, it tends to the measure "ratio" of
+    `errors_in_variables`, which is known in closed form. Weights are multiplied in the log domain and
+    normalised; the result repeats bit for bit with the seed.
 
     Parameters
     ----------

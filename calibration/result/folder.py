@@ -1,64 +1,40 @@
-"""The folder that a calibration leaves: complete, or as it was before."""
+"""The folder that a calibration leaves, with its page: complete, or as it was before."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from matplotlib.figure import Figure
-
+from calibration.result.figures import corner_figure, drawn_parameters, readings_figure
 from calibration.result.file import FILE_NAME, result_bytes
-from calibration.result.page import FIGURE_NAMES, begun_page, ended_page, report_figures
 from calibration.result.record import Calibration
+from calibration.result.text import (
+    PROCEDURES,
+    WORDS,
+    channel_rows,
+    correlation_lines,
+    parameter_rows,
+    reading_rows,
+)
 from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text, write_error
-from reporting.page import Page
+from reporting.page import Page, ReportFigure
 from reporting.progress import Progress
+from reporting.words import plus_minus
 
 FIGURES, REPORT_NAME = "figures", "report.html"
+WING_FIELDS, MODE_FIELDS = "wing.vtu", "modes.vtu"
 
-Extra = Callable[[Page, Mapping[str, bytes]], None]
-"""Adds sections to a page, from all figures as SVG."""
-
-
-def _nothing(page: Page, drawings: Mapping[str, bytes]) -> None:
-    pass
+_DRAWN = (REPORT_NAME, WING_FIELDS, MODE_FIELDS, f"{FIGURES}/*.svg", f"{FIGURES}/*.png")
+"""What an older calibration drew: beside a newer file it would show other figures."""
 
 
-def write_calibration_folder(
-    result: Calibration,
-    folder: Path,
-    progress: Progress,
-    *,
-    report: bool = True,
-    figures: Callable[[], Mapping[str, Figure]] = dict,
-    extra: Extra = _nothing,
-    companions: Iterable[str] = (),
-    write_others: Callable[[Path], None] = lambda folder: None,
-) -> Path:
-    """Write page, figures and last `calibration.nc`, all at once; return the path of the latter.
+@contextmanager
+def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
+    """Yield an empty folder; at the end all in it and `calibration.nc` are moved to `folder`.
 
-    Everything is written beside the folder first and moved into place when it is complete: a full disk leaves
-    the folder as it was. An older file of the same name is replaced; page and figures of an older calibration
-    are removed where none are written, lest a page shows other figures than the file beside it.
-
-    Parameters
-    ----------
-    result : Calibration
-        The calibration.
-    folder : Path
-        Where the files go.
-    progress : Progress
-        Where drawing is reported.
-    report : bool
-        Whether page and figures are written.
-    figures : callable
-        Draws further figures of the page, by the name of their files.
-    extra : callable
-        Adds further sections to the page.
-    companions : iterable of str
-        Further files that may stand beside the calibration.
-    write_others : callable
-        Writes further files into a folder.
+    A full disk leaves `folder` as it was. Older files of the same names are replaced, the calibration last;
+    what an older calibration drew is removed where nothing stands for it.
 
     Raises
     ------
@@ -66,43 +42,91 @@ def write_calibration_folder(
         If a file cannot be written; the folder is then as it was.
     """
     content = result_bytes(result)
-    drawn: dict[str, Figure] = {}
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as scratch:
             fresh = Path(scratch)
-            if report:
-                with progress.stage("Drawing the report"):
-                    drawn = report_figures(result) | dict(figures())
-                    drawings = {name: to_svg(figure) for name, figure in drawn.items()}
-                    for name, figure in drawn.items():
-                        atomic_write_bytes(fresh / FIGURES / f"{name}.svg", drawings[name])
-                        atomic_write_bytes(fresh / FIGURES / f"{name}.png", to_png(figure))
-                    page = begun_page(result, drawings)
-                    extra(page, drawings)
-                    atomic_write_text(fresh / REPORT_NAME, ended_page(page, result))
-            write_others(fresh)
+            yield fresh
+            files = sorted(path.relative_to(fresh) for path in fresh.rglob("*") if path.is_file())
             atomic_write_bytes(fresh / FILE_NAME, content)
-            _replace(folder, fresh, {REPORT_NAME, *drawing_names(FIGURE_NAMES), *companions})
+            if (folder / FILE_NAME).exists():
+                for older in [path for pattern in _DRAWN for path in folder.glob(pattern)]:
+                    if older.relative_to(folder) not in files:
+                        older.unlink()
+                with suppress(OSError):  # not there, or not empty
+                    (folder / FIGURES).rmdir()
+            for file in (*files, Path(FILE_NAME)):
+                (folder / file).parent.mkdir(parents=True, exist_ok=True)
+                (fresh / file).replace(folder / file)
     except OSError as error:
         raise write_error(error, folder) from error
+
+
+def write_calibration_folder(
+    result: Calibration, folder: Path, progress: Progress, *, report: bool = True
+) -> Path:
+    """Write page, figures and `calibration.nc`, or without a report the latter alone; return its path.
+
+    Raises
+    ------
+    FileNotWrittenError
+        As `calibration_folder`.
+    """
+    with calibration_folder(result, folder) as fresh:
+        if report:
+            with progress.stage("Drawing the report"):
+                end_page(begun_page(result, fresh), result, fresh)
     return folder / FILE_NAME
 
 
-def drawing_names(names: Iterable[str]) -> list[str]:
-    """Return the files of figures in the folder of a calibration."""
-    return [f"{FIGURES}/{name}.{kind}" for name in names for kind in ("svg", "png")]
+def add_figure(page: Page, figure: ReportFigure, folder: Path) -> None:
+    """Add a figure to a page, and leave it in the folder of the page."""
+    drawing = to_svg(figure.figure)
+    atomic_write_bytes(folder / FIGURES / f"{figure.name}.svg", drawing)
+    atomic_write_bytes(folder / FIGURES / f"{figure.name}.png", to_png(figure.figure))
+    page.add_figure(drawing, figure.caption, title=figure.title)
 
 
-def _replace(folder: Path, fresh: Path, companions: set[str]) -> None:
-    """Move all files to a folder, the calibration last; of an older one no companion stays."""
-    files = sorted(path.relative_to(fresh).as_posix() for path in fresh.rglob("*") if path.is_file())
-    if (folder / FILE_NAME).exists():
-        for name in companions - set(files):
-            (folder / name).unlink(missing_ok=True)
-        figures = folder / FIGURES
-        if figures.is_dir() and not any(figures.iterdir()):
-            figures.rmdir()
-    for name in sorted(files, key=lambda name: (name == FILE_NAME, name)):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (fresh / name).replace(folder / name)
+def begun_page(result: Calibration, folder: Path) -> Page:
+    """Return a page with all that any calibration says; its figures are left in a folder."""
+    title, subtitle, footer = (WORDS.say(name, result=result) for name in ("title", "subtitle", "footer"))
+    page = Page(title, subtitle, (footer,))
+    page.add_section("Result")
+    highlights = []
+    for prior in result.priors[:6]:
+        value = plus_minus(result.mean(prior.name), result.standard_deviation(prior.name))
+        highlights.append((f"{value} {prior.figure.shown_unit}".strip(), prior.figure.title))
+    page.add_highlights(highlights)
+    for sentence in result.findings:
+        page.add_notice(sentence)
+    if not result.findings:
+        page.add_paragraph(WORDS.say("agreed"))
+    procedure = PROCEDURES[result.procedure]
+    WORDS.add_table(page, "parameters", parameter_rows(result), result=result, procedure=procedure)
+    for line in correlation_lines(result):
+        page.add_paragraph(f"{line}.")
+    places, titles = drawn_parameters(result)
+    sets = [("posterior", result.samples[:, places]), ("prior", result.prior_samples[:, places])]
+    for name, shown in (("posterior", sets[:1]), ("prior_and_posterior", sets)):
+        add_figure(page, WORDS.figure(name, corner_figure(titles, shown)), folder)
+    page.add_section("What is left of the readings")
+    WORDS.add_table(page, "readings", reading_rows(result))
+    if result.readings:
+        add_figure(page, WORDS.figure("readings", readings_figure(result)), folder)
+    WORDS.add_table(page, "channels", channel_rows(result))
+    return page
+
+
+def end_page(page: Page, result: Calibration, folder: Path) -> None:
+    """Write a page with where the calibration comes from at its end."""
+    versions = result.provenance["versions"].items()
+    rows = [
+        ("asset", result.asset),
+        ("model", f"{result.model}, SHA-256 {result.model_hash[:16]}"),
+        ("measured", result.source),
+        ("seed", str(result.seed)),
+        ("priors", ", ".join(f"{prior.name}: {prior.stated_by}" for prior in result.priors)),
+        ("software", ", ".join(f"{name} {version}" for name, version in versions)),
+    ]
+    WORDS.add_table(page, "origin", rows)
+    atomic_write_text(folder / REPORT_NAME, page.render())

@@ -50,8 +50,8 @@ def tailoring(calibration: Calibration) -> WingTailoring:
 def description(calibration: Calibration) -> str:
     """Return one sentence with the name of the wing and its figures, mean and standard deviation."""
     figures = ", ".join(
-        f"{name} {calibration.mean(name):.6g} +- {calibration.standard_deviation(name):.3g}"
-        + ("" if figure.unit == "1" else f" {figure.unit}")
+        f"{name} {calibration.mean(name):.6g} +- {calibration.standard_deviation(name):.3g} "
+        f"{figure.shown_unit}".rstrip()
         for figure in calibration.figures
         if (name := figure.name) in STATE
     )

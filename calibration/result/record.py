@@ -43,6 +43,16 @@ class CalibratedFigure:
     unit: str
     title: str
 
+    @property
+    def shown_unit(self) -> str:
+        """The unit as it is printed: nothing for a plain number."""
+        return "" if self.unit == "1" else self.unit
+
+    @property
+    def axis_title(self) -> str:
+        """Name and unit as they stand at an axis."""
+        return self.name.replace("_", " ") + (f" ({self.shown_unit})" if self.shown_unit else "")
+
 
 @dataclass(frozen=True)
 class ParameterPrior:

@@ -28,7 +28,7 @@ def parameter_rows(result: Calibration) -> Rows:
         deviation, kept = result.standard_deviation(prior.name), 100.0 * result.kept_share(prior.name)
         rows.append(
             (
-                prior.name, "" if prior.unit == "1" else prior.unit,
+                prior.name, prior.figure.shown_unit,
                 plus_minus(*result.prior_moments(prior.name)), plus_minus(result.mean(prior.name), deviation),
                 between(*result.interval(prior.name), deviation), f"{kept:.{0 if kept > 9.5 else 1}f} %",
             )
@@ -38,7 +38,7 @@ def parameter_rows(result: Calibration) -> Rows:
 
 def reading_rows(result: Calibration) -> Rows:
     """Return a row for each reading."""
-    units = {figure.name: "" if figure.unit == "1" else figure.unit for figure in result.figures}
+    units = {figure.name: figure.shown_unit for figure in result.figures}
     return [
         (
             item.experiment, item.name, units[item.name], plus_minus(item.value, item.deviation),

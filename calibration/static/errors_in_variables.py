@@ -27,7 +27,7 @@ the residuals of a run then have the covariance S I + k^2 R_0 1 1'.
 """
 
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -56,9 +56,12 @@ def residual_variance(data: LoadDisplacementData, stiffness: ArrayLike) -> NDArr
 
 
 def pair_log_likelihoods(
-    curve: StiffnessCurve, data: LoadDisplacementData, young_modulus_factor: ArrayLike
+    curve: StiffnessCurve,
+    data: LoadDisplacementData,
+    young_modulus_factor: ArrayLike,
+    measure: Measure = "displacement",
 ) -> NDArray[np.float64]:
-    """Return log N(f - k(e) x; 0, S(e)) of each pair.
+    """Return the log likelihood of each pair; as "ratio" the limit of the paper's kernel likelihoods.
 
     Parameters
     ----------
@@ -68,38 +71,36 @@ def pair_log_likelihoods(
         The measured pairs.
     young_modulus_factor : (N,) array
         Values of e.
+    measure : {"displacement", "load", "ratio"}
+        See the module's docstring.
 
     Returns
     -------
     (n_pairs, N) array, log of 1/N
+
+    Raises
+    ------
+    PosteriorError
+        If `measure` is unknown.
     """
-    k = curve.stiffness(np.atleast_1d(young_modulus_factor))
-    variance = residual_variance(data, k)
-    residual = data.load[:, None] - k * data.displacement[:, None]
-    return np.asarray(-0.5 * (residual**2 / variance + np.log(2.0 * math.pi * variance)))
-
-
-def log_ratio_density(
-    curve: StiffnessCurve, data: LoadDisplacementData, young_modulus_factor: ArrayLike
-) -> NDArray[np.float64]:
-    """Return the log density of e = k^-1(f / x) for each pair: the limit of the paper's kernel likelihoods.
-
-    Parameters and shape as `pair_log_likelihoods`.
-    """
+    if measure not in get_args(Measure):
+        raise PosteriorError(f"the measure must be displacement, load or ratio, but {measure!r} was given.")
     factor = np.atleast_1d(np.asarray(young_modulus_factor, dtype=float))
-    k = curve.stiffness(factor)
-    load_variance = data.load_standard_deviation**2
-    displacement_variance = data.displacement_standard_deviation**2
+    k, load, displacement = curve.stiffness(factor), data.load[:, None], data.displacement[:, None]
     variance = residual_variance(data, k)
-    centre = data.displacement[:, None] * load_variance + k * data.load[:, None] * displacement_variance
-    centre /= variance
-    spread = np.sqrt(load_variance * displacement_variance / variance)
-    # E|X| of X ~ N(centre, spread^2), the mean of the folded Gaussian.
-    standard = np.divide(centre, spread, out=np.full_like(centre, np.inf), where=spread > 0.0)
-    folded = spread * math.sqrt(2.0 / math.pi) * np.exp(-0.5 * standard**2)
-    folded += centre * erf(standard / math.sqrt(2.0))
-    likelihood = pair_log_likelihoods(curve, data, factor)
-    return np.asarray(likelihood + np.log(folded) + np.log(curve.slope(factor)))
+    likelihood = -0.5 * ((load - k * displacement) ** 2 / variance + np.log(2.0 * math.pi * variance))
+    if measure == "load":
+        likelihood += np.log(k)
+    if measure == "ratio":
+        load_variance, own = data.load_standard_deviation**2, data.displacement_standard_deviation**2
+        centre = (displacement * load_variance + k * load * own) / variance
+        spread = np.sqrt(load_variance * own / variance)
+        # E|X| of X ~ N(centre, spread^2), the mean of the folded Gaussian.
+        standard = np.divide(centre, spread, out=np.full_like(centre, np.inf), where=spread > 0.0)
+        folded = spread * math.sqrt(2.0 / math.pi) * np.exp(-0.5 * standard**2)
+        folded += centre * erf(standard / math.sqrt(2.0))
+        likelihood += np.log(folded) + np.log(curve.slope(factor))
+    return np.asarray(likelihood)
 
 
 def log_likelihood(
@@ -110,35 +111,24 @@ def log_likelihood(
     measure: Measure = "displacement",
     zero_offset_standard_deviation: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the log likelihood of all pairs.
+    """Return the log likelihood (N,) of all pairs.
 
     Parameters
     ----------
-    curve, data, young_modulus_factor
+    curve, data, young_modulus_factor, measure
         As in `pair_log_likelihoods`.
-    measure : {"displacement", "load", "ratio"}
-        See the module's docstring.
     zero_offset_standard_deviation : float
         Standard deviation of the zero offset of the displacement that a loading run shares [m].
-
-    Returns
-    -------
-    (N,) array
 
     Raises
     ------
     PosteriorError
         If `measure` is unknown, or "ratio" is asked for together with a zero offset.
     """
-    if measure not in ("displacement", "load", "ratio"):
-        raise PosteriorError(f"the measure must be displacement, load or ratio, but {measure!r} was given.")
-    factor = np.atleast_1d(np.asarray(young_modulus_factor, dtype=float))
-    if measure == "ratio":
-        if zero_offset_standard_deviation:
-            raise PosteriorError("the ratio of load and displacement has no likelihood with a zero offset.")
-        return np.asarray(log_ratio_density(curve, data, factor).sum(axis=0))
-    total = pair_log_likelihoods(curve, data, factor).sum(axis=0)
-    k = curve.stiffness(factor)
+    if measure == "ratio" and zero_offset_standard_deviation:
+        raise PosteriorError("the ratio of load and displacement has no likelihood with a zero offset.")
+    total = pair_log_likelihoods(curve, data, young_modulus_factor, measure).sum(axis=0)
+    k = curve.stiffness(np.atleast_1d(young_modulus_factor))
     variance = residual_variance(data, k)
     shared = (k * zero_offset_standard_deviation) ** 2
     for run in data.run_indices:
@@ -146,7 +136,7 @@ def log_likelihood(
         whole = variance + of_run.sum() * shared  # Sherman and Morrison
         residual = data.load[of_run].sum() - k * data.displacement[of_run].sum()
         total += 0.5 * (shared * residual**2 / (variance * whole) - np.log(whole / variance))
-    return np.asarray(total + data.count * np.log(k) if measure == "load" else total)
+    return np.asarray(total)
 
 
 def exact_posterior(

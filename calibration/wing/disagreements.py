@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, AmplitudePoint, amplitude_dependence
+from calibration.dynamics.damped_cosine import RingDownMode
+from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, amplitude_dependence
 from calibration.result.record import Calibration
 from calibration.static.experiments import published_measurements
 from calibration.static.quality import FitQuality
@@ -81,7 +82,7 @@ def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
     return found
 
 
-def _amplitude(points: Sequence[AmplitudePoint]) -> float:
+def _amplitude(points: Sequence[RingDownMode]) -> float:
     return float(np.mean([point.amplitude for point in points]))
 
 

@@ -14,7 +14,6 @@ from math import log, nan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from calibration.dynamics.damped_cosine import DampedCosines, Solution
 from discrepancy.errors import FitError
@@ -101,26 +100,22 @@ def backbones(
             "change `periods`, or give a longer or more finely sampled record."
         )
     active = np.ones(start.size, dtype=bool)
-    omega, decay = start.copy(), 0.02 * start
+    pole = (1j - 0.02) * start
     rows: list[list[tuple[float, ...]]] = [[] for _ in start]
     for first in range(0, time.size - width + 1, max(1, round(width * (1.0 - overlap)))):
         part = slice(first, first + width)
         window = DampedCosines(time[part], signal[part], averaging_width)
         while active.any():
-            found = _fit(window, decay[active], omega[active])
-            solution = window.solve(found[0], found[1], frequencies_fitted=True)
-            deviation = solution.residual_deviation if noise_deviation is None else noise_deviation
-            points = _points(time[part] - time[first], found, solution, deviation)
-            numbers = np.flatnonzero(active)
-            lost = [
-                number
-                for number, point in zip(numbers.tolist(), points, strict=True)
-                if not _credible(point, start[number])
-            ]
+            solution = window.fit(pole[active])
+            points = _points(time[part] - time[first], solution, noise_deviation)
+            numbers = np.flatnonzero(active).tolist()
+            pairs = list(zip(numbers, points, strict=True))
+            lost = [number for number, point in pairs if not _credible(point, start[number])]
             if not lost:
-                for number, point, d, w in zip(numbers, points, *found, strict=True):
+                for number, point in pairs:
                     rows[number].append((float(time[first]) + point[0], *point[1:]))
-                    decay[number], omega[number] = max(d, 1e-4 * w), w
+                found = solution.pole
+                pole[active] = np.minimum(found.real, -1e-4 * found.imag) + 1j * found.imag
                 break
             # Fit again without the modes that have died away: they would spoil the errors of the others.
             active[lost] = False
@@ -151,46 +146,25 @@ def _check(time: FloatArray, signal: FloatArray, frequencies: Sequence[float], o
     return interval
 
 
-def _fit(window: DampedCosines, decay: FloatArray, omega: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return decay rates and angular frequencies of the best fit; amplitudes are eliminated."""
-    modes = omega.size
-
-    def residual(unknown: FloatArray) -> FloatArray:
-        return window.residual(unknown[:modes] * omega, unknown[modes:] * omega)
-
-    first = np.concatenate([decay / omega, np.ones(modes)])
-    scale = np.concatenate([np.full(modes, 0.02), np.full(modes, 0.02)])
-    found = least_squares(residual, first, method="lm", x_scale=scale, xtol=1e-9, ftol=1e-12, diff_step=1e-7)
-    return found.x[:modes] * omega, found.x[modes:] * omega
-
-
-def _points(
-    time: FloatArray, found: tuple[FloatArray, FloatArray], solution: Solution, deviation: float
-) -> list[tuple[float, ...]]:
+def _points(time: FloatArray, solution: Solution, noise_deviation: float | None) -> list[tuple[float, ...]]:
     """Return time, amplitude, frequency and damping ratio of each mode, each with its error but the time."""
-    own = solution.residual_deviation
-    covariance = solution.covariance * ((deviation / own) ** 2 if own > 0.0 else 0.0)
-    modes = found[0].size
+    own = float(solution.deviation[0])
+    deviation = own if noise_deviation is None else noise_deviation
     points: list[tuple[float, ...]] = []
-    for mode, (d, w) in enumerate(zip(*found, strict=True)):
-        natural = float(np.hypot(d, w))
-        weight = np.exp(-2.0 * np.clip(d * (time - time[-1] / 2.0), -50.0, 50.0))
+    for mode in solution.modes:
+        decay = -mode.pole.real
+        weight = np.exp(-2.0 * np.clip(decay * (time - time[-1] / 2.0), -50.0, 50.0))
         centre = float(weight @ time / weight.sum())
-        amplitude = float(np.abs(solution.amplitude[mode])) * float(np.exp(-np.clip(d * centre, -50.0, 50.0)))
-        block = covariance[np.ix_([mode, modes + mode], [mode, modes + mode])]
-        # Derivatives of |s| and decay / |s| by decay and omega.
-        of_frequency = np.array([d, w]) / natural / (2.0 * np.pi)
-        of_ratio = np.array([w * w, -d * w]) / natural**3
         effective = float(weight.sum()) ** 2 / float(weight @ weight)
         points.append(
             (
                 centre,
-                amplitude,
+                mode.amplitude * float(np.exp(-np.clip(decay * centre, -50.0, 50.0))),
                 deviation * sqrt(2.0 / effective),
-                natural / (2.0 * np.pi),
-                sqrt(max(float(of_frequency @ block @ of_frequency), 0.0)),
-                float(d) / natural,
-                sqrt(max(float(of_ratio @ block @ of_ratio), 0.0)),
+                mode.frequency,
+                mode.frequency_standard_error * deviation / own,
+                mode.damping_ratio,
+                mode.damping_ratio_standard_error * deviation / own,
             )
         )
     return points

@@ -37,7 +37,7 @@ def along(
 
 @cache
 def _compiled_along() -> Callable[..., None]:
-    return compiled(along, law_functions(), "numpy")
+    return compiled(along, law_functions())
 
 
 def law_course(

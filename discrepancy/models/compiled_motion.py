@@ -162,7 +162,7 @@ def law_functions() -> tuple[Callable[..., Any], ...]:
     """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
     functions = [item for module in (*laws.MODULES, interface) for item in _functions(module)]
     for function in functions:
-        callable_when_compiled(function, error_model="numpy", makes_arrays=False)
+        callable_when_compiled(function, makes_arrays=False)
     for name in interface.FUNCTIONS:
         choose_when_compiled(getattr(laws, name), laws.answers(name))
     return tuple(functions)
@@ -176,9 +176,7 @@ def _kernel_functions() -> tuple[Callable[..., Any], ...]:
         for function in _functions(module):
             functions.append(function)
             if function is not motion_kernel.integrate:
-                callable_when_compiled(
-                    function, error_model="numpy", makes_arrays=False, inline=function not in SELDOM
-                )
+                callable_when_compiled(function, makes_arrays=False, inline=function not in SELDOM)
     return tuple(functions)
 
 
@@ -190,14 +188,14 @@ def compiled_kernel() -> Kernel:
     """
     functions = _kernel_functions()
     for function in (static_path.static_forces, static_path.arrive_at_rest):
-        callable_when_compiled(function, error_model="numpy")
+        callable_when_compiled(function)
     return Kernel(
-        compiled(motion_kernel.integrate, functions, "numpy"),
-        compiled(static_path.static_path, functions, "numpy"),
+        compiled(motion_kernel.integrate, functions),
+        compiled(static_path.static_path, functions),
     )
 
 
 @cache
 def compiled_steps() -> Callable[..., None]:
     """Return the compiled loop over steps of any lengths."""
-    return compiled(integrate_steps, _kernel_functions(), "numpy")
+    return compiled(integrate_steps, _kernel_functions())

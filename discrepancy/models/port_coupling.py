@@ -116,8 +116,8 @@ def begin(positions: FloatArray, ports: Ports, memory: FloatArray) -> None:
 @cache
 def _compiled(loop: Callable[..., None]) -> Callable[..., None]:
     if loop is couple:
-        callable_when_compiled(held_forces, error_model="numpy", makes_arrays=False)
-    return compiled(loop, (*law_functions(), Ports), "numpy")  # a constant stands in the file of `Ports`
+        callable_when_compiled(held_forces, makes_arrays=False)
+    return compiled(loop, (*law_functions(), Ports))  # a constant stands in the file of `Ports`
 
 
 def _ports(internal: Laws) -> Ports:

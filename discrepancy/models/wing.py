@@ -31,17 +31,10 @@ from fe.runtime.patch import (
     RootCompliance,
 )
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.patched_wing import (
-    LOAD_PLACE,
-    MODE_COUNT,
-    ON_MODES,
-    PORTS,
-    PatchedWing,
-    motion_basis,
-    strain_gauge,
-)
+from fe.runtime.patched_wing import MODE_COUNT, ON_MODES, PatchedWing, motion_basis
 from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import wing_names
+from fe.runtime.wing_rows import LOAD_PLACE, PORTS, strain_gauge
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress
 
@@ -185,7 +178,7 @@ class WingModel(StructuralModel):
     def _made_rows(self, outputs: Outputs, component: int) -> FloatArray:
         places = f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction"
         named = ("tip_displacement", "load_point_displacement", places)
-        gauges = f"strain[1] to strain[{self.wing.gauge_count}]"
+        gauges = f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]"
         check_outputs("The wing", self, outputs, (gauges, *named))
         rows = [self.wing.output_row(output, component) for output, _ in outputs]
         return np.array(rows, dtype=np.float64).reshape(len(rows), self.wing.size)

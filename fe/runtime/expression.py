@@ -1,15 +1,14 @@
-"""Arithmetic in a text, evaluated without executing code: for one value of each name, or for many times.
+"""Arithmetic in a text, for one value of each name or for many times; it is checked to be nothing else.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
 import ast
-import operator
 from collections.abc import Callable, Collection, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import lru_cache, reduce
-from math import cos, exp, isfinite, log, sin, sqrt, tan
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -20,45 +19,30 @@ from .errors import InvalidPatchError
 LONGEST = 600
 """Longest expression [characters]."""
 
-
-def step(value: float) -> float:
-    """Return 1 from zero on, 0 before."""
-    return 1.0 if value >= 0.0 else 0.0
-
-
-_BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
-}
-_UNARY: dict[type[ast.unaryop], Callable[[Any], Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
-_FUNCTIONS: dict[str, Callable[..., float]] = {
-    "sqrt": sqrt,
-    "exp": exp,
-    "log": log,
-    "sin": sin,
-    "cos": cos,
-    "tan": tan,
-    "abs": abs,
-    "min": min,
-    "max": max,
-    "step": step,
-}
-RESERVED = frozenset({*_FUNCTIONS, "pi", "place", "time"})
-"""What names in an expression mean already: no event and no parameter can have one of them."""
-_OF_ARRAYS: dict[str, Callable[..., Any]] = {
+_OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.UAdd, ast.USub)
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(np, name) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "abs")},
     "min": lambda *given: reduce(np.minimum, given),
     "max": lambda *given: reduce(np.maximum, given),
     "step": lambda value: np.where(np.asarray(value) >= 0.0, 1.0, 0.0),
 }
+_KNOWN = {"__builtins__": {}, **_FUNCTIONS}
+RESERVED = frozenset({*_FUNCTIONS, "pi", "place", "time"})
+"""What names in an expression mean already: no event and no parameter can have one of them."""
+
+
+@lru_cache(maxsize=1024)
+def _parsed(text: str) -> ast.expr:
+    return ast.parse(text, mode="eval").body
 
 
 @lru_cache(maxsize=1024)  # an expression is evaluated at every step of a fit
-def _parsed(text: str) -> ast.expr:
-    return ast.parse(text, mode="eval").body
+def _compiled(text: str) -> CodeType:
+    tree = deepcopy(_parsed(text))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant):
+            node.value = float(node.value)  # type: ignore[arg-type]  # no integer grows beyond a float's range
+    return compile(ast.Expression(tree), "an expression", "eval")
 
 
 @dataclass(frozen=True)
@@ -112,10 +96,10 @@ class Expression:
                     raise InvalidPatchError(
                         f"{self.where} uses the unknown name {name!r}; known are {known}."
                     )
-            case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+            case ast.BinOp(left=left, op=op, right=right) if isinstance(op, _OPERATORS):
                 self._check(left)
                 self._check(right)
-            case ast.UnaryOp(op=op, operand=operand) if type(op) in _UNARY:
+            case ast.UnaryOp(op=op, operand=operand) if isinstance(op, _OPERATORS):
                 self._check(operand)
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in _FUNCTIONS and args:
                 if name not in ("min", "max") and len(args) != 1:
@@ -136,28 +120,27 @@ class Expression:
         InvalidPatchError
             If a name has no value, or the result is not a finite real number.
         """
-        result = self._result(values, _FUNCTIONS)
-        if isinstance(result, complex) or not isfinite(result):
-            raise InvalidPatchError(f"{self.where}: {self.text!r} is not a finite number.")
-        return float(result)
+        return float(self._result(values))
 
     def course(self, time: NDArray[np.float64], values: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the values (N,) at times (N,), which are the name `time`; raises as `value`."""
-        with np.errstate(all="ignore"):
-            result = np.asarray(self._result({**values, "time": time}, _OF_ARRAYS))
-        if np.iscomplexobj(result) or not np.all(np.isfinite(result)):
-            raise InvalidPatchError(f"{self.where}: {self.text!r} is not a finite number at every time.")
+        result = self._result({**values, "time": time}, " at every time")
         return np.array(np.broadcast_to(result, time.shape), dtype=np.float64)
 
-    def _result(self, values: Mapping[str, Any], functions: Mapping[str, Callable[..., Any]]) -> Any:
+    def _result(self, values: Mapping[str, Any], when: str = "") -> Any:
         try:
-            return _evaluate(self._tree(), values, functions)
-        except KeyError as cause:
+            with np.errstate(all="ignore"):
+                # `_check` lets pass nothing but numbers, the known names and functions, and operators
+                result = eval(_compiled(self.text.strip()), _KNOWN, dict(values))
+        except NameError as cause:
             raise InvalidPatchError(
-                f"{self.where}: {self.text!r} needs {cause.args[0]!r}, which has no value at this place."
+                f"{self.where}: {self.text!r} needs {cause.name!r}, which has no value at this place."
             ) from cause
         except (ArithmeticError, ValueError, TypeError) as cause:
             raise InvalidPatchError(f"{self.where}: {self.text!r} cannot be evaluated ({cause}).") from cause
+        if np.iscomplexobj(result) or not np.isfinite(result).all():
+            raise InvalidPatchError(f"{self.where}: {self.text!r} is not a finite number{when}.")
+        return result
 
     def used(self) -> frozenset[str]:
         """Return the names that it uses."""
@@ -185,18 +168,3 @@ class _Numbers(ast.NodeTransformer):
         value = float(self.values[node.id])
         number = ast.Constant(abs(value))
         return ast.UnaryOp(ast.USub(), number) if value < 0.0 else number
-
-
-def _evaluate(node: ast.expr, values: Mapping[str, Any], functions: Mapping[str, Callable[..., Any]]) -> Any:
-    match node:
-        case ast.Constant(value=int() | float() as value):
-            return float(value)  # so that no integer grows beyond the range of a float
-        case ast.Name(id=name):
-            return values[name]
-        case ast.BinOp(left=left, op=op, right=right):
-            return _BINARY[type(op)](_evaluate(left, values, functions), _evaluate(right, values, functions))
-        case ast.UnaryOp(op=unary, operand=operand):
-            return _UNARY[type(unary)](_evaluate(operand, values, functions))
-        case ast.Call(func=ast.Name(id=name), args=args):
-            return functions[name](*(_evaluate(argument, values, functions) for argument in args))
-    raise TypeError(f"{ast.unparse(node)} is no arithmetic")

@@ -141,8 +141,8 @@ class KeptArrays:
     ----------------
     what : str
         What it is, with its article, for sentences.
-    layout : (str, int) or None
-        Name and value of the entry of the file that tells the version of its layout.
+    layout : mapping of str to int
+        Name and value of the entry of the file that tells the version of its layout; empty for none.
 
     Attributes
     ----------
@@ -151,7 +151,7 @@ class KeptArrays:
     """
 
     what: ClassVar[str]
-    layout: ClassVar[tuple[str, int] | None] = None
+    layout: ClassVar[Mapping[str, int]] = {}
 
     design_hash: str
 
@@ -185,13 +185,8 @@ class KeptArrays:
 
     def to_bytes(self) -> bytes:
         """Return the bytes of an `.npz` file; equal records give equal bytes."""
-        arrays: dict[str, npt.NDArray[Any]] = {}
-        if self.layout is not None:
-            arrays[self.layout[0]] = np.array(self.layout[1])
-        for item in fields(self):
-            if item.init:
-                arrays[item.name] = np.array(getattr(self, item.name))
-        return arrays_to_bytes(arrays)
+        values = {**self.layout, **{item.name: getattr(self, item.name) for item in fields(self)}}
+        return arrays_to_bytes({name: np.array(value) for name, value in values.items()})
 
     @classmethod
     def from_bytes(cls, content: bytes, where: str = "") -> Self:
@@ -210,19 +205,17 @@ class KeptArrays:
             If the archive is damaged, incomplete or of another layout.
         """
         where = where or f"The {cls.what.removeprefix('a ')}"
-        kept = [item for item in fields(cls) if item.init]
-        layout = () if cls.layout is None else (cls.layout[0],)
-        arrays = arrays_from_bytes(content, where, layout)
-        if cls.layout is not None and arrays[cls.layout[0]].tolist() != cls.layout[1]:
-            raise ReducedModelFileError(
-                f"{where} has the format {arrays[cls.layout[0]]}, but this version reads {cls.layout[1]}; "
-                "build it anew."
-            )
-        require_arrays(arrays, where, (item.name for item in kept))
+        arrays = arrays_from_bytes(content, where, cls.layout)
+        for name, version in cls.layout.items():
+            if arrays[name].tolist() != version:
+                raise ReducedModelFileError(
+                    f"{where} has the format {arrays[name]}, but this version reads {version}; build it anew."
+                )
+        require_arrays(arrays, where, (item.name for item in fields(cls)))
         try:
             values: dict[str, Any] = {
                 item.name: kind(arrays[item.name]) if kind in (str, int, float) else arrays[item.name]
-                for item in kept
+                for item in fields(cls)
                 for kind in (getattr(item.type, "__origin__", item.type),)
             }
             return cls(**values)

@@ -167,7 +167,7 @@ def laws_of(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = Fal
         if not isinstance(item, PortForce):
             continue
         if item.port not in ports:
-            known = f"it has {', '.join(ports)}" if ports else "it has none"
+            known = f"it has {', '.join(dict.fromkeys(map(place_of, ports)))}" if ports else "it has none"
             raise InvalidPatchError(
                 f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model does not "
                 f"have; {known}."

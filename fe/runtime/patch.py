@@ -6,12 +6,11 @@ primitives; which physical effect a set of them stands for is not known here (`d
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Annotated, Any, ClassVar
 
 from .errors import InvalidPatchError
-from .expression import Expression
 from .laws import LAWS
 from .laws.bouc_wen import BoucWen as BoucWen
 from .laws.free_play import FreePlay as FreePlay
@@ -23,6 +22,7 @@ from .laws.power_stiffness import PowerStiffness as PowerStiffness
 from .laws.sine_force import SineForce as SineForce
 from .primitive import Primitive as Primitive
 from .primitive import Window as Window
+from .primitive import course_of as course_of
 
 EVERY_CHANNEL = "*"
 """Name that stands for every channel of the primitive's quantity."""
@@ -31,15 +31,9 @@ PER_RELEASE = f"{CHANNEL_UNIT} per release amplitude"
 """Units of numbers that are shown by a channel."""
 
 
-def course_of(text: str, kind: str) -> Expression:
-    """Return a formula in `time`; raises `InvalidPatchError`."""
-    return Expression(text, ("time", "pi"), f"The formula of the primitive {kind!r}")
-
-
 # ---------------------------------------------------------------- mass and stiffness
 
 
-@dataclass(frozen=True, slots=True)
 class PointMass(Primitive):
     """A mass [kg] on the elastic line at `station` [m] from the root (lumped model: at a named place)."""
 
@@ -47,14 +41,12 @@ class PointMass(Primitive):
     station: Annotated[float, "m"]
 
 
-@dataclass(frozen=True, slots=True)
 class RootCompliance(Primitive):
     """A rotational spring in series with the root: `compliance` [rad/(N m)] about the flapping axis."""
 
     compliance: Annotated[float, "rad/(N m)"]
 
 
-@dataclass(frozen=True, slots=True)
 class LocalStiffnessLoss(Primitive):
     """The skin between `start` and `start + length` [m] from the root keeps 1 - `loss` of its stiffness."""
 
@@ -63,14 +55,12 @@ class LocalStiffnessLoss(Primitive):
     length: Annotated[float, "m"]
 
 
-@dataclass(frozen=True, slots=True)
 class ModulusTemperature(Primitive):
     """Young's modulus falls with temperature: E (1 - `coefficient` (T - T_ref)), `coefficient` [1/K]."""
 
     coefficient: Annotated[float, "1/K"]
 
 
-@dataclass(frozen=True, slots=True)
 class StiffnessDrift(Primitive):
     """The whole stiffness changes with time within a record: K (1 + `rate` t), `rate` [1/s]."""
 
@@ -89,7 +79,6 @@ class StiffnessDrift(Primitive):
 # ---------------------------------------------------------------- loads
 
 
-@dataclass(frozen=True, slots=True)
 class LoadPlace(Primitive):
     """Applied forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
 
@@ -97,7 +86,6 @@ class LoadPlace(Primitive):
     along_chord: Annotated[float, "m"]
 
 
-@dataclass(frozen=True, slots=True)
 class LoadGain(Primitive):
     """The force that acts is (1 + `gain`) times the recorded one plus `tare` [N], while one is applied."""
 
@@ -105,7 +93,6 @@ class LoadGain(Primitive):
     tare: Annotated[float, "N"]
 
 
-@dataclass(frozen=True, slots=True)
 class Washout(Primitive):
     """Lift in flight is l (1 - `coefficient` n eta^`exponent`), eta = y / semi-span, n the load factor."""
 
@@ -113,14 +100,12 @@ class Washout(Primitive):
     exponent: Annotated[float, "1"]
 
 
-@dataclass(frozen=True, slots=True)
 class InertiaRelief(Primitive):
     """In flight the structure's weight times n relieves the lift by this `fraction` more than modelled."""
 
     fraction: Annotated[float, "1"]
 
 
-@dataclass(frozen=True, slots=True)
 class PortLoad(Primitive):
     """A force [N or N m] that pushes a port along its motion, a formula in `time` [s] of the trial."""
 
@@ -129,17 +114,12 @@ class PortLoad(Primitive):
     port: str
     force: str
 
-    def __post_init__(self) -> None:
-        super(PortLoad, self).__post_init__()
-        course_of(self.force, self.kind)
-
 
 # ---------------------------------------------------------------- what is read
 #
 # `channel` is a channel's name, or `EVERY_CHANNEL` for all of `quantity` ("" for all quantities).
 
 
-@dataclass(frozen=True, slots=True)
 class SensorGain(Primitive):
     """A channel shows (1 + `gain`) times what it should."""
 
@@ -149,7 +129,6 @@ class SensorGain(Primitive):
     quantity: str = ""
 
 
-@dataclass(frozen=True, slots=True)
 class SensorDrift(Primitive):
     """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
 
@@ -161,7 +140,6 @@ class SensorDrift(Primitive):
     quantity: str = ""
 
 
-@dataclass(frozen=True, slots=True)
 class ChannelOffset(Primitive):
     """A channel shows `offset` more, a formula in `time` [s] of the trial, in the channel's unit."""
 
@@ -171,12 +149,7 @@ class ChannelOffset(Primitive):
     offset: str
     quantity: str = ""
 
-    def __post_init__(self) -> None:
-        super(ChannelOffset, self).__post_init__()
-        course_of(self.offset, self.kind)
 
-
-@dataclass(frozen=True, slots=True)
 class SensorRotation(Primitive):
     """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
 
@@ -184,7 +157,6 @@ class SensorRotation(Primitive):
     angle: Annotated[float, "rad"]
 
 
-@dataclass(frozen=True, slots=True)
 class ThermalStrain(Primitive):
     """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
 
@@ -193,7 +165,6 @@ class ThermalStrain(Primitive):
     coefficient: Annotated[float, "1/K"]
 
 
-@dataclass(frozen=True, slots=True)
 class HighPass(Primitive):
     """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s].
 
@@ -206,7 +177,6 @@ class HighPass(Primitive):
     quantity: str = ""
 
 
-@dataclass(frozen=True, slots=True)
 class Clock(Primitive):
     """A sample that is stamped t was taken at (1 + `rate`) t + `zero` [s]."""
 
@@ -214,7 +184,6 @@ class Clock(Primitive):
     zero: Annotated[float, "s"]
 
 
-@dataclass(frozen=True, slots=True)
 class LoggerClock(Primitive):
     """The clock of a logger: what it stamps t, readings and recorded inputs alike, was at (1 + `rate`) t.
 
@@ -225,7 +194,6 @@ class LoggerClock(Primitive):
     rate: Annotated[float, "1"]
 
 
-@dataclass(frozen=True, slots=True)
 class Line(Primitive):
     """A line at `frequency` [Hz] is added: cosine cos + sine sin (2 pi f t), t since the trial's start.
 
@@ -240,7 +208,6 @@ class Line(Primitive):
     quantity: str = ""
 
 
-@dataclass(frozen=True, slots=True)
 class DecayingLine(Primitive):
     """A mode that the model does not have, e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), in ring-downs.
 
@@ -255,7 +222,6 @@ class DecayingLine(Primitive):
     quantity: str = ""
 
 
-@dataclass(frozen=True, slots=True)
 class RunOffset(Primitive):
     """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
 
@@ -351,52 +317,35 @@ class ModelPatch:
         return cls(tuple(_primitive(row, f"{where}, primitive {n}") for n, row in enumerate(rows, start=1)))
 
 
+_ACCEPTED: dict[type, tuple[type, ...]] = {float: (float, int), int: (int,), str: (str,)}
+_WINDOW = {"trial": str, "begin": float, "end": float}
+
+
+def _values(row: Mapping[Any, Any], types: Mapping[str, Any], needed: Iterable[str], where: str) -> Any:
+    """Return the values of a row of a file by name, each of its type."""
+    for name, value in row.items():
+        if name not in types:
+            raise InvalidPatchError(f"{where} has no value {name!r}; it has {', '.join(types)}.")
+        if isinstance(value, bool) or not isinstance(value, _ACCEPTED[types[name]]):
+            wanted = "text" if types[name] is str else "a number"
+            raise InvalidPatchError(f"{where}: {name} must be {wanted}, but is {value!r}.")
+    missing = [name for name in needed if name not in row]
+    if missing:
+        raise InvalidPatchError(f"{where} lacks {', '.join(missing)}.")
+    return {name: types[name](value) for name, value in row.items()}
+
+
 def _primitive(row: object, where: str) -> Primitive:
     kind = row.get("kind") if isinstance(row, Mapping) else row
     if not isinstance(row, Mapping) or not isinstance(kind, str) or kind not in PRIMITIVES:
         raise InvalidPatchError(f"{where} has the kind {kind!r}, but known are {', '.join(PRIMITIVES)}.")
-    primitive = PRIMITIVES[kind]
-    types = primitive.values()
-    values = {str(name): value for name, value in row.items() if name not in ("kind", "windows")}
-    for name, value in values.items():
-        wanted = types.get(name)
-        if wanted is None:
-            raise InvalidPatchError(f"{where} has no value {name!r}; it has {', '.join(types)}.")
-        fits = (
-            isinstance(value, str)
-            if wanted is str
-            else isinstance(value, int) and not isinstance(value, bool)
-            if wanted is int
-            else isinstance(value, float | int) and not isinstance(value, bool)
-        )
-        if not fits:
-            raise InvalidPatchError(
-                f"{where}: {name} must be {'text' if wanted is str else 'a number'}, but is {value!r}."
-            )
-        if wanted is float:
-            values[name] = float(value)
-    windows = _windows(row.get("windows", ()), where)
-    try:
-        return primitive(**values, windows=windows)
-    except TypeError as cause:
-        missing = [name for name in types if name not in values]
-        raise InvalidPatchError(f"{where} lacks {', '.join(missing)}.") from cause
-
-
-def _windows(rows: object, where: str) -> tuple[Window, ...]:
-    """Return the windows of a primitive as a file has them."""
-    if not isinstance(rows, list | tuple):
-        raise InvalidPatchError(f"{where}: windows must be a list, but is {rows!r}.")
-    found = []
-    for row in rows:
-        times = [row.get(key) for key in ("begin", "end")] if isinstance(row, Mapping) else []
-        sound = all(
-            value is None or (isinstance(value, float | int) and not isinstance(value, bool))
-            for value in times
-        )
-        if not times or not sound or not isinstance(row.get("trial"), str) or len(row) > 3:
-            raise InvalidPatchError(
-                f"{where}: a window has trial, begin and end (seconds or null), but is {row!r}."
-            )
-        found.append(Window(row["trial"], *(None if value is None else float(value) for value in times)))
-    return tuple(found)
+    primitive, windows = PRIMITIVES[kind], row.get("windows", ())
+    if not isinstance(windows, list | tuple) or not all(isinstance(window, Mapping) for window in windows):
+        raise InvalidPatchError(f"{where}: windows must be a list of tables, but is {windows!r}.")
+    types, own = primitive.values(), {name: row[name] for name in row if name not in ("kind", "windows")}
+    needed = [item.name for item in fields(primitive) if item.default is MISSING]
+    spans = ({name: value for name, value in window.items() if value is not None} for window in windows)
+    return primitive(
+        **_values(own, types, needed, where),
+        windows=tuple(Window(**_values(span, _WINDOW, ["trial"], f"{where}, a window")) for span in spans),
+    )

@@ -3,10 +3,11 @@
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 from sys import float_info
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -80,7 +81,7 @@ class PatchArrays(RegionArrays):
     """
 
     what = "a wing for patches"
-    layout = ("patch_format", 2)
+    layout: ClassVar[Mapping[str, int]] = {"patch_format": 2}
 
     validity_box: Annotated[FloatArray, "chosen", 2]
     largest_loss: Positive

@@ -17,13 +17,9 @@ from .motion import laws_of
 from .patch import LOADS, LoadGain, ModelPatch, ModulusTemperature, PointMass, RootCompliance
 from .patch_arrays import PatchArrays
 from .planform_forces import STATION_PORTS
+from .reduced import lowest_modes
 from .state import Losses
-from .wing_rows import EMPTY as EMPTY
-from .wing_rows import LOAD_PLACE as LOAD_PLACE
-from .wing_rows import PORTS as PORTS
-from .wing_rows import Place as Place
-from .wing_rows import WingRows, boxes_of, remaining_skin
-from .wing_rows import strain_gauge as strain_gauge
+from .wing_rows import EMPTY, LOAD_PLACE, WingRows, remaining_skin
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -34,16 +30,11 @@ HELD = 1e-7
 
 
 class Modes(NamedTuple):
-    """Modes that move: angular frequencies (M,) [rad/s], shapes (n, M), displacements to modes (M, n)."""
+    """Modes that move: frequencies (M,) [Hz], shapes (n, M), displacements to modal coordinates (M, n)."""
 
-    angular_frequency: FloatArray
+    frequency: FloatArray
     shapes: FloatArray
     to_modes: FloatArray
-
-    @property
-    def frequency(self) -> FloatArray:
-        """Natural frequencies (M,) [Hz]."""
-        return np.asarray(self.angular_frequency / (2.0 * np.pi))
 
 
 class PatchedStructure:
@@ -73,23 +64,16 @@ class PatchedStructure:
 
         The basis that they are found in holds the static shapes of the rows `held` (s, n) as well.
         """
-        solutions = None if held is None else self.static(held.T)
+        solutions = np.zeros((len(self.mass), 0)) if held is None else self.static(held.T)
         basis = motion_basis(self.static, self.mass, self._arrays.start_shapes, solutions)
-        # M x = K x / w^2: the low modes are the largest eigenvalues, which keep all their digits
-        to_standard = np.linalg.inv(np.linalg.cholesky(_symmetric(basis.T @ self.stiffness @ basis)))
-        mass = _symmetric(basis.T @ self.mass @ basis)
-        inverse_square, vectors = np.linalg.eigh(_symmetric(to_standard @ mass @ to_standard.T))
-        inverse_square = inverse_square[::-1][:count]
-        shapes = basis @ (to_standard.T @ vectors[:, ::-1][:, :count] / np.sqrt(inverse_square))
+        frequency, own = lowest_modes(basis.T @ self.stiffness @ basis, basis.T @ self.mass @ basis, count)
+        shapes = basis @ own
         shapes = shapes * np.where(self._arrays.tip_row @ shapes < 0.0, -1.0, 1.0)
-        return Modes(1.0 / np.sqrt(inverse_square), shapes, shapes.T @ self.mass)
+        return Modes(frequency, shapes, shapes.T @ self.mass)
 
 
 def motion_basis(
-    static: Callable[[FloatArray], FloatArray],
-    mass: FloatArray,
-    start: FloatArray,
-    solutions: FloatArray | None = None,
+    static: Callable[[FloatArray], FloatArray], mass: FloatArray, start: FloatArray, solutions: FloatArray
 ) -> FloatArray:
     """Return a basis of the first modes of a structure, by subspace iteration.
 
@@ -101,7 +85,7 @@ def motion_basis(
         M.
     start : (n, r) ndarray
         Modes of a structure near by.
-    solutions : (n, s) ndarray, optional
+    solutions : (n, s) ndarray
         Static shapes that the basis is to hold as well.
 
     Returns
@@ -112,8 +96,6 @@ def motion_basis(
     basis = start
     for _ in range(ITERATIONS):
         basis = np.linalg.qr(static(mass @ basis))[0]
-    if solutions is None:
-        return np.asarray(basis)
     for shape in (solutions / np.linalg.norm(solutions, axis=0)).T:
         # a static shape is held already but for a small part: two passes
         rest = shape - basis @ (basis.T @ shape)
@@ -123,10 +105,6 @@ def motion_basis(
         if size > HELD:
             basis = np.concatenate((basis, rest[:, np.newaxis] / size), axis=1)
     return np.asarray(basis)
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (matrix + matrix.T))
 
 
 HOLDING = 3
@@ -146,13 +124,6 @@ class PatchedWing(WingRows):
     arrays : PatchArrays
         From `fe.reduction.model_cache.patch_arrays`, or read from a file.
     """
-
-    def __init__(self, arrays: PatchArrays) -> None:
-        super().__init__(arrays)
-        lower = np.tril_indices(self.size)
-        self._strips = np.zeros((len(arrays.strip_of), self.size, self.size))
-        self._strips[:, lower[0], lower[1]] = arrays.strip_stiffness
-        self._strips[:, lower[1], lower[0]] = arrays.strip_stiffness
 
     def structure(
         self,
@@ -229,11 +200,13 @@ class PatchedWing(WingRows):
                 )
             spring = 1.0 / flexibility - arrays.flap_spring
             stiffness += spring * np.multiply.outer(arrays.flap_row, arrays.flap_row)
-        boxes = boxes_of(patch)
-        if boxes:
-            remaining = remaining_skin(boxes, arrays.strip_lines).of_strips[arrays.strip_of]
-            for part in np.flatnonzero(remaining != 1.0):
-                stiffness += (remaining[part] - 1.0) * theta[arrays.term_of[part]] * self._strips[part]
+        skin = remaining_skin(patch, arrays.strip_lines)
+        if skin is not None:
+            weights = (skin.of_strips[arrays.strip_of] - 1.0) * theta[arrays.term_of]
+            changed = np.flatnonzero(weights)
+            lower = np.zeros_like(stiffness)
+            lower[np.tril_indices(self.size)] = weights[changed] @ arrays.strip_stiffness[changed]
+            stiffness += lower + np.tril(lower, -1).T
         return np.asarray(stiffness)
 
     def at(

@@ -64,14 +64,7 @@ def at_stations(patch: ModelPatch, share: FloatArray) -> ModelPatch:
         Any; what acts elsewhere stays, in its order.
     share : (S,) ndarray
         Of the stations.
-
-    Returns
-    -------
-    ModelPatch
-        The patch itself where nothing acts at `PLANFORM`.
     """
-    if not any(isinstance(item, PortForce) and item.port == PLANFORM for item in patch):
-        return patch
     spread: list[Primitive] = []
     for item in patch:
         if not isinstance(item, PortForce) or item.port != PLANFORM:

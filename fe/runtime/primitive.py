@@ -1,15 +1,16 @@
 """What every primitive change of a model has in common.
 
-Standard library and relative imports only: this file is copied into the FMU.
+NumPy and relative imports only: this file is copied into the FMU.
 """
 
 import re
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import Field, asdict, dataclass, field, fields
 from inspect import get_annotations
 from math import inf, isfinite
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, dataclass_transform
 
 from .errors import InvalidPatchError
+from .expression import Expression
 
 
 class Window(NamedTuple):
@@ -25,9 +26,25 @@ class Window(NamedTuple):
         return -inf if self.begin is None else self.begin, inf if self.end is None else self.end
 
 
-@dataclass(frozen=True, slots=True)
-class Primitive:
+def course_of(text: str, kind: str) -> Expression:
+    """Return a formula in `time`; raises `InvalidPatchError`."""
+    return Expression(text, ("time", "pi"), f"The formula of the primitive {kind!r}")
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+class Record:
+    """What makes each class that derives from it a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True)(cls)
+
+
+class Primitive(Record):
     """One primitive change; `kind` names its class in a file. All values SI; zero magnitude is no change.
+
+    A class of primitives is a frozen record of its annotated values, without a decorator of its own.
 
     With `windows` it acts within these only, and in no trial that they do not name; without, always.
     """
@@ -45,6 +62,7 @@ class Primitive:
     windows: tuple[Window, ...] = field(default=(), kw_only=True)
 
     def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
         if "kind" not in cls.__dict__:
             cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
         hints = get_annotations(cls).items()
@@ -67,6 +85,8 @@ class Primitive:
                 raise InvalidPatchError(
                     f"{item.name} of the primitive {self.kind!r} must be finite, but is {value!r}."
                 )
+        for name in self.courses:
+            course_of(getattr(self, name), self.kind)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return kind and values as plain data."""

@@ -5,7 +5,7 @@ NumPy and relative imports only: this file is copied into the FMU. The equations
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
 
@@ -25,6 +25,16 @@ Values = Mapping[str, float] | FloatArray
 def dense_sum(coefficients: FloatArray, terms: FloatArray) -> FloatArray:
     """Return the sum of coefficients (T,) times dense terms (T, n, m)."""
     return np.asarray((coefficients @ terms.reshape(len(terms), -1)).reshape(terms.shape[1:]))
+
+
+def lowest_modes(stiffness: FloatArray, mass: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest frequencies (M,) [Hz] and mass-normalised shapes (n, M) of dense matrices (n, n)."""
+    # M x = K x / omega^2: the stiffness is well conditioned in a basis of modes, the mass is not, and the low
+    # modes are the largest eigenvalues, which keep all their digits.
+    to_standard = np.linalg.inv(np.linalg.cholesky(stiffness))
+    inverse_square, vectors = np.linalg.eigh(to_standard @ mass @ to_standard.T)
+    root = np.sqrt(inverse_square[::-1][:count])
+    return 1.0 / (2.0 * np.pi * root), to_standard.T @ vectors[:, ::-1][:, :count] / root
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,28 +126,22 @@ class ReducedModel(ReducedArrays):
     nominal, and healthy.
     """
 
-    _online: OnlineArrays = field(init=False, repr=False, compare=False)
-    _limits: tuple[tuple[float, float], ...] = field(init=False, repr=False, compare=False)
-    _pairs: tuple[tuple[tuple[int, int], ...], ...] = field(init=False, repr=False, compare=False)
+    @cached_property
+    def _online(self) -> OnlineArrays:
+        return OnlineArrays(self)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        limits = tuple((float(low), float(high)) for low, high in self.validity_box)
-        # places of a term's two factors among (1, what is chosen, what the losses leave)
+    @cached_property
+    def _pairs(self) -> tuple[list[list[int]], list[list[int]]]:
+        """Places of the two factors of each stiffness term and load among those of `_coefficients`."""
         parameters, regions, masses = len(self.parameters), len(self.regions), len(self.masses)
-        (scale, region), (control, mass) = self.stiffness_factors.T, self.load_factors.T
-        stiffness = np.stack((scale, np.where(region > 0, len(self.chosen) + region, 0)), axis=1)
-        load = np.stack(
-            (
-                np.where(control > 0, parameters + regions + masses + control, 0),
-                np.where(mass > 0, parameters + regions + mass, 0),
-            ),
-            axis=1,
+        # a factor that is counted from one, and after which others it comes; none is the one in front
+        losses, controls = parameters + regions, parameters + regions + masses
+        of_stiffness, of_load = (0, len(self.chosen)), (controls, losses)
+        stiffness, load = (
+            np.where(factors > 0, factors + np.array(offsets), 0).tolist()
+            for factors, offsets in ((self.stiffness_factors, of_stiffness), (self.load_factors, of_load))
         )
-        pairs = tuple(tuple(map(tuple, places.tolist())) for places in (stiffness, load))
-        object.__setattr__(self, "_online", OnlineArrays(self))
-        object.__setattr__(self, "_limits", limits)
-        object.__setattr__(self, "_pairs", pairs)
+        return stiffness, load
 
     def __repr__(self) -> str:
         return (
@@ -151,10 +155,10 @@ class ReducedModel(ReducedArrays):
         """Number of strain gauges G."""
         return len(self.gauges)
 
-    @property
+    @cached_property
     def validity(self) -> Mapping[str, tuple[float, float]]:
         """Least and largest value for which the model was made, by name (SI units)."""
-        return dict(zip(self.chosen, self._limits, strict=True))
+        return dict(zip(self.chosen, map(tuple, self.validity_box.tolist()), strict=True))
 
     def vector(
         self,
@@ -218,7 +222,7 @@ class ReducedModel(ReducedArrays):
         OutsideModelError
             If one lies outside; the sentence names it and its range.
         """
-        for name, value, (low, high) in zip(self.chosen, values, self._limits, strict=True):
+        for (name, (low, high)), value in zip(self.validity.items(), values, strict=True):
             if not low <= value <= high:
                 raise OutsideModelError(
                     f"{name} must lie between {low:g} and {high:g}, the range of the reduced model of "
@@ -356,18 +360,13 @@ class ReducedModel(ReducedArrays):
         self.check_validity(vector.tolist())
         stiffness = dense_sum(self.stiffness_coefficients(vector), self.modal_stiffness)
         mass = dense_sum(self.mass_coefficients(vector), self.modal_mass)
-        # M x = K x / omega^2: the stiffness is well conditioned in this basis, the mass is not, and the low
-        # modes are the largest eigenvalues, which keep all their digits.
-        to_standard = np.linalg.inv(np.linalg.cholesky(stiffness))
-        inverse_square, vectors = np.linalg.eigh(to_standard @ mass @ to_standard.T)
-        inverse_square = inverse_square[::-1][: self.mode_count]
-        shape = to_standard.T @ vectors[:, ::-1][:, : self.mode_count] / np.sqrt(inverse_square)
+        frequency, shape = lowest_modes(stiffness, mass, self.mode_count)
         shape = shape * np.where(self.modal_output[-1] @ shape < 0.0, -1.0, 1.0)
         reference = self.followed_shapes @ mass
         size = np.sum(reference * self.followed_shapes, axis=1)[:, np.newaxis]
         assurance = (reference @ shape) ** 2 / size
         return Modes(
-            frequency=1.0 / (2.0 * np.pi * np.sqrt(inverse_square)),
+            frequency=frequency,
             shape=shape,
             output=self.modal_output @ shape,
             participation=self.modal_load @ shape,

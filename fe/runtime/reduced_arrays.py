@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -136,7 +136,7 @@ class ReducedArrays(RegionArrays):
     """
 
     what = "a reduced model"
-    layout = ("format", 4)
+    layout: ClassVar[Mapping[str, int]] = {"format": 4}
     parameters = _words("parameter_names")
     masses = _words("mass_names")
     controls = _words("control_names")

@@ -2,14 +2,15 @@
 
 Pure functions on arrays for the primitives of `fe.runtime.patch.SENSORS`; clocks are not here, because they
 say when the response is taken and so belong to whoever computes it. Without sensors the input comes back
-untouched.
+untouched. A record whose end is not known is read row after row, with what filters remember (`FilterMemory`).
 
-NumPy and standard library only: this file is copied into the FMU.
+NumPy and relative imports only: this file is copied into the FMU.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi, sqrt
+from itertools import islice
+from math import exp, expm1, factorial, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +88,11 @@ def needs_components(patch: ModelPatch) -> bool:
     return any(isinstance(item, SensorRotation) for item in patch)
 
 
+def needs_structure(patch: ModelPatch) -> bool:
+    """Return whether a patch needs more than what its sensors make of the readings of the plain structure."""
+    return needs_components(patch) or any(not isinstance(item, SENSORS) for item in patch)
+
+
 def clock_of(patch: ModelPatch) -> tuple[float, float]:
     """Return rate [1] and zero [s] of the clock primitives of a patch, added up."""
     clocks = [item for item in patch if isinstance(item, Clock)]
@@ -125,6 +131,7 @@ def apply_sensors(
     rates: FloatArray | None = None,
     transverse: FloatArray | None = None,
     shear: FloatArray | None = None,
+    memory: "FilterMemory | None" = None,
 ) -> tuple[FloatArray, FloatArray | None]:
     """Return what the channels show and its time derivative.
 
@@ -145,6 +152,9 @@ def apply_sensors(
         Its time derivative, for dynamic trials.
     transverse, shear : (N, C) ndarray, optional
         Strain across each gauge's direction and engineering shear strain; needed for rotations.
+    memory : FilterMemory, optional
+        The record is one row (1, C) of a longer one, and this is what its filters remember; there are no
+        rates then.
 
     Raises
     ------
@@ -157,20 +167,28 @@ def apply_sensors(
     ]
     if not active:
         return values, rates
-    values = np.array(values, dtype=np.float64)
-    rates = None if rates is None else np.array(rates, dtype=np.float64)
-    _rotate(active, record, values, rates, transverse, shear)
+    shown = np.array(values, dtype=np.float64)
+    slopes = np.zeros_like(shown) if rates is None else np.array(rates, dtype=np.float64)
+    _rotate(active, record, shown, slopes, transverse, shear)
     for item in active:
         columns = columns_of(item, record.channels)
-        if columns.size and not isinstance(item, SensorRotation):
-            signal, slope = _read(
-                item, record, values[:, columns], None if rates is None else rates[:, columns]
-            )
-            acting = np.flatnonzero(_acts(item, record.time))
-            values[np.ix_(acting, columns)] = signal[acting]
-            if rates is not None and slope is not None:
-                rates[np.ix_(acting, columns)] = slope[acting]
-    return values, rates
+        if not columns.size or isinstance(item, SensorRotation):
+            continue
+        signal, slope = shown[:, columns], slopes[:, columns]
+        if isinstance(item, SensorGain):
+            read = (1.0 + item.gain) * signal, (1.0 + item.gain) * slope
+        elif not isinstance(item, HighPass):
+            added, rate = _added(item, record)
+            read = signal + np.reshape(added, (-1, 1)), slope + np.reshape(rate, (-1, 1))
+        elif not record.is_dynamic:
+            continue
+        else:
+            read = _filtered(item, record, signal, slope) if memory is None else memory.filtered(item, signal)
+        acting = _acts(item, record.time)[:, np.newaxis]
+        shown[:, columns], slopes[:, columns] = (
+            np.where(acting, after, before) for after, before in zip(read, (signal, slope), strict=True)
+        )
+    return shown, None if rates is None else slopes
 
 
 def _acts(item: Primitive, time: FloatArray) -> NDArray[np.bool_]:
@@ -198,7 +216,7 @@ def _rotate(
     active: Sequence[Primitive],
     record: SensorRecord,
     values: FloatArray,
-    rates: FloatArray | None,
+    rates: FloatArray,
     transverse: FloatArray | None,
     shear: FloatArray | None,
 ) -> None:
@@ -217,22 +235,9 @@ def _rotate(
     cosine, sine = np.cos(angles[turned]), np.sin(angles[turned])
     across = transverse[:, turned] * sine**2 + shear[:, turned] * (sine * cosine)
     values[:, turned] = values[:, turned] * cosine**2 + across
-    if rates is not None:
+    if len(across) > 1 and record.is_dynamic:
         # A response has no rates of the components; a central difference of this small share will do.
         rates[:, turned] = rates[:, turned] * cosine**2 + np.gradient(across, record.time, axis=0)
-
-
-def _read(
-    item: Primitive, record: SensorRecord, signal: FloatArray, slope: FloatArray | None
-) -> tuple[FloatArray, FloatArray | None]:
-    """Return what columns (N, C) show with one primitive, and the rates of that."""
-    if isinstance(item, SensorGain):
-        gain = 1.0 + item.gain
-        return gain * signal, None if slope is None else gain * slope
-    if isinstance(item, HighPass):
-        return _filtered(item, record, signal, slope) if record.is_dynamic else (signal, slope)
-    added, rate = _added(item, record)
-    return signal + np.reshape(added, (-1, 1)), None if slope is None else slope + np.reshape(rate, (-1, 1))
 
 
 def _added(item: Primitive, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
@@ -283,10 +288,10 @@ def _decaying_line(item: DecayingLine, record: SensorRecord) -> tuple[FloatArray
 
 
 def _filtered(
-    item: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray | None
-) -> tuple[FloatArray, FloatArray | None]:
+    item: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Pass columns through a high-pass filter; where sampling is uneven, on an even grid and back."""
-    time = record.time
+    time, tau = record.time, item.time_constant
     count = max(len(time) - 1, 1)
     interval = float(time[-1] - time[0]) / count
     even = len(time) < 3 or bool(np.max(np.abs(np.diff(time) - interval)) <= 2e-3 * interval)
@@ -294,14 +299,16 @@ def _filtered(
         count = int(np.ceil(2.0 * float(time[-1] - time[0]) / float(np.median(np.diff(time)))))
         interval = float(time[-1] - time[0]) / count
         grid = np.linspace(time[0], time[-1], count + 1)
-        signal = _at(grid, time, signal)
-        slope = None if slope is None else _at(grid, time, slope)
+        signal, slope = _at(grid, time, signal), _at(grid, time, slope)
     held = signal[0] if record.kind == "ringdown" else np.zeros(signal.shape[1])
-    shown = high_pass(signal, interval, item.time_constant, item.order, held)
-    rates = None if slope is None else _filtered_rates(item, interval, signal, shown, held, slope)
-    if even:
-        return shown, rates
-    return _at(time, grid, shown), None if rates is None else _at(time, grid, rates)
+    shown = high_pass(signal, interval, tau, item.order, held)
+    if item.order in (1.0, 2.0):  # each stage obeys y' = x' - y / tau
+        if item.order == 2.0:
+            slope = slope - high_pass(signal, interval, tau, 1.0, held) / tau
+        slope = slope - shown / tau
+    else:
+        slope = high_pass(slope, interval, tau, item.order, np.zeros(len(held)))
+    return (shown, slope) if even else (_at(time, grid, shown), _at(time, grid, slope))
 
 
 def _at(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
@@ -309,17 +316,74 @@ def _at(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
     return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
 
 
-def _filtered_rates(
-    item: HighPass,
-    interval: float,
-    signal: FloatArray,
-    filtered: FloatArray,
-    held: FloatArray,
-    rates: FloatArray,
-) -> FloatArray:
-    """Return the derivative of the output; each stage obeys y' = x' - y / tau, so whole orders are exact."""
-    if item.order not in (1.0, 2.0):
-        return high_pass(rates, interval, item.time_constant, item.order, np.zeros(len(held)))
-    if item.order == 2.0:
-        rates = rates - high_pass(signal, interval, item.time_constant, 1.0, held) / item.time_constant
-    return rates - filtered / item.time_constant
+LARGEST_ORDER = 4
+"""Most stages of a high-pass."""
+
+
+class FilterMemory:
+    """What filters remember from one row of a record to the next; the signal is linear between the two.
+
+    Parameters
+    ----------
+    before : sequence of float or None
+        `after` of the row before; None: the signals had settled at the values of this row for ever.
+    duration : float
+        Time since the row before [s].
+
+    Attributes
+    ----------
+    after : list of float
+        What is remembered of this row: signal and stages, column after column and filter after filter.
+    """
+
+    def __init__(self, before: Sequence[float] | None, duration: float) -> None:
+        self._before, self._duration = None if before is None else iter(before), duration
+        self.after: list[float] = []
+
+    def filtered(self, item: HighPass, row: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what columns (1, C) show, and no rates; raises `InvalidPatchError`."""
+        if not (item.time_constant > 0.0 and item.order in range(1, LARGEST_ORDER + 1)):
+            raise InvalidPatchError(
+                f"A high-pass that is read sample by sample needs a positive time constant and 1 to "
+                f"{LARGEST_ORDER} stages, but {item} was given."
+            )
+        shown, order = [], int(item.order)
+        for signal in row[0].tolist():
+            states = np.zeros(order)
+            if self._before is not None:
+                last, *kept = islice(self._before, 1 + order)
+                states = high_pass_step(np.array(kept), signal - last, self._duration / item.time_constant)
+            shown.append(states[-1])
+            self.after += [signal, *states.tolist()]
+        return np.array([shown]), np.zeros_like(row)
+
+
+def high_pass_step(states: FloatArray, increment: float, ratio: float) -> FloatArray:
+    """Return the outputs of a chain of equal first-order high-pass stages after a linear change of its input.
+
+    The outputs obey y_i' = x' - (y_1 + ... + y_i) / tau, whose matrix -L / tau has the single eigenvalue
+    -1 / tau: its exponential is a finite sum.
+
+    Parameters
+    ----------
+    states : (n,) ndarray
+        Outputs of the stages before.
+    increment : float
+        Change of the input.
+    ratio : float
+        Duration of the change over tau.
+    """
+    count = len(states)
+    lower = np.tril(np.ones((count, count)), -1)
+    decay, power = exp(-ratio), np.eye(count)
+    transition = decay * power
+    rest = np.zeros(count)  # exp(-ratio L) e_1 without the term of the unit matrix
+    for k in range(1, count):
+        power = power @ lower
+        term = decay * (-ratio) ** k / factorial(k) * power
+        transition += term
+        rest += term[:, 0]
+    # (e_1 - exp(-ratio L) e_1) / ratio is the mean of the response over the change
+    gain = -rest / ratio
+    gain[0] += -expm1(-ratio) / ratio
+    return np.asarray(transition @ states + gain * increment)

@@ -65,14 +65,10 @@ def losses_of(stiffness_loss: Mapping[str, float] | Iterable[float], regions: tu
     return loss
 
 
-def _require_positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise InvalidStateError(f"{name} must be a positive finite number, but {value!r} was given.")
-
-
-def _require_not_negative(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value >= 0.0):
-        raise InvalidStateError(f"{name} must be zero or a positive finite number, but {value!r} was given.")
+def _require(name: str, value: float, *, positive: bool) -> None:
+    if not (math.isfinite(value) and (value > 0.0 if positive else value >= 0.0)):
+        wanted = "a positive finite number" if positive else "zero or a positive finite number"
+        raise InvalidStateError(f"{name} must be {wanted}, but {value!r} was given.")
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,7 @@ class Geometry:
 
     def __post_init__(self) -> None:
         for name in ("semi_span", "root_chord", "tip_chord"):
-            _require_positive(f"geometry.{name}", getattr(self, name))
+            _require(f"geometry.{name}", getattr(self, name), positive=True)
 
 
 @dataclass(frozen=True)
@@ -147,9 +143,9 @@ class DigitalState:
         }
 
     def __post_init__(self) -> None:
-        _require_positive("young_modulus_factor", self.young_modulus_factor)
+        _require("young_modulus_factor", self.young_modulus_factor, positive=True)
         for name in ("servo_mass", "pitot_mass", "damping_alpha", "damping_beta"):
-            _require_not_negative(name, getattr(self, name))
+            _require(name, getattr(self, name), positive=False)
         if len(self.stiffness_loss) > MOST_REGIONS:
             raise InvalidStateError(
                 f"stiffness_loss must hold at most {MOST_REGIONS} fractions, one for each damage region, but "

@@ -16,14 +16,17 @@ from fe.elements.kinds import KINDS
 from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
-from .deck import GLOBAL, Deck, System, fail, frame, included, real, shown, whole, words_of
-from .mesh import FileMesh
+from .deck import FLAT, GLOBAL, Deck, System, fail, frame, included, real, shown, whole, words_of
 
-_KINDS = {kind.calculix: kind for kind in KINDS.values()}
 _VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
 """Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
-_FLAT = {"T3D2": 2, "T3D3": 3, "CPS3": 3, "CPS4": 4, "CPS6": 6, "CPS8": 8}
+_FLAT = {
+    "T3D2": "line", "T3D3": "line3", "CPS3": "triangle", "CPS4": "quad", "CPS6": "triangle6", "CPS8": "quad8",
+}  # fmt: skip
 """Elements by which Gmsh and others hand on lines and surfaces: they only name nodes and faces here."""
+_TYPES = {kind.calculix: (kind.file_type, kind.node_count) for kind in KINDS.values()} | {
+    name: (kind, FLAT[kind][0]) for name, kind in _FLAT.items()
+}
 
 
 class _Block(NamedTuple):
@@ -41,7 +44,7 @@ class _Block(NamedTuple):
         return self.parameters[key]
 
 
-def read_abaqus(path: Path) -> FileMesh:
+def read_abaqus(path: Path) -> Deck:
     """Read the mesh of a deck; what is no mesh (materials, steps, loads) is passed over.
 
     Raises
@@ -49,10 +52,28 @@ def read_abaqus(path: Path) -> FileMesh:
     MeshError
         If it cannot be read, or holds what the mesh would lose; the sentence names the line.
     """
-    reader = _Reader(path)
+    words = words_of("abaqus")
+    deck, system = Deck(path, words), GLOBAL
     for block in _blocks((path,)):
-        reader.take(block)
-    return reader.deck.mesh()
+        if block.keyword.endswith(" SECTION"):
+            deck.sections[block.parameters.get("ELSET", "").casefold()] = block.where
+        if block.keyword not in words.read:
+            deck.word(block.keyword, block.where)
+            continue
+        for key in (key for key in block.parameters if key not in words.read[block.keyword]):
+            fail(block.where, f"*{block.keyword} with {shown(key)} is not read; write what it makes out.")
+        if block.keyword == "NODE":
+            _add_nodes(deck, block, system)
+        elif block.keyword == "ELEMENT":
+            _add_elements(deck, block)
+        elif block.keyword == "SYSTEM":
+            system = _system(block)
+        elif block.keyword != "SURFACE":
+            _add_members(deck, block)
+        elif block.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT":
+            rows = [(where, values[0], (*values, "")[1]) for where, values in block.data]
+            deck.surfaces[block.name("NAME")] = rows
+    return deck
 
 
 def _blocks(files: tuple[Path, ...]) -> Iterator[_Block]:
@@ -79,91 +100,66 @@ def _blocks(files: tuple[Path, ...]) -> Iterator[_Block]:
             yield from _blocks(included(where, files, given.get("INPUT", "")))
 
 
-class _Reader:
-    """Takes the blocks of a deck one after the other."""
+def _system(block: _Block) -> System:
+    """Return the system of the nodes below: origin, then a point on x, then one in the plane of x and y."""
+    rows = [(where, ",".join(values).rstrip(",").split(",")) for where, values in block.data]
+    given = [real(where, text) for where, values in rows for text in values]
+    if len(given) not in (0, 3, 6, 9):
+        fail(block.where, f"*SYSTEM needs one, two or three points, but {len(given)} numbers came.")
+    points = np.zeros((3, 3))
+    points.flat[: len(given)] = given
+    if len(given) < 6:
+        points[1:] = points[0] + np.eye(3)[:2]
+    elif len(given) < 9:  # z stays, and x is turned about it
+        points[1, 2] = points[0, 2]
+        points[2] = points[0] + np.cross((0.0, 0.0, 1.0), points[1] - points[0])
+    return System(points[0], frame(block.where, points))
 
-    def __init__(self, path: Path) -> None:
-        self.deck = Deck(path, words_of("abaqus"))
-        self.system = GLOBAL
 
-    def take(self, block: _Block) -> None:
-        """Take one keyword with its data."""
-        if block.keyword.endswith(" SECTION"):
-            self.deck.sections[block.parameters.get("ELSET", "").casefold()] = block.where
-        readable = self.deck.words.read.get(block.keyword)
-        if readable is None:
-            self.deck.word(block.keyword, block.where)
-            return
-        for key in (key for key in block.parameters if key not in readable):
-            fail(block.where, f"*{block.keyword} with {shown(key)} is not read; write what it makes out.")
-        if block.keyword == "NODE":
-            self._nodes(block)
-        elif block.keyword == "ELEMENT":
-            self._elements(block)
-        elif block.keyword == "SYSTEM":
-            self._system(block)
-        elif block.keyword != "SURFACE":
-            self._set(block)
-        elif block.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT":
-            rows = [(where, values[0], (*values, "")[1]) for where, values in block.data]
-            self.deck.surfaces[block.name("NAME")] = rows
+def _add_nodes(deck: Deck, block: _Block, system: System) -> None:
+    kind = block.parameters.get("SYSTEM", "R").upper()
+    if kind not in ("R", "C"):
+        fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
+    plain = kind == "R" and system is GLOBAL
+    system = replace(system, kind=kind)
+    added = []
+    for where, values in block.data:
+        place = [real(where, text) for text in (*values[1:], "", "", "")[:3]]
+        added.append(whole(where, values[0]))
+        deck.add_node(where, added[-1], place if plain else system.place(place))
+    if "NSET" in block.parameters:
+        deck.members("NSET", block.name("NSET")).extend(added)
 
-    def _system(self, block: _Block) -> None:
-        """Set the system of the nodes below: origin, then a point on x, then one in the plane of x and y."""
-        rows = [(where, ",".join(values).rstrip(",").split(",")) for where, values in block.data]
-        given = [real(where, text or "0") for where, values in rows for text in values]
-        if len(given) not in (0, 3, 6, 9):
-            fail(block.where, f"*SYSTEM needs one, two or three points, but {len(given)} numbers came.")
-        points = np.zeros((3, 3))
-        points.flat[: len(given)] = given
-        if len(given) < 6:
-            points[1:] = points[0] + np.eye(3)[:2]
-        elif len(given) < 9:  # z stays, and x is turned about it
-            points[1, 2] = points[0, 2]
-            points[2] = points[0] + np.cross((0.0, 0.0, 1.0), points[1] - points[0])
-        self.system = System(points[0], frame(block.where, points))
 
-    def _nodes(self, block: _Block) -> None:
-        kind = block.parameters.get("SYSTEM", "R").upper()
-        if kind not in ("R", "C"):
-            fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
-        plain = kind == "R" and self.system is GLOBAL
-        system = replace(self.system, kind=kind)
-        added = []
-        for where, values in block.data:
-            place = [real(where, text) if text else 0.0 for text in (*values[1:], "", "", "")[:3]]
-            added.append(whole(where, values[0]))
-            self.deck.add_node(where, added[-1], place if plain else system.place(place))
-        if "NSET" in block.parameters:
-            self.deck.members("NSET", block.name("NSET")).extend(added)
+def _add_elements(deck: Deck, block: _Block) -> None:
+    name = block.name("TYPE").upper()
+    variant = _VARIANT.fullmatch(name)
+    plain = variant[1] if variant else name
+    if plain not in _TYPES:
+        readable = ", ".join(kind.calculix for kind in KINDS.values())
+        fail(block.where, f"elements of type {shown(name)} cannot be read; {readable} and variants can.")
+    kind, width = _TYPES[plain]
+    numbers = [(where, whole(where, text)) for where, row in block.data for text in row if text]
+    if len(numbers) % (width + 1):
+        fail(block.where, f"{len(numbers)} numbers are not a multiple of {width + 1}, as {name} needs.")
+    added = []
+    for start in range(0, len(numbers), width + 1):
+        (where, number), *nodes = numbers[start : start + width + 1]
+        deck.add_element(where, number, kind, [node for _, node in nodes])
+        added.append(number)
+    if "ELSET" in block.parameters:
+        deck.members("ELSET", block.name("ELSET")).extend(added)
 
-    def _elements(self, block: _Block) -> None:
-        name = block.name("TYPE").upper()
-        variant = _VARIANT.fullmatch(name)
-        kind = _KINDS.get(variant[1]) if variant else None
-        width = kind.node_count if kind else _FLAT.get(name)
-        if width is None:
-            readable = ", ".join(_KINDS)
-            fail(block.where, f"elements of type {shown(name)} cannot be read; {readable} and variants can.")
-        numbers = [(where, whole(where, text)) for where, row in block.data for text in row if text]
-        if len(numbers) % (width + 1):
-            fail(block.where, f"{len(numbers)} numbers are not a multiple of {width + 1}, as {name} needs.")
-        rows = [numbers[start : start + width + 1] for start in range(0, len(numbers), width + 1)]
-        for (where, number), *nodes in rows:
-            self.deck.add_element(where, number, kind, [node for _, node in nodes])
-        if "ELSET" in block.parameters:
-            self.deck.members("ELSET", block.name("ELSET")).extend(number for (_, number), *_ in rows)
 
-    def _set(self, block: _Block) -> None:
-        members = self.deck.members(block.keyword, block.name(block.keyword))
-        for where, values in block.data:
-            given = [value for value in values if value]
-            if "GENERATE" in block.parameters:
-                first, last, step = [*(whole(where, value) for value in given), 1, 0, 0][:3]
-                numbers = range(first, last + 1, max(step, 1))
-                if len(given) not in (2, 3) or first < 1 or step < 1:
-                    fail(where, f"first, last and step are expected, but {shown(','.join(given))} came.")
-                members.extend(self.deck.counted(where, numbers))
-                continue
+def _add_members(deck: Deck, block: _Block) -> None:
+    members = deck.members(block.keyword, block.name(block.keyword))
+    for where, values in block.data:
+        given = [value for value in values if value]
+        if "GENERATE" not in block.parameters:
             for value in given:
-                members.extend(self.deck.named(block.keyword, where, value))
+                members.extend(deck.named(block.keyword, where, value))
+            continue
+        first, last, step = [*(whole(where, value) for value in given), 1, 0, 0][:3]
+        if len(given) not in (2, 3) or first < 1 or step < 1:
+            fail(where, f"first, last and step are expected, but {shown(','.join(given))} came.")
+        members.extend(deck.counted(where, range(first, last + 1, step)))

@@ -1,16 +1,17 @@
-"""What a deck holds, nodes, elements and sets, as the readers of Abaqus and Nastran collect it.
+"""What a mesh file holds, nodes, elements and sets, as the readers of all formats collect it.
 
-Last its coordinate systems: points that are given by radii and angles, or along other axes.
+Last the coordinate systems of decks: points that are given by radii and angles, or along other axes.
 """
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import resources
 from math import isfinite, nan
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,11 +20,16 @@ from fe.elements.kinds import KINDS, ElementKind
 from fe.runtime.errors import MeshError
 from reporting.toml_file import parse_toml
 
-from .mesh import FileMesh
+from .mesh import StructureMesh
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+FLAT = {
+    "vertex": (1, 1), "line": (2, 2), "line3": (3, 2), "triangle": (3, 3), "triangle6": (6, 3),
+    "quad": (4, 4), "quad8": (8, 4), "quad9": (9, 4),
+}  # fmt: skip
+"""Elements that only name nodes and faces, by their names in meshio: how many nodes and corners they have."""
 _MOST_NUMBERS = 5_000_000
 """Numbers that all sets may hold together: a short line can ask for any."""
 _LARGEST_NUMBER = 2**53
@@ -31,8 +37,7 @@ _SHOWN = 60
 _NO_EXPONENT = re.compile(r"(?<=[\d.])(?=[+-])")
 
 
-@dataclass(frozen=True)
-class Words:
+class Words(NamedTuple):
     """What becomes of the words of a dialect, see `deck_words.toml`.
 
     Attributes
@@ -91,9 +96,9 @@ def whole(where: str, text: str) -> int:
 
 
 def real(where: str, text: str) -> float:
-    """Return a real number, or refuse; Fortran writes D for E, and Nastran leaves the E out."""
+    """Return a real number, 0 for none, or refuse; Fortran writes D for E, and Nastran leaves the E out."""
     try:
-        number = float(_NO_EXPONENT.sub("E", text.upper().replace("D", "E")))
+        number = float(_NO_EXPONENT.sub("E", text.upper().replace("D", "E") or "0"))
     except ValueError:
         number = nan
     if not isfinite(number):
@@ -101,45 +106,43 @@ def real(where: str, text: str) -> float:
     return number
 
 
-def one_kind(where: str, counts: Mapping[str, int]) -> ElementKind:
-    """Return the one kind of elements of a mesh, whose elements of each kind of meshio's are counted."""
-    readable = ", ".join(kind.name for kind in KINDS.values())
-    names = {name: KINDS[name].name if name in KINDS else name for name in counts}
-    came = ", ".join(f"{counts[name]} {title}" for name, title in names.items())
-    if not counts or not counts.keys() <= KINDS.keys():
-        fail(where, f"a mesh of {readable} is expected, but {came or 'none that is solid'} came.")
-    if len(counts) > 1:
-        fail(where, f"one kind of elements is expected, but {came} came; mesh it with tetrahedra alone.")
-    return KINDS[next(iter(counts))]
-
-
 class Deck:
-    """Nodes, elements and sets by their numbers and names, while a deck is read."""
+    """Nodes, elements and sets by their numbers and names, while a mesh file is read.
 
-    def __init__(self, path: Path, words: Words) -> None:
-        self.path = path
+    Parameters
+    ----------
+    path : Path
+        The file.
+    words : Words, optional
+        Of the dialect of a deck, in which the case of a name does not count.
+    """
+
+    def __init__(self, path: Path, words: Words | None = None) -> None:
+        self.path, self.words = path, words
         self.nodes: dict[int, tuple[float, ...]] = {}
-        self.elements: dict[int, tuple[ElementKind | None, list[int]]] = {}
-        """Kind and nodes of each; those without a kind are flat and only name nodes and a face."""
+        self.elements: dict[int, tuple[str, list[int]]] = {}
+        """Type in meshio and nodes of each; those in `FLAT` only name nodes and a face."""
         self.surfaces: dict[str, list[tuple[str, str, str]]] = {}
         self.sections: dict[str, str] = {}
         """Where a set of elements, by its name in lower case, got a thickness, an area or a material."""
-        self.words = words
         self._sets: dict[str, dict[str, tuple[str, list[int]]]] = {"NSET": {}, "ELSET": {}}
-        self._kinds: dict[str, str] = {}
+        self._solids: dict[str, str] = {}
+        """Where each type of solid elements came first."""
         self._unknown: dict[str, list[str]] = {}
         self._room = _MOST_NUMBERS
 
     def word(self, word: str, where: str) -> None:
         """Pass over a word that is no part of the mesh; refuse what must not be lost, note the unknown."""
+        assert self.words is not None
         if word in self.words.refused:
             fail(where, f"{self.words.mark}{word} {self.words.refused[word]}.")
         if word not in self.words.harmless:
-            self._unknown.setdefault(word, []).append(where)
+            note = f"{where}: {self.words.mark}{word}"
+            self._unknown.setdefault(word, []).append(note)
 
     def members(self, key: str, name: str) -> list[int]:
         """Return the members of a set of nodes (NSET) or elements (ELSET), to be added to."""
-        return self._sets[key].setdefault(name.casefold(), (name, []))[1]
+        return self._sets[key].setdefault(name.casefold() if self.words else name, (name, []))[1]
 
     def named(self, key: str, where: str, text: str) -> list[int]:
         """Return a copy of the members of a set, or a number alone."""
@@ -159,76 +162,129 @@ class Deck:
         if self.nodes.setdefault(number, point) != point:
             fail(where, f"node {number} is there twice, at different places; delete one.")
 
-    def add_element(self, where: str, number: int, kind: ElementKind | None, nodes: list[int]) -> None:
+    def add_element(self, where: str, number: int, kind: str, nodes: list[int]) -> None:
         """Add an element."""
         if number in self.elements:
             fail(where, f"element {number} is there twice; delete one.")
         self.elements[number] = (kind, nodes)
-        if kind is not None:
-            self._kinds.setdefault(kind.file_type, where)
+        if kind not in FLAT:
+            self._solids.setdefault(kind, where)
 
-    def mesh(self) -> FileMesh:
-        """Return the mesh of all that was added."""
-        source = str(self.path)
-        if not self._kinds:
-            fail(source, "the deck holds no whole block of solid elements: was it cut off?")
-        counts = Counter(kind.file_type for kind, _ in self.elements.values() if kind)
-        kind = one_kind(list(self._kinds.values())[-1], counts)
-        place = {number: index for index, number in enumerate(self.nodes)}
+    def mesh(self, unit: float, unit_name: str) -> StructureMesh:
+        """Return the mesh of all that was added, its nodes in metres; `unit` is that of the file [m].
 
-        def places(members: Iterable[int], what: str) -> list[int]:
-            try:
-                return [place[number] for number in members]
-            except KeyError as lost:
-                fail(source, f"{what} names node {lost}, which is not there.")
-
-        solid = {number: nodes for number, (kind, nodes) in self.elements.items() if kind}
-        cells = np.array([places(nodes, f"element {n}") for n, nodes in solid.items()], dtype=np.int64)
+        Raises
+        ------
+        MeshError
+            If its elements are of no kind that is known, of several, doubled, or sets or elements name what
+            is not there.
+        """
+        source, kind = str(self.path), self._kind()
+        solid = {number: nodes for number, (own, nodes) in self.elements.items() if own not in FLAT}
         cell = {number: index for index, number in enumerate(solid)}
+        cells = np.array([self._places(nodes, f"element {n}") for n, nodes in solid.items()], dtype=np.int64)
+        numbers = np.array(list(solid), dtype=np.int64)
+        _, first = np.unique(np.sort(cells, axis=1), axis=0, return_index=True)
+        twins = np.delete(numbers, first)
+        if len(twins):
+            fail(
+                source, f"{len(twins)} elements, such as {twins[0]}, have the nodes of another; delete them."
+            )
+
         node_sets = {
-            name: np.unique(np.array(places(members, f"the set {name!r}"), dtype=np.int64))
+            name: _once(self._places(members, f"the set {name!r}"))
             for name, members in self._sets["NSET"].values()
         }
         cell_sets, face_sets = {}, {}
         for name, members in self._sets["ELSET"].values():
-            lost = next((number for number in members if number not in self.elements), None)
-            if lost is not None:
-                fail(source, f"the set {name!r} names element {lost}, which is not there.")
-            flat = [places(self.elements[n][1], f"element {n}") for n in members if n not in cell]
-            section = self.sections.get(name.casefold())
-            if flat and section:
-                what = (
-                    f"{len(flat)} bars, membranes or shells of the set {name!r} have a section and bear loads"
-                )
-                fail(section, f"{what}, but solids alone are read; delete one or the other.")
-            inside = np.unique(np.array([cell[n] for n in members if n in cell], dtype=np.int64))
+            flat = self._flat(name, [number for number in members if number not in cell])
+            inside = _once([cell[number] for number in members if number in cell])
             if len(inside) or not flat:
                 cell_sets[name] = inside
-            else:
-                face_sets[name] = frozenset(_corners(nodes) for nodes in flat)
-                node_sets.setdefault(name, np.unique(np.concatenate(flat)))
+                continue
+            node_sets.setdefault(name, _once([node for _, nodes in flat for node in nodes]))
+            corners = (tuple(sorted(nodes[: FLAT[own][1]])) for own, nodes in flat)
+            if faces := frozenset(face for face in corners if len(face) > 2):
+                face_sets[name] = faces
         for name, rows in self.surfaces.items():
-            face_sets[name] = self._faces(rows, kind, cells, cell)
-        return FileMesh(
+            face_sets[name], nodes = self._faces(rows, kind, cells, cell)
+            node_sets.setdefault(name, nodes)
+
+        points, own = np.array(list(self.nodes.values())), np.array(list(self.nodes), dtype=np.int64)
+        if not np.isfinite(points).all():
+            number = own[~np.isfinite(points).all(axis=1)][0]
+            fail(source, f"the coordinates of node {number} are not finite numbers.")
+        used = np.zeros(len(points), dtype=bool)
+        used[cells] = True
+        kept = np.where(used, np.cumsum(used) - 1, -1)
+        return StructureMesh(
+            source=source,
             kind=kind,
-            points=np.array(list(self.nodes.values()), dtype=np.float64),
-            node_numbers=np.array(list(self.nodes), dtype=np.int64),
-            cells=cells,
-            cell_numbers=np.array(list(solid), dtype=np.int64),
-            node_sets=node_sets,
+            points=unit * points[used],
+            cells=kept[cells],
+            unit=unit,
+            unit_name=unit_name,
+            node_numbers=own[used],
+            cell_numbers=numbers,
+            node_sets={name: kept[nodes] for name, nodes in node_sets.items()},
             cell_sets=cell_sets,
-            face_sets=face_sets,
+            face_sets={
+                name: frozenset(tuple(kept[list(face)].tolist()) for face in faces)
+                for name, faces in face_sets.items()
+            },
+            loose=own[~used],
             remarks=tuple(
-                f"{where[0]}: {self.words.mark}{word}{f' ({len(where)} times)' * (len(where) > 1)} is not "
-                "known and was passed over; make sure that the model may do without."
-                for word, where in self._unknown.items()
+                f"{notes[0]}{f' ({len(notes)} times)' * (len(notes) > 1)} is not known and was passed over; "
+                "make sure that the model may do without."
+                for notes in self._unknown.values()
             ),
         )
 
+    def _kind(self) -> ElementKind:
+        """Return the one kind of the solid elements."""
+        counts = Counter(kind for kind, _ in self.elements.values() if kind not in FLAT)
+        names = {name: KINDS[name].name if name in KINDS else name for name in counts}
+        came = ", ".join(f"{counts[name]} {title}" for name, title in names.items())
+        where = [str(self.path), *self._solids.values()][-1]
+        if not counts or not counts.keys() <= KINDS.keys():
+            readable = ", ".join(kind.name for kind in KINDS.values())
+            came = came or "none that is solid"
+            fail(where, f"a whole mesh of {readable} is expected, but {came} came.")
+        if len(counts) > 1:
+            fail(where, f"one kind of elements is expected, but {came} came; mesh it with tetrahedra alone.")
+        return KINDS[next(iter(counts))]
+
+    def _places(self, members: Iterable[int], what: str) -> list[int]:
+        """Return the places of nodes by their numbers."""
+        try:
+            return [self._place[number] for number in members]
+        except KeyError as lost:
+            fail(str(self.path), f"{what} names node {lost}, which is not there.")
+
+    @cached_property
+    def _place(self) -> dict[int, int]:
+        return {number: index for index, number in enumerate(self.nodes)}
+
+    def _flat(self, name: str, members: list[int]) -> list[tuple[str, list[int]]]:
+        """Return types and nodes of those elements of a set that only name nodes and faces."""
+        lost = next((number for number in members if number not in self.elements), None)
+        if lost is not None:
+            fail(str(self.path), f"the set {name!r} names element {lost}, which is not there.")
+        section = self.sections.get(name.casefold())
+        if members and section:
+            what = (
+                f"{len(members)} bars, membranes or shells of the set {name!r} have a section and bear loads"
+            )
+            fail(section, f"{what}, but solids alone are read; delete one or the other.")
+        own = ((number, *self.elements[number]) for number in members)
+        return [(kind, self._places(nodes, f"element {number}")) for number, kind, nodes in own]
+
     def _faces(
         self, rows: list[tuple[str, str, str]], kind: ElementKind, cells: IntArray, cell: dict[int, int]
-    ) -> frozenset[tuple[int, ...]]:
+    ) -> tuple[frozenset[tuple[int, ...]], IntArray]:
+        """Return the faces of a surface, by their corners, and its nodes."""
         found: set[tuple[int, ...]] = set()
+        nodes: set[int] = set()
         for where, member, face in rows:
             label = face.upper()
             number = int(label[1:]) if re.fullmatch("S[1-6]", label) else 0
@@ -238,16 +294,15 @@ class Deck:
             members = set(self.named("ELSET", where, member))
             for lost in members - cell.keys():
                 fail(where, f"the surface names element {lost}, which is not a solid element.")
-            inside = np.array([cell[element] for element in members], dtype=np.int64)
-            corners = np.sort(cells[inside][:, kind.faces[number - 1]], axis=1)
-            found.update(map(tuple, corners.tolist()))
-        return frozenset(found)
+            inside = cells[[cell[element] for element in members]]
+            found.update(map(tuple, np.sort(inside[:, kind.faces[number - 1]], axis=1).tolist()))
+            nodes.update(inside[:, kind.face_nodes[number - 1]].ravel().tolist())
+        return frozenset(found), _once([*nodes])
 
 
-def _corners(nodes: list[int]) -> tuple[int, ...]:
-    """Corners of a surface element, rising; a line has none that bound a face."""
-    count = {6: 3, 8: 4}.get(len(nodes), len(nodes))
-    return tuple(sorted(nodes[:count]))
+def _once(numbers: list[int]) -> IntArray:
+    """Return numbers rising, each once."""
+    return np.unique(np.array(numbers, dtype=np.int64))
 
 
 _LEAST_SINE = 1e-9

@@ -16,8 +16,7 @@ from fe.elements.kinds import KINDS
 from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
-from .deck import GLOBAL, Deck, System, fail, frame, included, real, shown, whole, words_of
-from .mesh import FileMesh
+from .deck import FLAT, GLOBAL, Deck, System, fail, frame, included, real, shown, whole, words_of
 
 FloatArray = NDArray[np.float64]
 
@@ -29,8 +28,9 @@ _ORDER = {
 }
 """Nastran counts the middles of the upright edges before those of the top."""
 _FLAT = {
-    "CTRIA3": 3, "CTRIAR": 3, "CTRIA6": 6, "CQUAD4": 4, "CQUADR": 4, "CQUAD8": 8,
-    "CBAR": 2, "CBEAM": 2, "CROD": 2, "CTUBE": 2,
+    "CTRIA3": "triangle", "CTRIAR": "triangle", "CTRIA6": "triangle6",
+    "CQUAD4": "quad", "CQUADR": "quad", "CQUAD8": "quad8",
+    "CBAR": "line", "CBEAM": "line", "CROD": "line", "CTUBE": "line",
 }  # fmt: skip
 """Shells and bars, by which Gmsh and others hand on surfaces and lines: without a property they only name."""
 _SECTIONS = re.compile("P(BAR|BEAM|BCOMP|COMP|LPLANE|ROD|SHEAR|SHELL|TUBE)[GL]?")
@@ -54,11 +54,11 @@ class _Card(NamedTuple):
 
     def reals(self, first: int, count: int) -> list[float]:
         """Return fields as real numbers; what is left out is zero."""
-        given = [real(self.where, text) if text else 0.0 for text in self.fields[first : first + count]]
-        return given + [0.0] * (count - len(given))
+        given = (self.fields + [""] * (first + count))[first : first + count]
+        return [real(self.where, text) for text in given]
 
 
-def read_nastran(path: Path) -> FileMesh:
+def read_nastran(path: Path) -> Deck:
     """Read the mesh of a deck: its bulk data, with or without the sections above it.
 
     The elements of a property are the set `nastran:ref=` and its number.
@@ -88,21 +88,21 @@ def read_nastran(path: Path) -> FileMesh:
             deck.word(word, card.where)
     for number, card in points.grids.items():
         deck.add_node(card.where, number, points.place(number, card.where))
-    return deck.mesh()
+    return deck
 
 
 def _add_element(deck: Deck, card: _Card) -> None:
-    number = card.whole(0)
-    nodes = [card.whole(field) for field in range(2, 2 + _FLAT.get(card.word, len(card.fields)))]
-    kind = None
-    if card.word in _SOLIDS:
-        nodes = [node for node in nodes if node]
+    number, kind = card.whole(0), _FLAT.get(card.word)
+    if kind is not None:
+        nodes = [card.whole(field) for field in range(2, 2 + FLAT[kind][0])]
+    else:
+        nodes = [node for node in map(card.whole, range(2, len(card.fields))) if node]
         kinds = {kind.node_count: kind for kind in KINDS.values() if len(kind.corners) == _SOLIDS[card.word]}
         if len(nodes) not in kinds:
             counts = " or ".join(map(str, kinds))
             fail(card.where, f"{card.word} {number} must have {counts} nodes, but {len(nodes)} came.")
-        kind = kinds[len(nodes)]
-        nodes = [nodes[place] for place in _ORDER.get(kind.file_type, range(len(nodes)))]
+        kind = kinds[len(nodes)].file_type
+        nodes = [nodes[place] for place in _ORDER.get(kind, range(len(nodes)))]
     deck.add_element(card.where, number, kind, nodes)
     deck.members("ELSET", f"nastran:ref={card.whole(1, number)}").append(number)
 

@@ -1,7 +1,7 @@
 """From a structure file and its mesh to affine operators."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +75,7 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
         slack = 1e-9 * mesh.size
         inside = ((places >= low - slack) & (places <= high + slack)).all(axis=1)
         sets[part.of][part.name] = np.flatnonzero(inside)
-    return mesh.with_sets(sets["nodes"], sets["cells"])
+    return replace(mesh, node_sets=mesh.node_sets | sets["nodes"], cell_sets=mesh.cell_sets | sets["cells"])
 
 
 def cells_by_set(mesh: StructureMesh, parts: tuple[tuple[str, str, str], ...], what: str) -> IntArray:

@@ -3,14 +3,15 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.door.binding import expand
 from fmu_asset.errors import CouplingError
 from fmu_asset.instances.plan import Interface
 
-ConnectorKind = Literal["input", "output", "parameter"]
+CONNECTOR_KINDS = ("input", "output", "parameter")
+"""What a connector of a system can be."""
 SettingValue = float | bool | str
 
 
@@ -74,11 +75,22 @@ class Component:
 
 @dataclass(frozen=True)
 class Connector:
-    """A connector of the system itself; without a unit, it has that of what it is connected to."""
+    """A connector of a system, or what its file says of one of a component.
+
+    Attributes
+    ----------
+    name, kind : str
+        That of a system is of one of `CONNECTOR_KINDS`.
+    unit : str or None
+        If None, that of what it is connected to.
+    type : str or None
+        In the words of SSP 1.0, where a file says it.
+    """
 
     name: str
-    kind: ConnectorKind
+    kind: str
     unit: str | None = None
+    type: str | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -122,6 +134,12 @@ class SystemStructure:
         Between components, and between them and the connectors.
     units : tuple of UnitInfo
         Definitions of the units of connectors and settings; common units need none.
+    declared : mapping of Endpoint to Connector
+        Connectors of the components, as a file declares them.
+    span : (float or None, float or None)
+        Start and end of the default experiment [s], where a file says them.
+    unused : tuple of str
+        Names of parameters that a file sets, but that are of no element of the system.
     """
 
     name: str
@@ -129,6 +147,9 @@ class SystemStructure:
     connectors: tuple[Connector, ...] = ()
     connections: tuple[Connection, ...] = ()
     units: tuple[UnitInfo, ...] = ()
+    declared: Mapping[Endpoint, Connector] = field(default_factory=dict)
+    span: tuple[float | None, float | None] = (None, None)
+    unused: tuple[str, ...] = ()
 
     def component(self, name: str) -> Component:
         """Return the component of that name.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.units import IDENTITY, Conversion, between
+from fmu_asset.door.units import Conversion, between
 from fmu_asset.errors import CouplingError
 
 from .schedule import Link, Schedule, schedule
@@ -235,7 +235,7 @@ class Wiring:
                 f"{connection.source} is in {source!r} and {connection.target} in {target!r}, and there is "
                 "no conversion between the two; correct the connection, or suppress the conversion of units."
             )
-        return composed(unit, own)
+        return unit.then(own)
 
     def _definitions(self, end: Endpoint) -> tuple[UnitInfo, ...]:
         return self.declared[end.component].units if end.component else self.structure.units
@@ -290,7 +290,7 @@ class Wiring:
                 f"{end} is given in {setting.unit!r}, but it is in {variable.unit!r}, and there is no "
                 "conversion between the two."
             )
-        number = composed(conversion, Conversion(setting.factor, setting.offset)).to_fmu(float(value))
+        number = conversion.then(Conversion(setting.factor, setting.offset)).to_fmu(float(value))
         wrong = (
             (isinstance(value, bool) and variable.kind != "Boolean")
             or (not isinstance(value, bool) and variable.kind == "Boolean" and value not in (0, 1))
@@ -301,11 +301,3 @@ class Wiring:
             raise CouplingError(f"{end} cannot be set to {value!r}: it is of the type {variable.kind}.")
         return number
 
-
-def composed(first: Conversion, second: Conversion) -> Conversion:
-    """Return one conversion for two, one after the other."""
-    if first == IDENTITY:
-        return second
-    if second == IDENTITY:
-        return first
-    return Conversion(second.factor * first.factor, second.factor * first.offset + second.offset)

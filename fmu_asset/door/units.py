@@ -126,6 +126,10 @@ class Conversion(NamedTuple):
         """Return a value of the FMU in the binding's unit."""
         return value if self == IDENTITY else (value - self.offset) / self.factor
 
+    def then(self, second: "Conversion") -> "Conversion":
+        """Return one conversion for this one and another after it."""
+        return Conversion(second.factor * self.factor, second.factor * self.offset + second.offset)
+
 
 IDENTITY = Conversion(1.0, 0.0)
 

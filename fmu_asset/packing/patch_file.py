@@ -19,7 +19,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
@@ -33,10 +33,9 @@ from fe.runtime.patch import (
     Primitive,
     RunOffset,
 )
-from fe.runtime.sensor_stream import needs_structure
-from fe.runtime.sensors import check_channels
+from fe.runtime.sensors import check_channels, needs_structure
 from fmu_asset.errors import PatchFileError
-from reporting.json_file import parse_json
+from reporting.json_file import parse_json, read_json
 
 SCHEMA = "uav-twin patch 2"
 """Value of `schema` in a patch file; files of number 1 are read too."""
@@ -55,8 +54,7 @@ _NO_MEANING = {
 }
 
 
-@dataclass(frozen=True)
-class Effect:
+class Effect(NamedTuple):
     """One effect of a patch file: an identifier, and the changes that it stands for."""
 
     id: str
@@ -86,10 +84,11 @@ class PatchFile:
     @property
     def of_structure(self) -> PatchFile:
         """The same without what changes what is read and not what happens."""
-        kept = [
-            (e.id, ModelPatch(tuple(p for p in e.patch if not isinstance(p, SENSORS)))) for e in self.effects
-        ]
-        return PatchFile(tuple(Effect(name, patch) for name, patch in kept if len(patch)), self.channels)
+        rest = (
+            Effect(name, ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS))))
+            for name, patch in self.effects
+        )
+        return PatchFile(tuple(effect for effect in rest if len(effect.patch)), self.channels)
 
     @property
     def needs_arrays(self) -> bool:
@@ -111,39 +110,39 @@ class PatchFile:
         PatchFileError
             If a channel is no such output, or a primitive has no meaning in an FMU.
         """
-        return tuple(self._with_outputs(effect, outputs, where) for effect in self.effects)
+        found = []
+        for name, patch in self.effects:
+            label = f"{where}: the effect {name!r}"
+            items = tuple(self._with_output(item, outputs, label) for item in patch)
+            found.append(Effect(name, ModelPatch(items)))
+        return tuple(found)
 
-    def _with_outputs(self, effect: Effect, outputs: Sequence[tuple[str, str]], where: str) -> Effect:
-        found: list[Primitive] = []
-        for item in effect.patch:
-            label = f"{where}: the effect {effect.id!r} has the primitive {item.kind!r}"
-            for kind, reason in _NO_MEANING.items():
-                if isinstance(item, kind):
-                    raise PatchFileError(f"{label}, which has no meaning inside an FMU: {reason}.")
-            if isinstance(item, HighPass) and item.order not in (1.0, 2.0, 3.0, 4.0):
+    def _with_output(self, item: Primitive, outputs: Sequence[tuple[str, str]], where: str) -> Primitive:
+        label = f"{where} has the primitive {item.kind!r}"
+        for kind, reason in _NO_MEANING.items():
+            if isinstance(item, kind):
+                raise PatchFileError(f"{label}, which has no meaning inside an FMU: {reason}.")
+        if isinstance(item, HighPass) and item.order not in (1.0, 2.0, 3.0, 4.0):
+            raise PatchFileError(
+                f"{label} of order {item.order:g}; an FMU remembers whole stages only, order 1 to 4."
+            )
+        channel, quantity = getattr(item, "channel", EVERY_CHANNEL), getattr(item, "quantity", "")
+        if channel == EVERY_CHANNEL:
+            if quantity not in QUANTITIES:
                 raise PatchFileError(
-                    f"{label} of order {item.order:g}; an FMU remembers whole stages only, order 1 to 4."
+                    f"{label} for every channel of {quantity!r}; the outputs of the FMU are strains and "
+                    "displacements."
                 )
-            quantity = getattr(item, "quantity", "")
-            channel = getattr(item, "channel", EVERY_CHANNEL)
-            if channel == EVERY_CHANNEL:
-                if quantity not in QUANTITIES:
-                    raise PatchFileError(
-                        f"{label} for every channel of {quantity!r}; the outputs of the FMU are strains and "
-                        "displacements."
-                    )
-                found.append(item)
-                continue
-            item = replace(item, channel=self.channels.get(channel, channel))  # type: ignore[call-arg]
-            try:
-                check_channels(ModelPatch((item,)), outputs)
-            except InvalidPatchError as cause:
-                raise PatchFileError(
-                    f"{label} for the channel {channel!r}, which is no output of the FMU that it can act on "
-                    f"({_listed(outputs)}); name an output, or map the channel to one in `channels`."
-                ) from cause
-            found.append(item)
-        return Effect(effect.id, ModelPatch(tuple(found)))
+            return item
+        item = replace(item, channel=self.channels.get(channel, channel))  # type: ignore[call-arg]
+        try:
+            check_channels(ModelPatch((item,)), outputs)
+        except InvalidPatchError as cause:
+            raise PatchFileError(
+                f"{label} for the channel {channel!r}, which is no output of the FMU that it can act on "
+                f"({_listed(outputs)}); name an output, or map the channel to one in `channels`."
+            ) from cause
+        return item
 
 
 def _listed(outputs: Sequence[tuple[str, str]]) -> str:
@@ -160,17 +159,15 @@ def load_patch(path: str | os.PathLike[str]) -> PatchFile:
     PatchFileError
         If it cannot be read, is no patch file, or holds something that no patch can hold.
     """
-    file = Path(path)
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise PatchFileError(f"The patch file {file} cannot be read: {error.strerror or error}.") from error
-    return parse_patch(content, f"The patch file {file}")
+    return _of_record(read_json(Path(path), PatchFileError, what="patch file"), f"The patch file {path}")
 
 
 def parse_patch(content: bytes, where: str = "The patch file") -> PatchFile:
     """Return what the bytes of a patch file say; see `load_patch`."""
-    record = parse_json(content, where, PatchFileError)
+    return _of_record(parse_json(content, where, PatchFileError), where)
+
+
+def _of_record(record: Any, where: str) -> PatchFile:
     if not isinstance(record, dict) or record.get("schema") not in (SCHEMA, FIRST_SCHEMA):
         came = record.get("schema") if isinstance(record, dict) else type(record).__name__
         raise PatchFileError(f'{where} must have "schema": "{SCHEMA}", but has {came!r}.')

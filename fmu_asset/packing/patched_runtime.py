@@ -10,12 +10,11 @@ from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.sensor_stream import needs_structure
+from fe.runtime.sensors import needs_structure
 from fe.runtime.transient import ModalIntegrator
 from fmu_asset.errors import PatchFileError
 from fmu_asset.slaves.behaviour import StructureBehaviour
-from fmu_asset.slaves.effect_variables import effect_rows, switch_of
-from fmu_asset.slaves.effects import Effects
+from fmu_asset.slaves.effects import Effects, effect_rows, switch_of
 from fmu_asset.slaves.table import structure_table
 
 from .patch_file import Effect
@@ -30,7 +29,7 @@ def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
 
 
 def plain_effects(effects: Sequence[Effect]) -> list[dict[str, Any]]:
-    """Return effects as plain data, as `effect_variables` takes them."""
+    """Return effects as plain data, as `fmu_asset.slaves.effects` takes them."""
     return [{"id": effect.id, "primitives": effect.patch.to_list()} for effect in effects]
 
 
@@ -59,26 +58,14 @@ def patched_members(
     # The order of keys is that of the variables.
     text = json.dumps(record, indent=1, allow_nan=False)
     members = {"resources/effects.json": f"{text}\n".encode()}
-    patch = whole_patch(effects)
-    if needs_structure(patch):
-        if arrays is None:
-            raise PatchFileError(
-                "The patch changes structure or loads, for which the FMU needs the wing in the basis for "
-                "patches: give `arrays`, as `fe.reduction.model_cache.patch_arrays` returns them."
-            )
-        _check_arrays(model, arrays, patch)
-        if not len(patch.of(LocalStiffnessLoss)):
-            arrays = without_strips(arrays)
-        members[ARRAYS_FILE] = arrays.to_bytes()
-    return members
-
-
-def whole_patch(effects: Sequence[Mapping[str, Any]]) -> ModelPatch:
-    """Return all effects together."""
-    return ModelPatch.from_list([primitive for effect in effects for primitive in effect["primitives"]])
-
-
-def _check_arrays(model: ReducedModel, arrays: PatchArrays, patch: ModelPatch) -> None:
+    patch = ModelPatch.from_list([primitive for effect in effects for primitive in effect["primitives"]])
+    if not needs_structure(patch):
+        return members
+    if arrays is None:
+        raise PatchFileError(
+            "The patch changes structure or loads, for which the FMU needs the wing in the basis for "
+            "patches: give `arrays`, as `fe.reduction.model_cache.patch_arrays` returns them."
+        )
     if arrays.design_hash != model.design_hash:
         raise PatchFileError(
             f"The wing for patches is of the design {arrays.design_hash[:12]}, and the reduced model of "
@@ -88,16 +75,10 @@ def _check_arrays(model: ReducedModel, arrays: PatchArrays, patch: ModelPatch) -
         ModalIntegrator(PatchedWing(arrays), model.nominal, *model.damping.tolist(), patch).modes  # noqa: B018
     except FiniteElementError as cause:
         raise PatchFileError(f"The wing cannot carry the patch: {cause}") from cause
-
-
-def without_strips(arrays: PatchArrays) -> PatchArrays:
-    """Return the arrays without the parts that only a local stiffness loss needs, most of the bytes."""
-    return replace(
-        arrays,
-        strip_stiffness=arrays.strip_stiffness[:0],
-        strip_of=arrays.strip_of[:0],
-        term_of=arrays.term_of[:0],
-    )
+    if not len(patch.of(LocalStiffnessLoss)):  # strips, which only that needs, are most of the bytes
+        strips = ("strip_stiffness", "strip_of", "term_of")
+        arrays = replace(arrays, **{name: getattr(arrays, name)[:0] for name in strips})
+    return {**members, ARRAYS_FILE: arrays.to_bytes()}
 
 
 def patched_behaviour(

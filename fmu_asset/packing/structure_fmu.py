@@ -21,7 +21,7 @@ from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compi
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface
-from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
+from fmu_asset.slaves.effects import effect_rows, switch_of, units_of
 from fmu_asset.slaves.table import is_wing, structure_table
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
@@ -175,7 +175,7 @@ def _python_members(
     return python_members(
         declared,
         "Structure_",
-        imports="from .slaves.contents import load_contents\n",
+        imports="from .slaves.behaviour import load_contents\n",
         resources={
             "reduced_model.npz": model.to_bytes(),
             "start.json": (json.dumps(values, sort_keys=True, indent=1) + "\n").encode(),

@@ -12,6 +12,7 @@ import math
 import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -164,33 +165,34 @@ class Slave:
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Advance by one communication step, the inputs held; False (fmi2Discard) means nothing changed."""
+        step = partial(self._behaviour.advance, current_time, step_size)
+        if not self._may_step(current_time, step_size):
+            return False
         consequence = "the step was refused and the state is as it was"
-        try:
-            if not self._may_step(current_time, step_size):
-                return False
-            if not self._acceptable(self._input_count, consequence):
-                return False
-            inputs = self._values[: self._input_count]
-            outputs = self._behaviour.advance(current_time, step_size, inputs)
-        except UnacceptableValuesError as error:
-            return self._refuse(STATUS_OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
-        except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
-            return self._refuse(STATUS_INTERNAL, f"the step from t = {current_time:g} s failed: {error!r}")
+        if not self._done(step, self._input_count, f"the step from t = {current_time:g} s", consequence):
+            return False
         self._time = current_time + step_size
-        return self._accept(outputs)
+        return True
 
     def _initialise(self) -> bool:
-        consequence = "the initialisation was refused"
+        begin = partial(self._behaviour.start, self._parameters(self._values), self._time)
+        return self._done(begin, self._first_output, "the initialisation", "the initialisation was refused")
+
+    def _done(self, act: Callable[..., Sequence[float]], last: int, what: str, consequence: str) -> bool:
+        """Whether values were acceptable and something was done with the inputs, whose outputs are kept."""
         try:
-            if not self._acceptable(self._first_output, consequence):
+            if not self._acceptable(last, consequence):
                 return False
-            inputs = self._values[: self._input_count]
-            outputs = self._behaviour.start(self._parameters(self._values), self._time, inputs)
+            outputs = act(self._values[: self._input_count])
         except UnacceptableValuesError as error:
             return self._refuse(STATUS_OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
-            return self._refuse(STATUS_INTERNAL, f"the initialisation failed: {error!r}")
-        return self._accept(outputs)
+            return self._refuse(STATUS_INTERNAL, f"{what} failed: {error!r}")
+        self._values[self._first_output : self._first_output + len(outputs)] = outputs
+        self._values[self._status] = STATUS_OK
+        self._stale = False
+        self._pending = [True] * len(self._later)
+        return True
 
     def _acceptable(self, last: int, consequence: str) -> bool:
         """Whether the first rows and those to be tuned lie in their ranges; the latter are handed on."""
@@ -221,13 +223,6 @@ class Slave:
 
     def _parameters(self, values: Sequence[float]) -> dict[str, float]:
         return {row.name: values[row.reference] for row in self._table if row.causality == "parameter"}
-
-    def _accept(self, outputs: Sequence[float]) -> bool:
-        self._values[self._first_output : self._first_output + len(outputs)] = outputs
-        self._values[self._status] = STATUS_OK
-        self._stale = False
-        self._pending = [True] * len(self._later)
-        return True
 
     # ------------------------------------------------------------------ values
 

@@ -7,8 +7,11 @@ same for a structure without effects.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +21,8 @@ from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 
-from .base import UnacceptableValuesError
-from .table import MODE_COUNT, Roles
+from .base import Contents, UnacceptableValuesError
+from .table import MODE_COUNT, Roles, structure_table
 from .variables import TRANSIENT, FmuVariable
 
 if TYPE_CHECKING:
@@ -115,32 +118,23 @@ class StructureBehaviour:
         if self._vector is None:
             raise RuntimeError("the structure was not initialised")
         if group == MODES:
-            return self.modal_data()
+            modes = self._model.modes(self._vector) if self._integrator is None else self._integrator.modes
+            frequency = modes.frequency[:MODE_COUNT]
+            return [*frequency.tolist(), *rayleigh_damping_ratio(*self._damping, frequency).tolist()]
         if group == POINT_OR_BOUND and self._roles.load_point is not None:
-            return [self.load_point_displacement()]
+            return [
+                self._shown[-1] if self._shown else self._point()
+            ]  # as sensors show it, where they are on
         self._static = self._static or self._model.static_response(self._vector)
         bounds = self._static.strain_error_bound, self._static.displacement_error_bound
         return [bounds[group]]
 
-    def load_point_displacement(self) -> float:
-        """Return the displacement of the point where the load acts that holds the structure aside [m].
-
-        As it is shown, where sensors are on.
-        """
-        return self._shown[-1] if self._shown else self._point()
-
     def _point(self) -> float:
+        """Return the displacement of the point whose load holds the structure aside [m]."""
         if self._integrator is not None and self._state is not None:
             return self._integrator.point_displacement(self._state, self._held(self._integrator))
         self._static = self._static or self._model.static_response(self._vector)
         return float(self._model.static_load[self._roles.point_load] @ self._static.coordinates)
-
-    def modal_data(self) -> list[float]:
-        """Return natural frequencies [Hz], then damping ratios [1], under the last inputs."""
-        modes = self._model.modes(self._vector) if self._integrator is None else self._integrator.modes
-        frequency = modes.frequency[:MODE_COUNT]
-        ratio = rayleigh_damping_ratio(*self._damping, frequency)
-        return [*frequency.tolist(), *ratio.tolist()]
 
     def state(self) -> list[float]:
         """Return all that is remembered, without the parameters."""
@@ -196,44 +190,31 @@ class StructureBehaviour:
     def _go(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
         """Begin, where there is no state yet, or advance; return the outputs."""
         changed = self._effects is not None and self._take_effects(self._effects)
-        before, vector, own = self._vector, self._chosen(inputs), self._own
+        before, parameters, own = self._vector, self._parameters, self._own
+        vector = np.array([parameters[name] if n is None else inputs[n] for name, n in self._sources])
         integrator, state, static = self._integrator, self._state, None
         if not (self._moves or (self._acting is not None and self._acting.changes_structure)):
             integrator = state = None
             static = self._model.static_response(vector)
             values = [*static.strain.tolist(), *static.displacement.tolist(), *self._resting]
         else:
-            if (
-                integrator is None
-                or before is None
-                or changed
-                or vector[:own].tobytes() != before[:own].tobytes()
-            ):
+            same = before is not None and vector[:own].tobytes() == before[:own].tobytes()
+            if integrator is None or changed or not same:
                 integrator = self._made(vector)
                 if self._integrator is not None and state is not None:
                     state = integrator.take_over(state, self._integrator)
-            state = self._next(integrator, state, vector, time, duration)
+            load = integrator.structure.acting(vector)
+            if not self._moves:
+                state = integrator.settled(load, state)
+            elif state is not None:
+                state = integrator.advance(state, duration, load, time - self._begun)
+            elif self._roles.release is None:
+                state = integrator.at_rest(load)
+            else:
+                state = integrator.released(parameters[self._roles.release], load, self._held(integrator))
             values = integrator.outputs(state).tolist()
         self._vector, self._integrator, self._state, self._static = vector, integrator, state, static
         return values if self._acting is None else self._show(values, duration, time + duration)
-
-    def _next(
-        self,
-        integrator: ModalIntegrator,
-        state: TransientState | None,
-        vector: FloatArray,
-        time: float,
-        duration: float,
-    ) -> TransientState:
-        """Return the state under the loads of all that is chosen; where there is none, the first one."""
-        load = integrator.structure.acting(vector)
-        if not self._moves:
-            return integrator.settled(load, state)
-        if state is not None:
-            return integrator.advance(state, duration, load, time - self._begun)
-        if self._roles.release is None:
-            return integrator.at_rest(load)
-        return integrator.released(self._parameters[self._roles.release], load, self._held(integrator))
 
     def _held(self, integrator: ModalIntegrator) -> int:
         """Return the number of the load that holds the structure aside."""
@@ -253,6 +234,7 @@ class StructureBehaviour:
 
     def _show(self, values: list[float], duration: float, end: float) -> list[float]:
         """Return what sensors make of outputs."""
+        assert self._effects is not None
         assert self._acting is not None
         if not len(self._acting.patch):
             self._filters, self._shown = None, []
@@ -261,18 +243,14 @@ class StructureBehaviour:
         if self._integrator is not None and self._state is not None and self._acting.changes_structure:
             seen = self._integrator.structure.components @ self._integrator.displacement(self._state)
             across = np.pad(seen, ((0, 0), (0, len(values) + 1 - seen.shape[1])))
-        release = self._parameters.get(self._roles.release or "", 0.0) if self._moves else 0.0
-        self._shown, self._filters = self._acting.shown(
-            np.array([*values, self._point()]), across, self._filters, duration, end,
-            begun=self._begun, release=release, dynamic=self._moves,
+        release = self._parameters.get(self._roles.release or "", 0.0)
+        kind = "flight" if not self._moves else "ringdown" if release else "forced"
+        since = end - self._begun if self._moves else end
+        self._shown, self._filters = self._effects.shown(
+            self._acting, np.array([*values, self._point()]), across, self._filters, duration,
+            kind=kind, time=since, start=self._begun, release=release,
         )  # fmt: skip
         return self._shown[:-1]
-
-    def _chosen(self, inputs: Sequence[float]) -> FloatArray:
-        parameters = self._parameters
-        return np.array(
-            [parameters[name] if number is None else inputs[number] for name, number in self._sources]
-        )
 
     @property
     def _damping(self) -> tuple[float, float]:
@@ -284,3 +262,29 @@ class StructureBehaviour:
             return ModalIntegrator(self._model, vector, *self._damping)
         assert self._acting is not None
         return self._effects.integrator(vector, self._damping, self._acting)
+
+
+def load_contents(resources: Path) -> Contents:
+    """Return what the files that `fmu_asset.packing.structure_fmu` packed describe."""
+    model, start = ReducedModel.load(resources / "reduced_model.npz"), _read(resources / "start.json")
+    own = {name: value for name, value in start.items() if not name.startswith("effect.")}
+    table, roles = structure_table(model, own)
+    later, behaviour = later_outputs(table, roles), partial(StructureBehaviour, model, table, roles)
+    if not (resources / "effects.json").is_file():
+        return Contents(table, behaviour, later)
+    # a plain structure needs nothing of these
+    from fe.runtime.patch_arrays import PatchArrays
+    from fe.runtime.patched_wing import PatchedWing
+
+    from .effects import Effects, effect_rows
+
+    record, arrays = _read(resources / "effects.json"), resources / "patch_arrays.npz"
+    effects, channels = record["effects"], tuple((name, quantity) for name, quantity in record["channels"])
+    wing = PatchedWing(PatchArrays.load(arrays)) if arrays.is_file() else None
+    rows = effect_rows(effects, len(table), start)
+    return Contents(table + rows, lambda: behaviour(Effects(effects, channels, wing)), later)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return record

@@ -153,35 +153,28 @@ class Table:
         description: str,
         *,
         kind: Kind = "Real",
-        unit: str | None = None,
-        display: str | None = None,
         box: tuple[float | None, float | None] = (None, None),
         default: float = 0.0,
-        enumeration: str | None = None,
         tunable: bool = False,
+        display: str | None = None,
+        **own: str | None,
     ) -> None:
-        """Append a row; `box` is the range, `default` the start value of an input or parameter."""
+        """Append a row; `box` is the range, `default` the start value of an input or parameter.
+
+        `own` are further fields of `FmuVariable`: its unit, its enumeration.
+        """
         variability: Variability = "fixed" if causality == "parameter" else "continuous"
         if tunable:
             variability = "tunable"
         elif kind != "Real" and causality != "parameter":
             variability = "discrete"
-        self._rows.append(
-            FmuVariable(
-                name=name,
-                reference=self._first + len(self._rows),
-                kind=kind,
-                causality=causality,
-                variability=variability,
-                description=description,
-                unit=unit,
-                display_unit=display,
-                minimum=box[0],
-                maximum=box[1],
-                start=None if causality == "output" else float(self._start.pop(name, default)),
-                enumeration=enumeration,
-            )
-        )
+        start = None if causality == "output" else float(self._start.pop(name, default))
+        reference = self._first + len(self._rows)
+        row = FmuVariable(
+            name, reference, kind, causality, variability, description,
+            display_unit=display, minimum=box[0], maximum=box[1], start=start, **own,
+        )  # fmt: skip
+        self._rows.append(row)
 
     def add_status(self) -> None:
         """Append the row that says what became of the last call."""

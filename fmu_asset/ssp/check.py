@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.schedule import loop_sentence
-from fmu_asset.coupling.structure import listed
+from fmu_asset.coupling.structure import SystemStructure, listed
 from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.experiment import whole_binding
@@ -16,14 +16,7 @@ from fmu_asset.door.units import IDENTITY, between
 from fmu_asset.errors import FmuError, SspError
 from fmu_asset.folders import scratch_folder
 
-from .reader import SspSystem, read_ssp
-
-_CAUSALITIES = {
-    "input": ("input",),
-    "output": ("output", "local"),
-    "parameter": ("parameter",),
-    "calculatedParameter": ("calculatedParameter",),
-}
+from .reader import read_ssp
 
 
 @dataclass(frozen=True)
@@ -57,18 +50,14 @@ class SspCheck:
     unused: tuple[str, ...] = ()
     left_out: str = ""
 
-    @property
-    def passed(self) -> bool:
-        """Whether nothing was found."""
-        return not self.problems
 
-
-def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
+def join_ssp(structure: SystemStructure, delayed: Iterable[str] = ()) -> Wiring:
     """Join a system that was read, and check that its connectors are those of its FMUs.
 
     Parameters
     ----------
-    system : SspSystem
+    structure : SystemStructure
+        As `reader.read_ssp` returns it.
     delayed : iterable of str
         Ends whose connections are delayed by a step, whatever the file says.
 
@@ -79,27 +68,26 @@ def join_ssp(system: SspSystem, delayed: Iterable[str] = ()) -> Wiring:
     CouplingError, FmuFileError, FmuUnsupportedError
         If the system does not fit its FMUs.
     """
-    wiring = Wiring(system.structure.delayed(delayed), leave_out_unknown=True)
-    wiring.left_out += system.unused
-    definitions = system.structure.units
-    for end, declared in system.declared.items():
-        variable = wiring.variable(end)
-        if variable.causality not in _CAUSALITIES.get(declared.kind, ()):
-            raise SspError(
-                f"The connector {end} is declared as {declared.kind}, but its FMU has it as "
-                f"{variable.causality}."
-            )
-        if declared.type is not None and declared.type != variable.base_type:
-            raise SspError(
-                f"The connector {end} is declared of the type {declared.type}, but its FMU has it as "
-                f"{variable.kind}."
-            )
-        units = wiring.declared[end.component].units
-        if between(declared.unit, (*definitions, *units), variable.unit, units) != IDENTITY:
-            raise SspError(
-                f"The connector {end} is declared in {declared.unit!r}, but its FMU has it in "
-                f"{variable.unit!r}; connectors of components must have the unit of the FMU."
-            )
+    wiring = Wiring(structure.delayed(delayed), leave_out_unknown=True)
+    wiring.left_out += structure.unused
+    for end, declared in structure.declared.items():
+        variable, units = wiring.variable(end), wiring.declared[end.component].units
+        same_unit = between(declared.unit, (*structure.units, *units), variable.unit, units) == IDENTITY
+        # SSP 1.0 has no local variables.
+        own_kind = "output" if variable.causality == "local" else variable.causality
+        for fits, said, has in (
+            (declared.kind == own_kind, f"as {declared.kind}", f"as {variable.causality}"),
+            (
+                declared.type in (None, variable.base_type),
+                f"of the type {declared.type}",
+                f"as {variable.kind}",
+            ),
+            (same_unit, f"in {declared.unit!r}", f"in {variable.unit!r}"),
+        ):
+            if not fits:
+                raise SspError(
+                    f"The connector {end} is declared {said}, but its FMU has it {has}; correct the file."
+                )
     return wiring
 
 
@@ -133,33 +121,26 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
     file = Path(path)
     if not file.is_file():
         raise SspError(f"There is no SSP file {file}.")
-    try:
-        with scratch_folder() as folder:
+    problems: tuple[str, ...] = ()
+    with scratch_folder() as folder:
+        try:
             wiring = join_ssp(read_ssp(file, folder))
-            plan = wiring.schedule
-            problems = _trial(wiring)
-        return SspCheck(
-            path=file,
-            problems=tuple(problems),
-            components=tuple((name, wiring.declared[name].model_name) for name in plan.order),
-            connections=len(wiring.structure.connections),
-            parameters=sum(len(component.settings) for component in wiring.structure.components),
-            loops=(loop_sentence(plan.loops),) if plan.loops else (),
-            unused=tuple(wiring.left_out),
-            left_out=left_out_sentence(wiring, file),
-        )
-    except FmuError as error:
-        return SspCheck(file, (str(error),))
-
-
-def _trial(wiring: Wiring) -> list[str]:
-    """Make one step with the start values, and read what can be read."""
-    binding = whole_binding(system_description(wiring), step_size=1.0)
-    try:  # with an algebraic loop, too: whether it may be simulated is the user's choice
-        with CoupledAsset(
-            wiring, binding, algorithm="jacobi" if wiring.schedule.loops else "gauss_seidel"
-        ) as asset:
-            asset.step()
-    except FmuError as error:
-        return [str(error)]
-    return []
+        except FmuError as error:
+            return SspCheck(file, (str(error),))
+        plan = wiring.schedule
+        try:  # with an algebraic loop, too: whether it may be simulated is the user's choice
+            binding = whole_binding(system_description(wiring), step_size=1.0)
+            with CoupledAsset(wiring, binding, algorithm="jacobi" if plan.loops else "gauss_seidel") as asset:
+                asset.step()
+        except FmuError as error:
+            problems = (str(error),)
+    return SspCheck(
+        path=file,
+        problems=problems,
+        components=tuple((name, wiring.declared[name].model_name) for name in plan.order),
+        connections=len(wiring.structure.connections),
+        parameters=sum(len(component.settings) for component in wiring.structure.components),
+        loops=(loop_sentence(plan.loops),) if plan.loops else (),
+        unused=tuple(wiring.left_out),
+        left_out=left_out_sentence(wiring, file),
+    )

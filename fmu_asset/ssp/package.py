@@ -1,4 +1,4 @@
-"""The SSP archive: checked before it is used, packed to the same bytes, its XML valid by the schemas."""
+"""The SSP archive: checked before it is used, its XML valid by the schemas, in the words of SSP 1.0."""
 
 import os
 import posixpath
@@ -21,11 +21,9 @@ NAMESPACES = {
     "ssv": "http://ssp-standard.org/SSP1/SystemStructureParameterValues",
     "ssm": "http://ssp-standard.org/SSP1/SystemStructureParameterMapping",
 }
+"""By kind of document; the last word is the name of its schema."""
 OWN_NAMESPACE = "urn:uav-twin:coupling"
 """Of the annotations that say what SSP 1.0 has no word for: delayed connections, several steps in one."""
-SET_TYPE = "application/x-ssp-parameter-set"
-MAPPING_TYPE = "application/x-ssp-parameter-mapping"
-FMU_TYPE = "application/x-fmu-sharedlibrary"
 INTERFACES: dict[str, Interface | None] = {
     "any": None,
     "CoSimulation": "co-simulation",
@@ -38,23 +36,23 @@ _NUMBERS_OF_2 = {
     **{f"{sign}Int{bits}": "Integer" for sign in ("", "U") for bits in (8, 16, 32, 64)},
 }
 _LEFT_OUT_OF_2 = ("MetaData", "Signature")
-
+_UNSUPPORTED = {
+    "Binary": "a binary connector",
+    "Clock": "a clock",
+    "Dimension": "an array",
+    "SignalDictionaries": "signal dictionaries",
+    "SignalDictionaryReference": "signal dictionaries",
+    **{
+        f"{kind}MappingTransformation": f"a {kind}MappingTransformation"
+        for kind in ("Boolean", "Integer", "Enumeration")
+    },
+}
 _HOLD_COMMON = ("Units", "Enumerations", "Annotations", "MappingEntry")
 """Elements of parameter sets and mappings below which the common namespace begins."""
-_SCHEMAS = {
-    "ssd": "SystemStructureDescription.xsd",
-    "ssv": "SystemStructureParameterValues.xsd",
-    "ssm": "SystemStructureParameterMapping.xsd",
-}
 
 
 class SspPackage:
     """An SSP file that was checked: sound, safe, and with a system structure in it.
-
-    Attributes
-    ----------
-    unused : list of str
-        Names of parameters, gathered by those who read: what the file sets and nothing takes.
 
     Raises
     ------
@@ -64,7 +62,6 @@ class SspPackage:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self.unused: list[str] = []
         if not self.path.is_file():
             raise SspError(
                 f"There is no SSP file {self.path}; check the path, or write it with `uav-twin ssp export`."
@@ -104,22 +101,24 @@ class SspPackage:
             raise SspError(f"{what} in {self.path} names the source {source!r}, which is not in the archive.")
         return name
 
-    def parse(self, name: str, kind: str) -> Any:
-        """Return the root element of an XML file of the archive, valid by the schema of its kind.
+    def parse(self, kind: str, name: str, content: bytes | None = None) -> Any:
+        """Return the root element of an XML document, valid by the schema of its kind.
 
         Parameters
         ----------
-        name : str
-            The file.
         kind : {"ssd", "ssv", "ssm"}
             What it must be.
+        name : str
+            The file in the archive, or what `content` is.
+        content : bytes, optional
+            Its text, where it does not stand in a file of its own.
         """
-        root = parse_xml(self.read(name), f"{name} in {self.path}")
+        where = f"{name} in {self.path}"
+        root = parse_xml(self.read(name) if content is None else content, where)
         if not root.tag.startswith("{"):
             _put_into_namespace(root, kind)
-        if str(root.get("version", "")).startswith("2."):
-            in_words_of_1(root, f"{name} in {self.path}")
-        validate(root, kind, f"{name} in {self.path}")
+        _in_words_of_1(root, where)
+        validate(root, kind, where)
         return root
 
 
@@ -143,45 +142,44 @@ def parse_xml(content: bytes, where: str) -> Any:
     return root
 
 
-def in_words_of_1(root: Any, where: str) -> None:
-    """Put a document of SSP 2.0 into the words of SSP 1.0, which has the same namespaces and fewer of them.
+def _in_words_of_1(root: Any, where: str) -> None:
+    """Put a document into those words of SSP 1.0 that are read.
 
-    The numbers of FMI 3 become the two that 1.0 knows; what FMU they come from decides their size. Metadata
-    and signatures are left out.
+    Of SSP 2.0, which has the same namespaces and more words, the numbers of FMI 3 become the two that 1.0
+    knows; what FMU they come from decides their size. Metadata and signatures are left out.
 
     Raises
     ------
     SspError
-        If it has what 1.0 has no word for: clocks, arrays, structural parameters, a component without a
-        source.
+        If it has what is not read.
     """
-    own = tuple(f"{{{uri}}}" for uri in NAMESPACES.values())
     for element in list(root.iter(etree.Element)):
-        if not element.tag.startswith(own):
+        tag = etree.QName(element)
+        if tag.namespace not in NAMESPACES.values():
             continue
-        namespace, _, name = element.tag.rpartition("}")
         if str(element.get("version", "")).startswith("2."):
             element.set("version", "1.0")
-        if name in _LEFT_OUT_OF_2:
+        if tag.localname in _LEFT_OUT_OF_2:
             element.getparent().remove(element)
-        elif name in _NUMBERS_OF_2:
-            element.tag = f"{namespace}}}{_NUMBERS_OF_2[name]}"
-        missing = {"Clock": "a clock", "Dimension": "an array"}.get(name)
+        elif tag.localname in _NUMBERS_OF_2:
+            element.tag = f"{{{tag.namespace}}}{_NUMBERS_OF_2[tag.localname]}"
+        # A value that is binary is refused where something takes it.
+        missing = _UNSUPPORTED.get("" if tag.namespace == NAMESPACES["ssv"] else tag.localname)
         if element.get("kind") in ("clock", "structuralParameter"):
             missing = f"a connector of the kind {element.get('kind')}"
-        if name == "Component" and element.get("source") is None:
+        if tag.localname == "Component" and element.get("source") is None:
             missing = f"the component {element.get('name')!r} without a source"
         if missing:
             raise SspError(
-                f"{where} is of SSP 2.0 and has {missing} (line {element.sourceline}), which is not "
-                "supported; leave it out, or use what SSP 1.0 has."
+                f"{where} has {missing}, not supported (line {element.sourceline}); leave it out, or use "
+                "direct connections, single numbers and linear transformations."
             )
 
 
 def _put_into_namespace(element: Any, kind: str) -> None:
     """Give the namespaces of SSP 1.0 to a document that some tools write without any."""
     inner = "ssc" if element.tag in _HOLD_COMMON else kind
-    element.tag = tag(f"{kind}:{element.tag}")
+    element.tag = f"{{{NAMESPACES[kind]}}}{element.tag}"
     for child in element.iterchildren(etree.Element):
         _put_into_namespace(child, inner)
 
@@ -196,8 +194,8 @@ def validate(root: Any, kind: str, where: str) -> None:
     """
     import fmpy.ssp
 
-    folder = Path(fmpy.ssp.__file__).parent / "schema"
-    schema = etree.XMLSchema(file=str(folder / _SCHEMAS[kind]))
+    name = NAMESPACES[kind].rpartition("/")[2]
+    schema = etree.XMLSchema(file=str(Path(fmpy.ssp.__file__).parent / "schema" / f"{name}.xsd"))
     if not schema.validate(root):
         first = schema.error_log[0]
         text = str(first.message)
@@ -206,9 +204,3 @@ def validate(root: Any, kind: str, where: str) -> None:
         raise SspError(
             f"{where} is not valid by the schema of SSP 1.0 (line {first.line}): {text[:400].rstrip('.')}."
         )
-
-
-def tag(name: str) -> str:
-    """Return a tag such as `ssd:System` with its namespace."""
-    kind, _, local = name.partition(":")
-    return f"{{{NAMESPACES[kind]}}}{local}"

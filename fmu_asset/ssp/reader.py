@@ -2,66 +2,40 @@
 
 What SSP 1.0 allows and is not read is refused in a sentence: signal dictionaries, components that are systems
 of their own files, mappings of Booleans, integers and enumerations, texts and binary values.
-Of SSP 2.0 the same is read; see `package.in_words_of_1`.
+Of SSP 2.0 the same is read; see `package`.
 """
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import reduce
+from math import isfinite
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any
 
+from lxml import etree
+
+from fmu_asset.archive.declared import BASE_UNITS, UnitInfo
 from fmu_asset.coupling.structure import (
+    CONNECTOR_KINDS,
     Component,
     Connection,
     Connector,
-    ConnectorKind,
     Endpoint,
     Setting,
     SystemStructure,
 )
+from fmu_asset.door.units import IDENTITY, Conversion
 from fmu_asset.errors import SspError
 from reporting.files import atomic_write_bytes
 
-from .package import FMU_TYPE, INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
-from .parameters import VALUE_TYPES, flag, read_bindings, read_transformation, read_units
+from .package import INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage
 
 _INWARD = ("input", "parameter")
 """Kinds of connectors through which values come in; inside a system, they are where values come from."""
 
 
-@dataclass(frozen=True)
-class DeclaredConnector:
-    """A connector as the system structure declares it: kind, type and unit; None where it says nothing."""
-
-    kind: str
-    type: str | None
-    unit: str | None
-
-
-@dataclass(frozen=True)
-class SspSystem:
-    """What an SSP file holds.
-
-    Attributes
-    ----------
-    structure : SystemStructure
-        The system, flat; a component of a nested system is named `system.component`.
-    declared : dict of Endpoint to DeclaredConnector
-        The connectors of the components, as the file declares them.
-    span : (float or None, float or None)
-        Start and end of the default experiment [s], where the file says them.
-    unused : tuple of str
-        Names of parameters that are set, but are of no element of the system.
-    """
-
-    structure: SystemStructure
-    declared: dict[Endpoint, DeclaredConnector]
-    span: tuple[float | None, float | None] = (None, None)
-    unused: tuple[str, ...] = ()
-
-
-def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> SspSystem:
+def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> SystemStructure:
     """Read an SSP file, and write the FMUs in it to a folder.
 
     Parameters
@@ -73,8 +47,9 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
 
     Returns
     -------
-    SspSystem
-        The system. Whether it fits its FMUs is checked where it is joined; see `coupling.wiring`.
+    SystemStructure
+        The system, flat; a component of a nested system is named `system.component`. Whether it fits its FMUs
+        is checked where it is joined; see `check.join_ssp`.
 
     Raises
     ------
@@ -82,26 +57,30 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
         If the file is missing, damaged, unsafe or not valid by the schema, or uses what is not supported.
     """
     package = SspPackage(path)
-    root = package.parse(SSD_NAME, "ssd")
+    root = package.parse("ssd", SSD_NAME)
     tree = _Tree(package, root.find("ssd:System", NAMESPACES))
     connections = tuple(tree.flat_connections())
-    settings = tree.flat_settings()
     components = []
-    for name, (source, substeps, interface) in tree.components.items():
+    for name, component in tree.components.items():
         # Under its name in the archive, once for all components that are of it.
-        file = Path(folder) / source
+        file = Path(folder) / component.fmu
         file.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write_bytes(file, package.read(source))
-        own = {node.variable: value for node, value in settings.items() if node.component == name}
-        components.append(Component(name, file, own, substeps, interface))
-    connectors = tuple(tree.outer_connectors())
-    units = read_units(root, "ssd")
-    structure = SystemStructure(str(root.get("name")), tuple(components), connectors, connections, units)
-    inner = {node: it for node, it in tree.connectors.items() if node.component in tree.components}
-    found = root.find("ssd:DefaultExperiment", NAMESPACES)
-    told = {} if found is None else found.attrib
+        atomic_write_bytes(file, package.read(str(component.fmu)))
+        own = {node.variable: value for node, value in tree.settings.items() if node.component == name}
+        components.append(replace(component, fmu=file, settings=own))
+    experiment = root.find("ssd:DefaultExperiment", NAMESPACES)
+    told = {} if experiment is None else experiment.attrib
     start, stop = (float(told[name]) if name in told else None for name in ("startTime", "stopTime"))
-    return SspSystem(structure, inner, (start, stop), tuple(package.unused))
+    return SystemStructure(
+        str(root.get("name")),
+        tuple(components),
+        tree.outer_connectors(),
+        connections,
+        _units(root, "ssd"),
+        declared={node: own for node, own in tree.connectors.items() if node.component in tree.components},
+        span=(start, stop),
+        unused=tuple(tree.unused),
+    )
 
 
 class _Tree:
@@ -113,52 +92,45 @@ class _Tree:
 
     def __init__(self, package: SspPackage, system: Any) -> None:
         self.package = package
-        self.components: dict[str, tuple[str, int, Any]] = {}
-        self.connectors: dict[Endpoint, DeclaredConnector] = {}
+        self.components: dict[str, Component] = {}
+        self.connectors: dict[Endpoint, Connector] = {}
+        self.settings: dict[Endpoint, Setting] = {}
+        self.unused: list[str] = []
+        self._elements = {""}
         self._edges: dict[Endpoint, Connection] = {}
-        self._settings: dict[Endpoint, Setting] = {}
         self._read_system(system, "")
 
     def _error(self, sentence: str) -> SspError:
         """Return the error that says what is wrong with the system structure."""
         return SspError(f"{SSD_NAME} in {self.package.path}: {sentence}")
 
+    def _refuse_other(self, element: Any, attribute: str, usual: str, where: str, instead: str) -> None:
+        """Refuse an attribute that has another value than the one that is read."""
+        if (given := element.get(attribute, usual)) != usual:
+            raise self._error(f"{where} has the {attribute} {given!r}: {instead}.")
+
     # ------------------------------------------------------------------ as it is written
 
     def _read_system(self, element: Any, path: str) -> None:
-        name = str(element.get("name"))
-        if element.find("ssd:SignalDictionaries", NAMESPACES) is not None:
-            raise self._error(
-                f"the system {name!r} has signal dictionaries, which are not supported; connect directly."
-            )
         self._read_connectors(element, path)
-        children: dict[str, str] = {}
         for child in element.iterfind("ssd:Elements/*", NAMESPACES):
-            own = str(child.get("name"))
-            if own in children:
-                raise self._error(
-                    f"the system {name!r} has two elements named {own!r}; each needs a name of its own."
-                )
-            children[own] = f"{path}.{own}".removeprefix(".")
-            if child.tag == tag("ssd:System"):
-                self._read_system(child, children[own])
-            elif child.tag == tag("ssd:Component"):
-                self._read_component(child, children[own])
+            own = _path(path, str(child.get("name")))
+            if own in self._elements:
+                raise self._error(f"there are two elements named {own!r}; each needs a name of its own.")
+            self._elements.add(own)
+            if etree.QName(child).localname == "System":
+                self._read_system(child, own)
             else:
-                raise self._error(
-                    f"the system {name!r} refers to the signal dictionary {own!r}, which is not supported; "
-                    "connect directly."
-                )
-        for connection in element.findall("ssd:Connections/ssd:Connection", NAMESPACES):
-            self._read_connection(connection, path, children)
+                self._read_component(child, own)
+        for connection in element.iterfind("ssd:Connections/ssd:Connection", NAMESPACES):
+            self._read_connection(connection, path)
         self._bind(element, path)  # after the elements in it: bindings of a system go before theirs
 
     def _read_component(self, element: Any, path: str) -> None:
         where = f"the component {path!r}"
-        if path in self.components:
-            raise self._error(f"two components are named {path!r}; rename one of them.")
-        if element.get("type", FMU_TYPE) != FMU_TYPE:
-            raise self._error(f"{where} is of the type {element.get('type')!r}; only FMUs are supported.")
+        self._refuse_other(
+            element, "type", "application/x-fmu-sharedlibrary", where, "only FMUs are supported"
+        )
         implementation = element.get("implementation", "any")
         if implementation not in INTERFACES:
             raise self._error(f"{where} asks for {implementation!r}, which is not supported.")
@@ -168,32 +140,31 @@ class _Tree:
             raise self._error(
                 f"{where} has the number of steps {substeps!r}, which must be a positive whole number."
             )
-        self.components[path] = (source, int(substeps), INTERFACES[implementation])
+        self.components[path] = Component(
+            path, Path(source), substeps=int(substeps), interface=INTERFACES[implementation]
+        )
         self._read_connectors(element, path)
         self._bind(element, path)
 
     def _read_connectors(self, element: Any, path: str) -> None:
-        for connector in element.findall("ssd:Connectors/ssd:Connector", NAMESPACES):
+        for connector in element.iterfind("ssd:Connectors/ssd:Connector", NAMESPACES):
             node = Endpoint(path, str(connector.get("name")))
             if node in self.connectors:
                 raise self._error(f"the connector {str(node)!r} is there twice.")
-            items = {name: connector.find(f"ssc:{name}", NAMESPACES) for name in VALUE_TYPES}
-            kind = next((name for name, item in items.items() if item is not None), None)
-            if kind == "Binary":
-                raise self._error(f"the connector {str(node)!r} is binary, which is not supported.")
-            unit = items[kind].get("unit") or None if kind else None
-            self.connectors[node] = DeclaredConnector(str(connector.get("kind")), kind, unit)
+            item = connector.find("ssc:*", NAMESPACES)
+            kind, unit = (None, None) if item is None else (etree.QName(item).localname, item.get("unit"))
+            self.connectors[node] = Connector(node.variable, connector.get("kind"), unit or None, kind)
 
-    def _read_connection(self, element: Any, path: str, children: dict[str, str]) -> None:
+    def _read_connection(self, element: Any, path: str) -> None:
         ends: list[Endpoint] = []
         gives: list[bool] = []
         for side in ("start", "end"):
-            owner = element.get(f"{side}Element")
-            if owner and owner not in children:
+            owner = element.get(f"{side}Element") or ""
+            node = Endpoint(_path(path, owner), str(element.get(f"{side}Connector")))
+            if node.component not in self._elements:
                 raise self._error(
                     f"a connection names the element {owner!r}, which its system does not have."
                 )
-            node = Endpoint(children[owner] if owner else path, str(element.get(f"{side}Connector")))
             declared = self.connectors.get(node)
             if declared is None:
                 raise self._error(f"a connection names the connector {str(node)!r}, which is not declared.")
@@ -212,45 +183,126 @@ class _Tree:
                 f"{str(target)!r} has two sources, {str(self._edges[target].source)!r} and {str(source)!r}; "
                 "keep one of the two connections."
             )
-        factor, offset = read_transformation(element, f"the connection from {source} to {target}")
-        convert = not flag(element, "suppressUnitConversion")
-        delayed = _annotation(element).get("delayed") == "true"
-        self._edges[target] = Connection(source, target, factor, offset, convert, delayed)
+        scale = self._transformation(element, f"the connection from {source} to {target}")
+        convert, delayed = (
+            not _flag(element, "suppressUnitConversion"),
+            _flag(_annotation(element), "delayed"),
+        )
+        self._edges[target] = Connection(source, target, *scale, convert, delayed)
+
+    def _transformation(self, element: Any, where: str) -> Conversion:
+        """Return the linear transformation of a connection or mapping entry."""
+        linear = element.find("ssc:LinearTransformation", NAMESPACES)
+        told = {"factor": "1", "offset": "0"} | dict({} if linear is None else linear.attrib)
+        return Conversion(*(self._finite(told[name], f"the {name} of {where}") for name in told))
+
+    def _finite(self, text: str, what: str) -> float:
+        value = float(text)  # a number by its schema, in which NaN and INF are numbers
+        if not isfinite(value):
+            raise self._error(f"{what} must be a finite number, and {text} came.")
+        return value
+
+    # ------------------------------------------------------------------ parameters
 
     def _bind(self, element: Any, path: str) -> None:
         """Take the parameter bindings of an element; they go before those of the elements inside it."""
-        where = f"the element {path or str(element.get('name'))!r}"
-        for name, setting in read_bindings(element, self.package, where).items():
-            nodes = self._nodes_of(name, path)
-            self._settings |= dict.fromkeys(nodes, setting)
-            self.package.unused += [] if nodes else [str(Endpoint(path, name))]
+        where = f"a parameter binding of the element {path or str(element.get('name'))!r}"
+        found: dict[str, Setting] = {}
+        missed: list[str] = []
+        for binding in element.iterfind("ssd:ParameterBindings/ssd:ParameterBinding", NAMESPACES):
+            values = self._values(binding, where)
+            mapping = binding.find("ssd:ParameterMapping", NAMESPACES)
+            if mapping is not None and (mapping.get("source") or len(mapping)):  # an empty one maps nothing
+                values = self._mapped(values, mapping, where, missed)
+            found |= values
+        self.unused += [name for name in missed if name not in found]
+        for name, setting in found.items():
+            # What stands before one of the dots may be the element.
+            cuts = [-1, *(place for place, letter in enumerate(name) if letter == ".")]
+            ends = [Endpoint(_path(path, name[: max(cut, 0)]), name[cut + 1 :]) for cut in cuts]
+            nodes = [node for node in ends if node.component in self.components or node in self.connectors]
+            for node in nodes:
+                if node.component not in self.components and self.connectors[node].kind not in _INWARD:
+                    kind = self.connectors[node].kind
+                    raise self._error(f"{str(node)!r} is set, but it is of the kind {kind}.")
+            self.settings |= dict.fromkeys(nodes, setting)
+            self.unused += [] if nodes else [str(Endpoint(path, name))]
 
-    def _nodes_of(self, name: str, path: str) -> list[Endpoint]:
-        """Return connectors of systems, and variables that components may have, of a parameter's name."""
-        found = []
-        for place in dict.fromkeys((*self.components, *(node.component for node in self.connectors))):
-            if path not in ("", place) and not place.startswith(f"{path}."):
+    def _content(self, element: Any, inline: str, kind: str, where: str) -> Any:
+        """Return the set or mapping that an element refers to or holds."""
+        self._refuse_other(
+            element,
+            "sourceBase",
+            "SSD",
+            where,
+            "it lies inside a component, which is not supported; move it out",
+        )
+        if source := element.get("source"):
+            return self.package.parse(kind, self.package.resolve(source, where))
+        root = element.find(inline, NAMESPACES)
+        if root is None:
+            raise self._error(f"{where} has neither a source nor content.")
+        return self.package.parse(kind, where, etree.tostring(root))
+
+    def _values(self, element: Any, where: str) -> dict[str, Setting]:
+        """Return the values of a parameter set under the names that it gives them."""
+        self._refuse_other(
+            element, "type", "application/x-ssp-parameter-set", where, "only parameter sets are read"
+        )
+        root = self._content(element, "ssd:ParameterValues/ssv:ParameterSet", "ssv", where)
+        units, found = _units(root, "ssv"), dict[str, Setting]()
+        for parameter in root.iterfind("ssv:Parameters/ssv:Parameter", NAMESPACES):
+            name = element.get("prefix", "") + parameter.get("name")
+            if name in found:
+                raise self._error(f"{where} gives {name!r} twice; keep one of the two.")
+            item = parameter.find("*")  # by the schema, its type comes first
+            kind, value = etree.QName(item).localname, item.get("value")
+            if kind == "Real":
+                value = self._finite(value, f"the value of {name!r} of {where}")
+            elif kind in ("Integer", "Boolean"):
+                value = int(value) if kind == "Integer" else _flag(item, "value")
+            found[name] = Setting(value, item.get("unit"), units=units)
+        return found
+
+    def _mapped(
+        self, values: dict[str, Setting], element: Any, where: str, missed: list[str]
+    ) -> dict[str, Setting]:
+        """Return the values under the names that a mapping gives them; what it does not name is not used."""
+        where = f"the mapping of {where}"
+        self._refuse_other(
+            element, "type", "application/x-ssp-parameter-mapping", where, "only parameter mappings are read"
+        )
+        root = self._content(element, "ssm:ParameterMapping", "ssm", where)
+        found: dict[str, Setting] = {}
+        for entry in root.iterfind("ssm:MappingEntry", NAMESPACES):
+            source, target = entry.get("source"), entry.get("target")
+            factor, offset = scale = self._transformation(entry, f"{source!r} in {where}")
+            if source not in values:  # one mapping may serve several sets
+                missed.append(target)
                 continue
-            inside = place.removeprefix(path).removeprefix(".")
-            before = f"{inside}." if inside else ""
-            node = Endpoint(place, name.removeprefix(before))
-            known = place in self.components or node in self.connectors
-            if known and name.startswith(before):
-                found.append(node)
+            if target in found:
+                raise self._error(f"{where} maps two parameters to {target!r}; keep one of the two.")
+            setting = values[source]
+            if scale != IDENTITY:
+                if isinstance(setting.value, bool | str):
+                    raise self._error(f"{where} scales {source!r}, which is no number.")
+                setting = replace(setting, factor=factor, offset=offset)
+            suppressed = _flag(entry, "suppressUnitConversion")
+            found[target] = replace(setting, unit=None if suppressed else setting.unit)
         return found
 
     # ------------------------------------------------------------------ flat
 
-    def outer_connectors(self) -> Iterator[Connector]:
-        """Yield the connectors of the outermost system."""
-        for node, declared in self.connectors.items():
-            if node.component == "":
-                if declared.kind not in get_args(ConnectorKind):
-                    raise self._error(
-                        f"the connector {str(node)!r} of the system is of the kind {declared.kind}, not "
-                        "supported."
-                    )
-                yield Connector(node.variable, cast("ConnectorKind", declared.kind), declared.unit)
+    def outer_connectors(self) -> tuple[Connector, ...]:
+        """Return the connectors of the outermost system."""
+        found = [connector for node, connector in self.connectors.items() if not node.component]
+        for connector in found:
+            if connector.kind not in CONNECTOR_KINDS:
+                raise self._error(
+                    f"the connector {connector.name!r} of the system is of the kind {connector.kind}, not "
+                    "supported."
+                )
+        return tuple(found)
 
     def _is_end(self, node: Endpoint) -> bool:
         return node.component in self.components or node.component == ""
@@ -258,10 +310,12 @@ class _Tree:
     def flat_connections(self) -> Iterator[Connection]:
         """Yield the connections between components, and between them and the outermost connectors.
 
+        The value of a connector on the way becomes that of its target.
+
         Raises
         ------
         SspError
-            If they go round in a circle of systems, or are transformed in units that nobody resolves.
+            If they go round in a circle of systems, or are transformed where units or values forbid it.
         """
         for target in filter(self._is_end, self._edges):
             edges = [self._edges[target]]
@@ -269,58 +323,54 @@ class _Tree:
                 edges.insert(0, self._edges[edges[0].source])
                 if len(edges) > len(self._edges) + 1:
                     raise self._error(f"the connections to {str(target)!r} go round in a circle of systems.")
+            # Of systems inside each other the outermost value counts.
+            nodes = [edge.source for edge in edges if edge.source.component not in self.components]
+            for node in (node for node in nodes if node in self.settings):
+                rest = edges[[edge.source for edge in edges].index(node) :]
+                if any((edge.factor, edge.offset, edge.convert_units) != (*IDENTITY, True) for edge in rest):
+                    raise self._error(
+                        f"{str(node)!r} is set and transformed on its way to {str(target)!r}; set that "
+                        "instead."
+                    )
+                self.settings[target] = self.settings[node]
+                break
             if self._is_end(edges[0].source):  # else nothing comes to a connector of a nested system
                 yield self._joined(edges)
 
     def _joined(self, edges: list[Connection]) -> Connection:
         """Return one connection for those that follow one another through nested systems."""
         source, target = edges[0].source, edges[-1].target
-        factor, offset = 1.0, 0.0
-        for edge in edges:
-            factor, offset = edge.factor * factor, edge.factor * offset + edge.offset
+        scale = reduce(Conversion.then, (Conversion(edge.factor, edge.offset) for edge in edges))
         with_units = any(self.connectors[edge.source].unit for edge in edges[1:])
         converted = {edge.convert_units for edge in edges}
-        if len(converted) > 1 or ((factor, offset) != (1.0, 0.0) and with_units):
+        if len(converted) > 1 or (scale != IDENTITY and with_units):
             raise self._error(
                 f"the connection to {str(target)!r} through a nested system is transformed between "
                 "connectors with units of their own, which is not supported; leave out the units of the "
                 "nested system's connectors."
             )
-        if not (source.component or target.component):
-            raise self._error(f"{str(source)!r} is connected to {str(target)!r} without a component between.")
-        delayed = any(edge.delayed for edge in edges)
-        return Connection(source, target, factor, offset, converted == {True}, delayed)
+        return Connection(source, target, *scale, converted == {True}, any(edge.delayed for edge in edges))
 
-    def flat_settings(self) -> dict[Endpoint, Setting]:
-        """Return values by variables of components; those of connectors of systems follow the connections.
 
-        Raises
-        ------
-        SspError
-            If a connector is set through which no value comes in, or whose value is transformed on its way.
-        """
-        found = {n: s for n, s in self._settings.items() if n.component in self.components}
-        outer = [node for node in self._settings if node.component not in self.components]
-        # Of a system inside another the outer one comes last, and counts.
-        for node in sorted(outer, key=lambda node: -len(node.component)):
-            found |= dict.fromkeys(self._behind(node), self._settings[node])
-        return found
+def _units(root: Any, kind: str) -> tuple[UnitInfo, ...]:
+    """Return the unit definitions of a document of a kind: "ssd" or "ssv"."""
+    found = []
+    for unit in root.iterfind(f"{kind}:Units/ssc:Unit", NAMESPACES):
+        base = unit.find("ssc:BaseUnit", NAMESPACES)
+        exponents = tuple(int(base.get(symbol, "0")) for symbol in BASE_UNITS)
+        factor, offset = float(base.get("factor", "1")), float(base.get("offset", "0"))
+        found.append(UnitInfo(unit.get("name"), exponents, factor, offset))
+    return tuple(found)
 
-    def _behind(self, node: Endpoint) -> Iterator[Endpoint]:
-        """Yield the variables of components that a connector of a system goes to."""
-        if self.connectors[node].kind not in _INWARD:
-            raise self._error(f"{str(node)!r} is set, but it is of the kind {self.connectors[node].kind}.")
-        for target, edge in self._edges.items():
-            if edge.source != node:
-                continue
-            if (edge.factor, edge.offset, edge.convert_units) != (1.0, 0.0, True):
-                raise self._error(
-                    f"{str(node)!r} is set and transformed on its way to {str(target)!r}; set that instead."
-                )
-            if target.component in self.components:
-                yield target
-            else:
-                yield from self._behind(target)
+
+def _path(*names: str) -> str:
+    """Return the names that lead to an element as one."""
+    return ".".join(filter(None, names))
+
+
+def _flag(element: Any, name: str) -> bool:
+    """Return a Boolean attribute; false where it is absent."""
+    return str(element.get(name, "false")).strip() in ("true", "1")
 
 
 def _annotation(element: Any) -> Any:

@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fmu_asset.archive.declared import BASE_UNITS, UnitInfo, VariableInfo
+from fmu_asset.archive.declared import BASE_UNITS, VariableInfo
 from fmu_asset.coupling.structure import Endpoint
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import rendered
@@ -68,35 +68,36 @@ def ssp_bytes(
 
     def connector(name: str, kind: str, end: Endpoint | None, unit: str | None) -> dict[str, Any]:
         """Return what is said of a connector with the type of the variable at an end."""
-        kind_of_value = None if end is None else wiring.variable(end).base_type
-        if end is not None and kind_of_value == "Enumeration":
-            enumerations[str(end)] = wiring.variable(end).items
-        return {
-            "name": name,
-            "kind": kind,
-            "type": kind_of_value,
-            "unit": unit if kind_of_value == "Real" and unit in units else None,
-            "enumeration": str(end) if kind_of_value == "Enumeration" else None,
-        }
+        variable = VariableInfo(name, 0, kind="") if end is None else wiring.variable(end)
+        said = {"name": name, "kind": kind, "type": variable.base_type}
+        if variable.base_type == "Real" and unit in units:
+            said["unit"] = unit
+        if variable.base_type == "Enumeration":
+            said["enumeration"] = str(end)
+            enumerations[str(end)] = variable.items
+        return said
 
-    outer, components = [], []
+    outer = []
     for item in structure.connectors:
-        there = wiring.outward.get(item.name)
-        behind = [there] if there else wiring.inward.get(item.name)
-        outer.append(
-            connector(item.name, item.kind, behind[0].end if behind else None, wiring.units[item.name])
-        )
+        ports = (*wiring.inward.get(item.name, ()), *filter(None, [wiring.outward.get(item.name)]))
+        end = ports[0].end if ports else None
+        outer.append(connector(item.name, item.kind, end, wiring.units[item.name]))
+    ends = dict.fromkeys(end for link in structure.connections for end in (link.source, link.target))
+    components = []
     for component in structure.components:
-        ends = (end for link in structure.connections for end in (link.source, link.target))
-        used = dict.fromkeys(end for end in ends if end.component == component.name)
-        variables = [(end, _connectable(wiring.variable(end))) for end in used]
+        variables = {end: wiring.variable(end) for end in ends if end.component == component.name}
+        if other := [v for v in variables.values() if v.causality not in _CONNECTOR_KINDS]:
+            raise SspError(
+                f"The variable {other[0].name!r} is declared as {other[0].causality}, which SSP 1.0 has no "
+                "connector for."
+            )
         components.append(
             {
                 "name": component.name,
                 "source": _resource(component.name),
                 "implementation": _IMPLEMENTATIONS[wiring.declared[component.name].interface],
                 "substeps": component.substeps,
-                "connectors": [connector(v.name, v.causality, end, v.unit) for end, v in variables],
+                "connectors": [connector(v.name, v.causality, end, v.unit) for end, v in variables.items()],
             }
         )
     values = {
@@ -125,30 +126,19 @@ def _resource(component: str) -> str:
     return f"resources/{plain}.fmu"
 
 
-def _connectable(variable: VariableInfo) -> VariableInfo:
-    if variable.causality not in _CONNECTOR_KINDS:
-        raise SspError(
-            f"The variable {variable.name!r} is declared as {variable.causality}, which SSP 1.0 has no "
-            "connector for."
-        )
-    return variable
-
-
 def _known_units(wiring: Wiring) -> dict[str, dict[str, float]]:
     """Return the units that can be written: with exponents, and meaning the same in all FMUs."""
     found: dict[str, list[dict[str, float]]] = {}
     of_fmus = (unit for fmu in wiring.declared.values() for unit in fmu.units)
     for unit in (*wiring.structure.units, *of_fmus):
-        if unit.exponents is not None and (base := _base(unit)) not in found.setdefault(unit.name, []):
+        if unit.exponents is None:
+            continue
+        base: dict[str, float] = {s: n for s, n in zip(BASE_UNITS, unit.exponents, strict=True) if n}
+        if (unit.factor, unit.offset) != (1.0, 0.0):
+            base |= {"factor": unit.factor, "offset": unit.offset}
+        if base not in found.setdefault(unit.name, []):
             found[unit.name].append(base)
     return {name: bases[0] for name, bases in sorted(found.items()) if len(bases) == 1}
-
-
-def _base(unit: UnitInfo) -> dict[str, float]:
-    base: dict[str, float] = {s: n for s, n in zip(BASE_UNITS, unit.exponents or (), strict=True) if n}
-    if (unit.factor, unit.offset) != (1.0, 0.0):
-        base |= {"factor": unit.factor, "offset": unit.offset}
-    return base
 
 
 def _parameters(
@@ -156,10 +146,10 @@ def _parameters(
 ) -> list[dict[str, Any]]:
     """Return the parameters, in the FMUs' own units: no conversion stands between file and value."""
     found: dict[str, dict[str, Any]] = {}
-    for component in wiring.structure.components:
-        for variable_name, setting in sorted(component.settings.items()):
-            end = Endpoint(component.name, variable_name)
-            variable, value = wiring.variable(end), wiring.number(end, setting)
+    for component, values in wiring.settings.items():
+        for variable_name, value in sorted(values.items()):
+            end = Endpoint(component, variable_name)
+            variable = wiring.variable(end)
             name, kind = names.get(end, str(end)), variable.base_type
             if name in found:
                 raise SspError(

@@ -17,7 +17,14 @@ from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
 from twin_master.mission.loop import ended_sentence, fly
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth, checked_values, decided_to_end
+from twin_master.mission.truth import (
+    DamageGrowth,
+    SensorStatus,
+    Truth,
+    checked_values,
+    decided_to_end,
+    inspected,
+)
 from twin_master.mission.turns import History
 from twin_master.network.estimator import Notice
 from twin_master.network.step_many import decide_many, filter_step_many, rationed
@@ -99,9 +106,9 @@ class _Stateless:
         self._growth = DamageGrowth(knowledge.true_model)
         self._noise = np.stack([truth.noise for truth in truths])
         self._uniform = np.stack([truth.uniform for truth in truths])
-        self._truths = truths
+        self._reading_noise = np.stack([truth.reading_noise for truth in truths])
         self._truth = truths[0]  # script, drift and losses are the scenario's, the same for all
-        self._before: list[tuple[int | None, int | None]] = [(None, None)] * len(assets)
+        self._before: tuple[Index | None, Index | None] = None, None
         self._seen: dict[tuple[int, int, bytes], Float | str] = {}
         self.failure: dict[int, str] = {}
 
@@ -119,19 +126,16 @@ class _Stateless:
                 distinct[row] = shown
         observed = distinct[inverse] + self._noise[:, step] + self._truth.drift[step]
         observed[:, self._truth.status[step] == SensorStatus.LOST] = np.nan
-        turns = zip(self._truths, state, control.tolist(), strict=True)
-        return np.hstack((observed, [truth.inspected(step, *turn) for truth, *turn in turns])), state
+        read = inspected(self._scenario.readings, state, control) + self._reading_noise[:, step]
+        return np.hstack((observed, read)), state
 
     def _grown(self, step: int, control: Index) -> tuple[Index, Float]:
         """Return the true states: their numbers (B,), zeros where they are scripted, and levels (B, F)."""
         if self._scenario.truth.kind == "scripted":
             state = self._truth.state(step, None, None)
             return np.zeros_like(control), np.broadcast_to(state, (len(control), len(state)))
-        uniform = self._uniform[:, step].tolist()
-        moved = zip(self._before, uniform, strict=True)
-        grown = [self._growth.following(*before, value) for before, value in moved]
-        self._before = list(zip(control.tolist(), grown, strict=True))
-        place = np.array(grown)
+        place = self._growth.following(*self._before, self._uniform[:, step])
+        self._before = control, place
         return place, self._states.coordinates[place]
 
     def _shown(self, step: int, asset: int, control: int, state: Float) -> Float | str:
@@ -185,7 +189,8 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
             worst = knowledge.sensor_model.worst_residuals(observed[twin], int(control[twin]))
             plants.failure[twin] = str(ImpossibleObservation(scenario.mission.name, step, worst))
         flying &= ~impossible
-        log_filtered[impossible] = model.log_prior  # of a failed twin: anything that can be gone on with
+        # Of a failed twin: anything that can be gone on with.
+        filtered[impossible], log_filtered[impossible] = model.prior, model.log_prior
         for array, row in (
             (flights.observed, observed[:, : scenario.observation.count]),
             (flights.control_index, control),

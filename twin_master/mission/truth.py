@@ -1,8 +1,8 @@
 """What really happens: damage, noise and faults, and the flown asset that is driven by them."""
 
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
 Float = NDArray[np.float64]
-
+Index = NDArray[np.int64]
 
 _DECIMALS = 12
 """Sums of scripted gains are rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
@@ -121,8 +121,17 @@ class Truth:
 
     def inspected(self, step: int, state: Float, control: int) -> Float:
         """Return the readings of inspections in a step: (I,), SI, NaN where the control asks for none."""
-        read = [state[place] if action == control else np.nan for action, place, *_ in self._readings]
-        return np.asarray(np.array(read) + self.reading_noise[step])
+        read = inspected(self._readings, state[None], np.array([control]))[0]
+        return np.asarray(read + self.reading_noise[step])
+
+
+def inspected(readings: Sequence[Sequence[Any]], state: Float, control: Index) -> Float:
+    """Return what inspections would read without noise (B, I) of states (B, F) under controls (B,), SI.
+
+    It is NaN where the control asks for none.
+    """
+    read = [np.where(control == action, state[:, place], np.nan) for action, place, *_ in readings]
+    return np.array(read).reshape(-1, len(control)).T
 
 
 StateRule = Callable[[int, "Float | None", "int | None"], Float]
@@ -154,17 +163,29 @@ class DamageGrowth:
 
     def __init__(self, model: GraphicalModel) -> None:
         self._model = model
-        self._rows: dict[tuple[int, int] | None, tuple[list[float], list[int]]] = {}
+        self._rows: dict[tuple[int, int] | None, tuple[Float, Index]] = {}
 
-    def following(self, control: int | None, index: int | None, uniform: float) -> int:
-        """Return the index of the state that follows one under a control; both are None at the first step."""
-        key = None if control is None or index is None else (control, index)
+    def following(self, control: Index | None, index: Index | None, uniform: Float) -> Index:
+        """Return the indices (B,) of the states that follow states (B,) under controls (B,).
+
+        Both are None at the first step.
+        """
+        if control is None or index is None:
+            return self._reached(None, uniform)
+        result, code = np.empty_like(index), control * self._model.states.size + index
+        for number in np.unique(code).tolist():
+            chosen = code == number
+            result[chosen] = self._reached(divmod(number, self._model.states.size), uniform[chosen])
+        return result
+
+    def _reached(self, key: tuple[int, int] | None, uniform: Float) -> Index:
         if key not in self._rows:
             row = self._model.prior if key is None else self._model.transition.row(*key)
             possible = np.flatnonzero(row > 0.0)
-            self._rows[key] = np.cumsum(row[possible]).tolist(), possible.tolist()
-        reached, possible_states = self._rows[key]
-        return possible_states[min(bisect_right(reached, uniform), len(possible_states) - 1)]
+            self._rows[key] = np.cumsum(row[possible]), possible
+        reached, possible = self._rows[key]
+        place = np.searchsorted(reached, uniform, side="right").clip(max=len(possible) - 1)
+        return np.asarray(possible[place])
 
 
 def _random_growth(model: GraphicalModel, uniform: Float) -> StateRule:
@@ -172,9 +193,9 @@ def _random_growth(model: GraphicalModel, uniform: Float) -> StateRule:
     states, growth = model.states, DamageGrowth(model)
 
     def rule(step: int, previous_state: Float | None, previous_control: int | None) -> Float:
-        before = None if previous_state is None else states.index(tuple(previous_state))
-        state: Float = states.coordinates[growth.following(previous_control, before, uniform[step])].copy()
-        return state
+        before = None if previous_state is None else np.array([states.index(tuple(previous_state))])
+        control = None if previous_control is None else np.array([previous_control])
+        return np.asarray(states.coordinates[growth.following(control, before, uniform[[step]])][0])
 
     return rule
 

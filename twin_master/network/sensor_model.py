@@ -14,7 +14,7 @@ from scipy.special import ndtr
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.quantity import QuantityModel
-from twin_master.network.sensor_kernels import log_densities
+from twin_master.network.sensor_kernels import log_densities, separated
 
 __all__ = ["GaussianSensorModel", "PredictiveCheck", "check_noise"]
 
@@ -173,7 +173,12 @@ class GaussianSensorModel(QuantityModel):
         self.averages_inside = average == "inside"
         with np.errstate(divide="ignore"):
             self._log_weight: Float = np.log(self.draw_weight)
-        self._by_control = np.ascontiguousarray(self.value_per_draw.transpose(2, 1, 3, 0))
+        self._mean = np.ascontiguousarray(self.mean.transpose(1, 0, 2))
+        values = self.value_per_draw.transpose(2, 1, 3, 0)
+        beside = (values - self._mean[..., None]) * by_control[..., None]
+        size = float(np.max(np.abs(values) * by_control[..., None]))
+        part, self._function = separated(beside.reshape(-1, self.draw_count), size)
+        self._part = np.ascontiguousarray(part).reshape(*self._mean.shape, len(self._function))
 
     def checked(self, observation: ArrayLike) -> Float:
         """Return observations (..., G) in which NaN stands for a lost sensor.
@@ -267,11 +272,15 @@ class GaussianSensorModel(QuantityModel):
             )
         if control.size and (control.min() < 0 or control.max() >= self.control_count):
             raise InvalidModelError(f"expected control indices between 0 and {self.control_count - 1}")
-        result = np.empty((len(observations), self.state_count, draws))
-        log_densities(
-            observations, control, self._by_control, self._inverse_deviation, self._log_scale,
-            self._scaled_interval, self._log_weight, self.averages_inside and draws == 1, result,
-        )  # fmt: skip
+        inside = self.averages_inside and draws == 1
+        result = np.zeros((len(observations), self.state_count, draws))
+        for sensors in np.eye(self.sensor_count, dtype=bool) if inside else [np.array([True])]:
+            found = np.empty_like(result)
+            log_densities(
+                np.where(sensors, observations, np.nan), control, self._mean, self._part, self._function,
+                self._inverse_deviation, self._log_scale, self._scaled_interval, self._log_weight, found,
+            )  # fmt: skip
+            result += found
         return result
 
     def nearest(

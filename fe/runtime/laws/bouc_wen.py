@@ -3,13 +3,11 @@
 Parameters: k, z_y, n. Memory: z. NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from .interface import HEAD, FloatArray, PortForce, power
 
 
-@dataclass(frozen=True, slots=True)
 class BoucWen(PortForce):
     """Bouc-Wen hysteresis: F = stiffness (z - x), z' = v (1 - (1 + sgn(v z)) / 2 |z / z_y|^order).
 

@@ -3,13 +3,11 @@
 Parameters: k, d. No memory. NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from .interface import FloatArray, PortForce
 
 
-@dataclass(frozen=True, slots=True)
 class FreePlay(PortForce):
     """F = -stiffness clip(x, -half_width, half_width): the port's spring is absent inside the gap.
 

@@ -24,7 +24,6 @@ strength : float
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -41,7 +40,6 @@ HEAD = 5
 """Columns of a memory before its hysteretic elements."""
 
 
-@dataclass(frozen=True, slots=True)
 class PortForce(Primitive):
     """A primitive that acts at a port."""
 

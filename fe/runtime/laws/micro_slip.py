@@ -4,7 +4,6 @@ Parameters: k, count n of Jenkins elements in parallel; slip displacements d_i o
 stretches z_i. NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -16,7 +15,6 @@ MOST_ELEMENTS = 10_000
 """Far more than the curve of a joint can show."""
 
 
-@dataclass(frozen=True, slots=True)
 class MicroSlip(PortForce):
     """Iwan's joint: `element_count` Jenkins elements in parallel in place of a spring of `stiffness`.
 
@@ -47,7 +45,7 @@ class MicroSlip(PortForce):
 
     def check(self) -> None:
         """Raise `InvalidPatchError` where a number cannot be."""
-        super(MicroSlip, self).check()
+        super().check()
         self.require("1 + chi", 1.0 + self.chi, positive=True)
         self.require("-chi", -self.chi, positive=False)
         if self.element_count > MOST_ELEMENTS:

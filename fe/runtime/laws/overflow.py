@@ -5,7 +5,6 @@ v0. Alone at a port of speed s it takes s' = -strength (s - l)^n, which has a cl
 imports only: this file is copied into the FMU.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -13,7 +12,6 @@ import numpy as np
 from .interface import FloatArray, PortForce, power
 
 
-@dataclass(frozen=True, slots=True)
 class Overflow(PortForce):
     """F = coefficient ((v - level) / v0)^exponent where v > level, v0 = `reference_velocity`; else zero."""
 

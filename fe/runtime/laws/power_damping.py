@@ -5,7 +5,6 @@ takes s' = -strength |s|^p sgn s, which has a closed form. NumPy and relative im
 copied into the FMU.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -13,7 +12,6 @@ import numpy as np
 from .interface import FloatArray, PortForce, power
 
 
-@dataclass(frozen=True, slots=True)
 class PowerDamping(PortForce):
     """F = coefficient |v / v0|^velocity_exponent |x / x0|^displacement_exponent sgn v.
 

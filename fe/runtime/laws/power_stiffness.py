@@ -4,14 +4,12 @@ Parameters: c, n, side (0: both), x0. No memory. NumPy and relative imports only
 FMU.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from ..errors import InvalidPatchError
 from .interface import FloatArray, PortForce, power
 
 
-@dataclass(frozen=True, slots=True)
 class PowerStiffness(PortForce):
     """F = coefficient |x / x0|^exponent sgn x; `side` 0: both signs of x, +1 or -1: that sign only.
 
@@ -28,7 +26,7 @@ class PowerStiffness(PortForce):
 
     def check(self) -> None:
         """Raise `InvalidPatchError` where a number cannot be."""
-        super(PowerStiffness, self).check()
+        super().check()
         if abs(self.side) > 1:
             raise InvalidPatchError(f"side of {self.kind!r} must lie from -1 to 1, but is {self.side:g}.")
 

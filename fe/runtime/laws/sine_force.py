@@ -3,7 +3,6 @@
 Parameters: c, k, p. No memory. NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -11,7 +10,6 @@ import numpy as np
 from .interface import FloatArray, PortForce
 
 
-@dataclass(frozen=True, slots=True)
 class SineForce(PortForce):
     """F = coefficient sin(wave_number x + phase), against x; m g l sin x brings a pendulum back to x = 0."""
 

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.errors import DegenerateFilterError, PosteriorError
 from calibration.paper.particle_filter import kernel_density, normal_reference_bandwidth, particle_filter
-from calibration.static.errors_in_variables import exact_posterior, log_ratio_density
+from calibration.static.errors_in_variables import exact_posterior, pair_log_likelihoods
 from calibration.static.experiments import published_measurements
 from calibration.static.posterior import GaussianPrior
 from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of
@@ -41,7 +41,7 @@ def test_table_1_of_the_paper(seed):
 
 def test_kernel_likelihoods_tend_to_the_density_of_the_ratio():
     grid = np.linspace(0.93, 1.09, 33)
-    exact = np.exp(log_ratio_density(PUBLISHED_LINE, DATA, grid))
+    exact = np.exp(pair_log_likelihoods(PUBLISHED_LINE, DATA, grid, "ratio"))
     found = particle_filter(DATA, seed=3, particle_count=300_000)
     for density, expected in zip(found.likelihood, exact, strict=True):
         assert (

@@ -12,7 +12,7 @@ from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.static.errors_in_variables import (
     exact_posterior,
     log_likelihood,
-    log_ratio_density,
+    pair_log_likelihoods,
 )
 from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import GaussianPrior
@@ -37,7 +37,7 @@ def test_pair_likelihoods_equal_quadrature_over_the_true_displacement(measure):
         brute *= k
     if measure == "ratio":
         brute *= 575.2
-        ours = log_ratio_density(PUBLISHED_LINE, DATA, FACTORS)
+        ours = pair_log_likelihoods(PUBLISHED_LINE, DATA, FACTORS, "ratio")
         assert ours == pytest.approx(np.log(brute), abs=1e-8)
     total = log_likelihood(PUBLISHED_LINE, DATA, FACTORS, measure=measure)
     assert total == pytest.approx(np.log(brute).sum(axis=0), abs=1e-7)

@@ -39,6 +39,7 @@ from fe.runtime.patch import (
 )
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.planform_forces import STATION_PORTS
+from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import load_design
 
 NONE = ModelPatch()
@@ -76,8 +77,15 @@ def matrices(model: WingModel, conditions: Conditions, patch: ModelPatch = NONE)
     return structure.stiffness, structure.mass, alpha * structure.mass + beta * structure.stiffness
 
 
+def lift_at(model: WingModel, load_factor: float, patch: ModelPatch = NONE) -> Any:
+    return np.array((load_factor, load_factor**2)) @ model.wing.load_parts(patch)
+
+
 def output_rows(model: WingModel, patch: ModelPatch = NONE) -> Any:
-    return np.array([model.wing.output_row(name, 0, patch) for name, _ in OUTPUTS])
+    factors = model.wing.strain_factors(patch)
+    rows = np.array([model.wing.output_row(name) for name, _ in OUTPUTS])
+    gauges = [strain_gauge(name) for name, _ in OUTPUTS]
+    return rows if factors is None else rows * np.where(np.array(gauges) < 0, 1.0, factors[gauges])[:, None]
 
 
 def test_it_is_a_model(model: WingModel) -> None:
@@ -101,7 +109,7 @@ def test_at_rest_it_is_the_solution_of_the_matrices(model: WingModel, conditions
     row = model.wing.force_row("tip_load", patch)
     for trial, changes, structure, loads in (
         (STATIC, patch, patch, [force * row for force in STATIC.force]),
-        (FLIGHT, lift, NONE, [model.wing.load(n, lift) for n in FLIGHT.load_factor]),
+        (FLIGHT, lift, NONE, [lift_at(model, n, lift) for n in FLIGHT.load_factor]),
     ):
         u = np.linalg.solve(matrices(model, conditions, structure)[0], np.transpose(loads))
         response = model.respond(trial, OUTPUTS, changes, conditions)
@@ -128,7 +136,7 @@ def test_each_row_has_its_own_health_and_temperature(model: WingModel, condition
         parameters = conditions.parameters.copy()
         parameters[0] *= 1.0 - 1e-3 * temperature
         stiffness = matrices(model, Conditions(parameters, health=losses[None]))[0]
-        wanted = output_rows(model) @ np.linalg.solve(stiffness, model.wing.load(n))
+        wanted = output_rows(model) @ np.linalg.solve(stiffness, lift_at(model, n))
         assert values[row] == pytest.approx(wanted, rel=1e-9)
 
 
@@ -157,7 +165,7 @@ def test_a_cubic_spring_over_the_planform_solves_the_equations_of_all_unknowns(
     stiffness, *_ = matrices(model, conditions)
     row, rows = (
         model.wing.force_row("tip_load"),
-        np.stack([model.wing.port_row(port) for port in STATION_PORTS]),
+        np.stack([model.wing.port_rows[port] for port in STATION_PORTS]),
     )
     share = model.wing.planform.share
     values = model.respond(STATIC, OUTPUTS, patch, conditions).values

@@ -26,6 +26,7 @@ from fe.runtime.patch import (
     Washout,
 )
 from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.wing_rows import EMPTY
 from fe.wing.design import WingDesign
 from fe.wing.operators import (
     AffineOperators,
@@ -66,6 +67,10 @@ def patched(*primitives: Primitive) -> ModelPatch:
     return ModelPatch(primitives)
 
 
+def load(wing: PatchedWing, load_factor: float, patch: ModelPatch = EMPTY) -> FloatArray:
+    return np.array((load_factor, load_factor**2)) @ wing.load_parts(patch)
+
+
 def compare(wing: PatchedWing, reduced: FloatArray, operators: AffineOperators, full: FloatArray) -> None:
     strain = operators.gauge_output @ full
     assert np.abs(wing.arrays.strain_rows[0] @ reduced - strain).max() <= STRAIN * np.abs(strain).max()
@@ -80,7 +85,7 @@ def solved(operators: AffineOperators, loads: FloatArray, stiffness: Any = None)
 
 def compare_loads(wing: PatchedWing, structure: Any, operators: AffineOperators, matrix: Any = None) -> None:
     """Compare under the lift of 2.5 g and under a force at the tip."""
-    loads = (wing.load(2.5), 2.5 * operators.load_lift), (wing.force_row("tip_load"), operators.load_tip)
+    loads = (load(wing, 2.5), 2.5 * operators.load_lift), (wing.force_row("tip_load"), operators.load_tip)
     for reduced, full in loads:
         compare(wing, structure.static(reduced), operators, solved(operators, full, matrix))
 
@@ -105,12 +110,12 @@ def test_without_a_patch_it_is_the_reduced_model_within_its_error_bound(
         response = model.static_response(
             young_modulus_factor=e, stiffness_loss=loss, load_factor=factor, tip_force=force
         )
-        u = wing.structure(e, loss, *MASSES).static(wing.load(factor) + force * wing.force_row("tip_load"))
+        u = wing.structure(e, loss, *MASSES).static(load(wing, factor) + force * wing.force_row("tip_load"))
         scale = np.abs(response.strain).max()
         strain = wing.arrays.strain_rows[0] @ u
         assert np.abs(strain - response.strain).max() <= response.strain_error_bound + 3e-4 * scale
         assert float(wing.arrays.tip_row @ u) == pytest.approx(response.displacement[0], rel=5e-4)
-        frequency = wing.structure(e, loss, *MASSES).modes(3)[0] / (2.0 * np.pi)
+        frequency = wing.structure(e, loss, *MASSES).modes(3).frequency
         names = ("servo_mass", "pitot_mass")
         modes = model.modes({"young_modulus_factor": e, **dict(zip(names, MASSES, strict=True))}, loss)
         assert frequency == pytest.approx(modes.frequency[:3], rel=FREQUENCY)
@@ -124,7 +129,7 @@ def test_root_compliance_is_a_softer_root_spring(wing: PatchedWing, design: Wing
     structure = wing.structure(*STATE, *MASSES, patched(RootCompliance(compliance)))
     compare_loads(wing, structure, operators)
     wanted = frequencies(operators.stiffness(FACTOR, STATE[1]), operators.mass(point_masses(*MASSES)))
-    assert structure.modes(3)[0] == pytest.approx(wanted, rel=FREQUENCY)
+    assert 2.0 * np.pi * structure.modes(3).frequency == pytest.approx(wanted, rel=FREQUENCY)
 
 
 @pytest.mark.parametrize(("first", "last", "loss"), [(5, 6, 0.5), (2, 5, 0.3), (7, 10, 0.6)])
@@ -146,7 +151,7 @@ def test_local_loss_between_mesh_lines_is_softer_cells(
     structure = wing.structure(*STATE, *MASSES, patch)
     compare_loads(wing, structure, operators, stiffness.tocsr())
     wanted = frequencies(stiffness.tocsr(), operators.mass(point_masses(*MASSES)))
-    frequency = structure.modes(3)[0]
+    frequency = 2.0 * np.pi * structure.modes(3).frequency
     assert frequency[[0, 2]] == pytest.approx(wanted[[0, 2]], rel=FREQUENCY)  # flapwise
     assert frequency[1] == pytest.approx(wanted[1], rel=1e-3)
 
@@ -176,8 +181,8 @@ def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(
     strain = operators.gauge_output @ before
     wanted = operators.gauge_output @ after / strain
     patch = patched(LocalStiffnessLoss(loss, start, end - start))
-    plain = wing.structure(1.0, (0.0, 0.0), *MASSES).static(wing.load(1.0))
-    u = wing.structure(1.0, (0.0, 0.0), *MASSES, patch).static(wing.load(1.0))
+    plain = wing.structure(1.0, (0.0, 0.0), *MASSES).static(load(wing, 1.0))
+    u = wing.structure(1.0, (0.0, 0.0), *MASSES, patch).static(load(wing, 1.0))
     factors = wing.strain_factors(patch)
     ratio = factors * (wing.arrays.strain_rows[0] @ u) / (wing.arrays.strain_rows[0] @ plain)
     scale = np.abs(strain) / np.abs(strain).max()
@@ -219,13 +224,13 @@ def test_point_mass_is_a_pitot_tube_that_was_moved(wing: PatchedWing, design: Wi
         mass = operators.mass(point_masses(MASSES[0], added))
         wanted = frequencies(operators.stiffness(FACTOR, STATE[1]), mass)
         patch = patched(PointMass(added, station * wing.span))
-        frequency = wing.structure(*STATE, MASSES[0], 0.0, patch).modes(3)[0]
+        frequency = wing.structure(*STATE, MASSES[0], 0.0, patch).modes(3).frequency * 2.0 * np.pi
         assert frequency == pytest.approx(wanted, rel=FREQUENCY)
 
 
 def test_temperature_is_a_change_of_the_modulus_factor(wing: PatchedWing, operators: AffineOperators) -> None:
     patch = patched(ModulusTemperature(2e-3))
-    u = wing.structure(*STATE, *MASSES, patch, 25.0).static(wing.load(1.0))
+    u = wing.structure(*STATE, *MASSES, patch, 25.0).static(load(wing, 1.0))
     warm = operators.stiffness({"young_modulus_factor": STATE[0] * 0.95}, STATE[1])
     full = solved(operators, operators.load_lift, warm)
     compare(wing, u, operators, full)
@@ -326,7 +331,7 @@ def test_washout_is_another_lift_distribution(
     wanted = solved(operators, factor * (operators.load_lift + changed - plain))
     lifted = (changed - plain) * (_weight(operators, design) / z_force)
     lifted_full = solved(operators, factor * lifted * _upwards(operators))
-    u = wing.structure(*STATE, *MASSES).static(wing.load(factor, patched(Washout(coefficient, exponent))))
+    u = wing.structure(*STATE, *MASSES).static(load(wing, factor, patched(Washout(coefficient, exponent))))
     compare(wing, u, operators, wanted + lifted_full)
 
 
@@ -358,7 +363,7 @@ def test_inertia_relief_is_weight_where_it_lies(
     weight = -STANDARD_GRAVITY * (mass @ up)
     fraction, factor = 0.2, 2.5
     full = solved(operators, factor * (operators.load_lift + fraction * weight * up))
-    u = wing.structure(*STATE, *MASSES).static(wing.load(factor, patched(InertiaRelief(fraction))))
+    u = wing.structure(*STATE, *MASSES).static(load(wing, factor, patched(InertiaRelief(fraction))))
     compare(wing, u, operators, full)
 
 
@@ -373,7 +378,7 @@ def test_a_turned_gauge_follows_from_the_three_components(
     turned = gauge_output(operators.wing_mesh, angle)
     full = solved(operators, operators.load_lift)
     wanted = turned @ (operators.expansion @ full)
-    u = wing.structure(*STATE, *MASSES).static(wing.load(1.0))
+    u = wing.structure(*STATE, *MASSES).static(load(wing, 1.0))
     along, across, shear = wing.arrays.strain_rows @ u
     c, s = np.cos(angle), np.sin(angle)
     scale = np.abs(operators.gauge_output @ full).max()
@@ -381,7 +386,7 @@ def test_a_turned_gauge_follows_from_the_three_components(
 
 
 def test_outputs_by_name(wing: PatchedWing) -> None:
-    u = wing.structure(*STATE, *MASSES).static(wing.load(1.0))
+    u = wing.structure(*STATE, *MASSES).static(load(wing, 1.0))
     elastic = float(wing.arrays.line_chord[0])
     tip = wing.output_row("tip_displacement")
     there = wing.output_row(f"displacement[{wing.span}, {elastic}]")
@@ -424,10 +429,10 @@ def test_no_change_is_no_change_to_the_last_bit(wing: PatchedWing) -> None:
     assert np.array_equal(one.stiffness, other.stiffness)
     assert np.array_equal(one.mass, other.mass)
     loads = patched(LoadPlace(0.0, 0.0), Washout(0.0, 2.0), InertiaRelief(0.0))
-    assert np.array_equal(wing.load(2.0, loads), wing.load(2.0))
+    assert np.array_equal(load(wing, 2.0, loads), load(wing, 2.0))
     assert np.array_equal(wing.force_row("tip_load", loads), wing.force_row("tip_load"))
     factors = wing.strain_factors(nothing)
-    assert factors is None or np.array_equal(factors, np.ones(wing.gauge_count))
+    assert factors is None or np.array_equal(factors, np.ones(len(wing.arrays.gauge_stations)))
 
 
 @settings(max_examples=25, deadline=None)
@@ -468,7 +473,5 @@ def test_impossible_changes_are_refused(wing: PatchedWing, patch: ModelPatch, me
 def test_impossible_places_are_refused(wing: PatchedWing) -> None:
     with pytest.raises(InvalidPatchError, match="place 'nose' is not known"):
         wing.force_row("nose")
-    with pytest.raises(InvalidPatchError, match="no port 'nose'"):
-        wing.port_row("nose")
     with pytest.raises(InvalidPatchError, match="must not be negative"):
-        wing.load(1.0, patched(Washout(0.1, -1.0)))
+        load(wing, 1.0, patched(Washout(0.1, -1.0)))

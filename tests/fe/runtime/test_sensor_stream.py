@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,8 +21,7 @@ from fe.runtime.patch import (
     SensorRotation,
     ThermalStrain,
 )
-from fe.runtime.sensor_stream import Sample, SensorStream, high_pass_step
-from fe.runtime.sensors import SensorRecord, apply_sensors
+from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, high_pass_step
 
 CHANNELS = (("strain[1]", "strain"), ("strain[2]", "strain"), ("tip_displacement", "displacement"))
 PATCH = ModelPatch(
@@ -49,12 +50,14 @@ def test_samples_are_the_rows_of_the_whole_record(kind: str) -> None:
         CHANNELS, kind, since if dynamic else start + since, start, temperature, release=0.05
     )
     expected, _ = apply_sensors(PATCH, record, values, None, across, shear)
-    stream = SensorStream(PATCH, CHANNELS, dynamic, start, 0.05)
     memory = None
     shown = []
     for row in range(count):
-        sample = Sample(values[row], start + since[row], temperature[row], across[row], shear[row])
-        read, memory = stream.read(sample, memory, interval)
+        one = replace(record, time=record.time[row : row + 1], temperature=temperature[row : row + 1])
+        filters = FilterMemory(memory, interval)
+        parts = (part[row : row + 1] for part in (across, shear))
+        (read,), _ = apply_sensors(PATCH, one, values[row : row + 1], None, *parts, memory=filters)
+        memory = filters.after
         shown.append(read)
         assert len(memory) == (7 if dynamic else 0)  # signal and stages: 3 of one gauge, then 2 of each gauge
     np.testing.assert_allclose(shown, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
@@ -87,4 +90,4 @@ def test_filter_is_that_of_whole_records() -> None:
 @pytest.mark.parametrize("item", [HighPass("*", 0.0), HighPass("*", 1.0, 1.5), HighPass("*", 1.0, 5.0)])
 def test_filters_that_cannot_be_remembered_are_refused(item: HighPass) -> None:
     with pytest.raises(InvalidPatchError, match="sample by sample"):
-        SensorStream(ModelPatch((item,)), CHANNELS, True, 0.0, 0.0)
+        FilterMemory(None, 0.1).filtered(item, np.zeros((1, 2)))

@@ -39,7 +39,7 @@ from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.packing.patch_file import SCHEMA, PatchFile, parse_patch
 from fmu_asset.packing.patched_runtime import output_channels, plain_effects
 from fmu_asset.packing.structure_fmu import build_fmu
-from fmu_asset.slaves.effect_variables import active_primitives, effect_rows, numbers_of
+from fmu_asset.slaves.effects import active_primitives, effect_rows, numbers_of
 from tests.command_line import command
 
 BIN = Path(sys.executable).parent

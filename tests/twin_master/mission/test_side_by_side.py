@@ -176,5 +176,6 @@ def test_damage_grows_with_the_probabilities_of_the_model(library_file: Path) ->
     uniform = (np.arange(2000) + 0.5) / 2000
     for control in (0, 1):
         row = knowledge.model.transition.row(control, 6)
-        found = np.bincount([growth.following(control, 6, value) for value in uniform.tolist()], minlength=25)
+        before = np.full(len(uniform), control), np.full(len(uniform), 6)
+        found = np.bincount(growth.following(*before, uniform), minlength=25)
         np.testing.assert_allclose(found / 2000, row, atol=1.5 / 2000)
