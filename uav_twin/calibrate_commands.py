@@ -8,6 +8,7 @@ import typer
 
 from reporting import terminal
 from uav_twin.calibrate_laboratory import calibrate_ringdown, calibrate_simulate
+from uav_twin.options import refuse_before
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
@@ -169,19 +170,8 @@ def calibrate_wing(
     A lab folder may hold one step alone; the sub-commands fit ring-downs, make a lab folder of a virtual
     wing, and calibrate any model from a campaign.
     """
-    given = (data, out, asset, design, measured)
     if context.invoked_subcommand is not None:
-        if (
-            any(value is not None for value in given)
-            or seed
-            or fitted
-            or no_report
-            or json
-            or procedure is not ProcedureName.joint
-        ):
-            raise typer.BadParameter(
-                f"options go behind the command: calibrate {context.invoked_subcommand} ..."
-            )
+        refuse_before(context)
         return
     if measured and data is None:
         raise typer.BadParameter("--measured needs --data with ring-down records.")

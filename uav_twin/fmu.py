@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -12,6 +12,9 @@ from uav_twin.options import FmiVersion, Kind, Replace, StepTimeout
 from uav_twin.simulated import simulate
 from uav_twin.structure_model import fmu as build_structure
 from uav_twin.structure_model import names_structure
+
+if TYPE_CHECKING:
+    from fmu_asset.compiled.compiler import Platform
 
 
 def bind(
@@ -190,24 +193,18 @@ def _build_wing(
 ) -> None:
     """Pack a wing, tailored where it was calibrated."""
     from fe.wing.design import load_design
-    from fmu_asset.compiled.compiler import find_compiler, find_cross_compiler
     from fmu_asset.packing.contents import checked_target
     from fmu_asset.packing.patch_file import load_patch
-    from fmu_asset.packing.structure_fmu import check_kind, check_version
+    from fmu_asset.packing.structure_fmu import check_form
     from fmu_asset.packing.wing_packing import pack_wing
 
     kind, fmi, interface, windows = form
     out = checked_target(out, replace=replace)
-    check_version(kind, fmi, interface)
-    effects = None if patch is None else load_patch(patch)
-    if effects is not None:
-        check_kind(kind)
     if windows and kind != "compiled":
         raise typer.BadParameter("--windows is for --kind compiled.")
-    if kind == "compiled":  # before the wing is modelled, which can take a minute
-        find_compiler()
-    if windows:
-        find_cross_compiler()
+    platforms: tuple[Platform, ...] = ("linux64", "win64") if windows else ("linux64",)
+    effects = None if patch is None else load_patch(patch)
+    check_form(kind, fmi, interface, patched=effects is not None, platforms=platforms)
     tailored = None
     if calibration is None:
         shape = load_design(design)
@@ -226,7 +223,7 @@ def _build_wing(
         activate=activate,
         fmi=fmi,
         interface=interface,
-        platforms=("linux64", "win64") if windows else ("linux64",),
+        platforms=platforms,
         replace=replace,
         progress=terminal.progress(),
     )

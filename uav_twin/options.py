@@ -5,6 +5,16 @@ from typing import Annotated, Literal
 
 import typer
 
+
+def refuse_before(context: typer.Context) -> None:
+    """Refuse options that stand before a sub-command, which would not see them; raises `BadParameter`."""
+    sources = map(context.get_parameter_source, context.params)
+    if any(source is not None and source.name == "COMMANDLINE" for source in sources):
+        raise typer.BadParameter(
+            f"options go behind the command: {context.info_name} {context.invoked_subcommand} ..."
+        )
+
+
 Replace = Annotated[bool, typer.Option("--replace", help="Replace a file that exists.")]
 Design = Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")]
 Effects = Annotated[

@@ -9,6 +9,7 @@ import typer
 
 from reporting import terminal
 from uav_twin.structure_model import File, MemoryLimit, assembled, assembled_of_any, field, fmu, reduce
+from uav_twin.verify import Check, end_with, print_checks
 
 if TYPE_CHECKING:
     from fe.structure.affine import DesignedStructure
@@ -200,41 +201,35 @@ def verify(
         terminal.progress().stage("CalculiX on the same mesh"),
     ):
         agreement = structure_agreement(structure, out or Path(scratch), modes)
-    rows = list(_differences(agreement))
-    broken = [row for row in rows if not row[2] <= row[3]]
+    checks = list(_differences(agreement))
     if json:
         terminal.print_json(
             {
                 "checks": [
-                    dict(zip(("of", "what", "difference", "limit"), row, strict=True)) for row in rows
+                    {"of": check.group, "what": check.name, "difference": check.value, "limit": check.limit}
+                    for check in checks
                 ],
                 "frequencies": {key: getattr(agreement.modes, key).tolist() for key in ("ours", "calculix")},
-                "passed": not broken,
+                "passed": all(check.passed for check in checks),
             }
         )
     else:
-        table = [
-            (of, what, f"{value:.2g}", f"{limit:g}", "kept" if value <= limit else "BROKEN")
-            for of, what, value, limit in rows
-        ]
-        headings = ("of", "what", "difference", "limit", "verdict")
-        terminal.print_table(headings, table)
+        print_checks(checks)
         if out is not None:
             terminal.say(f"Wrote the decks and results of CalculiX to {out}")
-    if broken:
-        names = "; ".join(f"{of}, {what}" for of, what, _, _ in broken)
-        typer.echo(f"{len(broken)} of {len(rows)} checks broke their limit: {names}.", err=True)
-        raise typer.Exit(1)
+    end_with(checks)
 
 
-def _differences(agreement: "StructureAgreement") -> Iterator[tuple[str, str, float, float]]:
+def _differences(agreement: "StructureAgreement") -> Iterator[Check]:
     for load in agreement.loads:
-        yield f"load {load.load}", "nodal displacements", load.field, DISPLACEMENT_LIMIT
+        of = f"load {load.load}"
+        yield Check(of, "nodal displacements", load.field, DISPLACEMENT_LIMIT)
         if load.output is not None:
-            yield f"load {load.load}", "displacement outputs", load.output, DISPLACEMENT_LIMIT
+            yield Check(of, "displacement outputs", load.output, DISPLACEMENT_LIMIT)
         if load.strain is not None:
-            yield f"load {load.load}", "gauge strains", load.strain, STRAIN_LIMIT
-    yield f"{len(agreement.modes.ours)} modes", "frequencies", agreement.modes.relative, FREQUENCY_LIMIT
+            yield Check(of, "gauge strains", load.strain, STRAIN_LIMIT)
+    modes = agreement.modes
+    yield Check(f"{len(modes.ours)} modes", "frequencies", modes.relative, FREQUENCY_LIMIT)
 
 
 structure_app.command("reduce")(reduce)

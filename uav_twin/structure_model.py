@@ -213,23 +213,20 @@ def fmu(
 ) -> None:
     """Pack the reduced model of a structure as an FMU; equal input gives equal bytes."""
     from fe.structure.design import load_structure
-    from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.packing.contents import checked_target
-    from fmu_asset.packing.structure_fmu import build_fmu, check_version
+    from fmu_asset.packing.structure_fmu import build_fmu, check_form
     from fmu_asset.structures.binding import structure_binding_text
     from fmu_asset.structures.rig import rig_text
     from reporting.files import atomic_write_text
 
     version: Literal[2, 3] = 3 if fmi == 3 else 2
-    check_version(kind, version)
+    check_form(kind, version)
     if version == 3 and (binding is not None or rig is not None):
         raise typer.BadParameter("--binding and --rig are for FMI 2.0; `uav-twin fmu bind` drafts a binding.")
     target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
     _check_targets(located(file), target, {"binding": binding, "rig": rig}, replace=replace)
     design = load_structure(located(file))
     text = None if rig is None else rig_text(design, relpath(target, rig.parent))
-    if kind == "compiled":
-        find_compiler()  # before the structure is reduced, which can take minutes
     model = reduced(file, memory_limit)
     info = build_fmu(model, target, kind=kind, fmi=version, replace=replace)
     terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")

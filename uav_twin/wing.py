@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
-from uav_twin.options import Design
+from uav_twin.options import Design, refuse_before
 from uav_twin.verify import verify
 
 if TYPE_CHECKING:
@@ -36,8 +36,7 @@ def wing(
 ) -> None:
     """Say what the wing weighs, how it vibrates and how stiff its tip is."""
     if context.invoked_subcommand is not None:
-        if design is not None or vtu is not None or json:
-            raise typer.BadParameter(f"options go behind the command: wing {context.invoked_subcommand} ...")
+        refuse_before(context)
         return
     from fe.reduction.model_cache import reduced_model
     from fe.wing.design import load_design

@@ -73,14 +73,16 @@ def find_compiler() -> list[str]:
     )
 
 
-def find_cross_compiler() -> list[str]:
-    """Return the command of the compiler for 64-bit Windows.
+def compiler_for(platform: Platform) -> list[str]:
+    """Return the command of the compiler for a platform.
 
     Raises
     ------
     FmuBuildError
         If there is none.
     """
+    if platform == PLATFORM:
+        return find_compiler()
     program = shutil.which(CROSS_COMPILER)
     if program is None:
         raise FmuBuildError(
@@ -119,7 +121,7 @@ def compile_library(
             f"Compiled FMUs are built on {PLATFORM} only, but this is {fmi_platform}; build with --kind "
             "source and compile the FMU with `fmpy compile`."
         )
-    compiler = find_compiler() if platform == "linux64" else find_cross_compiler()
+    compiler = compiler_for(platform)
     with tempfile.TemporaryDirectory(prefix="uav-twin-cc-") as folder:
         for name, content in sources.items():
             (Path(folder) / name).write_bytes(content)

@@ -16,7 +16,7 @@ from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
-from fmu_asset.compiled.compiler import PLATFORM, Platform
+from fmu_asset.compiled.compiler import PLATFORM, Platform, compiler_for
 from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError
@@ -139,7 +139,7 @@ def fmu_bytes(
     platforms: Sequence[Platform] = (PLATFORM,),
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
-    check_version(kind, fmi, interface)
+    check_form(kind, fmi, interface, patched=patch is not None, platforms=platforms)
     values = start_values(model, state) if state is not None else {}
     values |= {name: float(value) for name, value in (start or {}).items()}
     try:
@@ -148,7 +148,6 @@ def fmu_bytes(
         raise FmuBuildError(f"The FMU of the structure {model.name} cannot be built: {error}.") from error
     effects = []
     if patch is not None:
-        check_kind(kind)
         effects = plain_effects(patch.for_outputs(output_channels(model.gauge_count)))
         values |= {switch_of(effect): float(activate) for effect in effects}
         table += effect_rows(effects, len(table), values)
@@ -199,22 +198,42 @@ def _units(table: tuple[FmuVariable, ...]) -> tuple[Unit, ...]:
     return (*known, *(Unit(name) for name in others))
 
 
-def check_kind(kind: FmuKind) -> None:
-    """Refuse a kind of FMU that cannot carry missing effects; raises `PatchFileError`."""
-    if kind != "python":
-        raise PatchFileError(
-            f"The FMU of the kind {kind!r} cannot carry missing effects: build the kind 'python' with this "
-            "patch."
-        )
+def check_form(
+    kind: FmuKind,
+    fmi: FmiVersion = 2,
+    interface: Interface = "co-simulation",
+    *,
+    patched: bool = False,
+    platforms: Sequence[Platform] = (PLATFORM,),
+) -> None:
+    """Refuse an FMU that cannot be made here; asked before a model is reduced, which can take minutes.
 
+    Parameters
+    ----------
+    kind, fmi, interface, platforms
+        See `build_fmu`.
+    patched : bool
+        Whether it is to carry missing effects.
 
-def check_version(kind: FmuKind, fmi: FmiVersion, interface: Interface = "co-simulation") -> None:
-    """Refuse what a kind of FMU cannot be; raises `FmuBuildError`."""
+    Raises
+    ------
+    FmuBuildError
+        The kind is not of that version of FMI, or a compiler is missing.
+    PatchFileError
+        The kind cannot carry missing effects.
+    """
     if kind == "python" and (fmi, interface) != (2, "co-simulation"):
         raise FmuBuildError(
             f"The FMU of the kind 'python' is of FMI 2.0 for co-simulation, but FMI {fmi}.0 for {interface} "
             "was asked for: build the kind 'compiled' or 'source'."
         )
+    if patched and kind != "python":
+        raise PatchFileError(
+            f"The FMU of the kind {kind!r} cannot carry missing effects: build the kind 'python' with this "
+            "patch."
+        )
+    for platform in platforms if kind == "compiled" else ():
+        compiler_for(platform)
 
 
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:

@@ -224,16 +224,12 @@ class WingFmuSource(FmuSource):
         return super().binding().with_regions(self._of.design().regions)
 
     def _effects(self) -> tuple[str, ...]:
-        from fmu_asset.compiled.compiler import find_compiler
-        from fmu_asset.packing.structure_fmu import check_kind
+        from fmu_asset.packing.structure_fmu import check_form
         from twin_master.assets.patches import effect_names
 
-        if self._packed == "compiled":
-            find_compiler()  # before the wing is reduced, which can take minutes
+        check_form(self._packed, patched=self._of.patch_path is not None)
         if self._of.patch_path is None:
             return ()
-        if self._packed == "compiled":
-            check_kind(self._packed)
         return effect_names(self._of.patch_path, len(self._of.design().gauges.positions))
 
     def _check_calibration(self, binding: "Binding", effects: tuple[str, ...]) -> None:

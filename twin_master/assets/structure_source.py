@@ -133,10 +133,9 @@ class StructureFmuSource(FmuSource):
         return structure_binding(self._design(), frequencies_observed(self._scenario))
 
     def _check_calibration(self, binding: "Binding", effects: tuple[str, ...]) -> None:
-        from fmu_asset.compiled.compiler import find_compiler
+        from fmu_asset.packing.structure_fmu import check_form
 
-        if self._section.packed == "compiled":
-            find_compiler()  # before the structure is reduced, which can take minutes
+        check_form(self._section.packed)
         believes_it = isinstance(self._scenario.belief, AssetBelief)
         check_parameter(self._scenario, self._design(), self.path(FLOWN_COPY) if believes_it else None)
 
