@@ -300,4 +300,3 @@ class Wiring:
         if wrong:
             raise CouplingError(f"{end} cannot be set to {value!r}: it is of the type {variable.kind}.")
         return number
-
