@@ -33,7 +33,7 @@ from calibration.dynamics.records import read_records
 from calibration.geometry import read_lengths
 from calibration.result.file import load_calibration
 from calibration.static.experiments import read_measurements
-from calibration.wing.laboratory import read_weighed_mass
+from calibration.wing.lab_data import read_weighed_mass
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.files.patch import read_patch

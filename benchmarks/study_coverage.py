@@ -25,8 +25,7 @@ from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, RingDownError
 from calibration.joint.measurement import measured_modes
 from calibration.joint.posterior import joint_posterior
-from calibration.joint.prior import MODEL_ERROR, wing_priors
-from calibration.joint.wing_table import WingTable, tabulate_wing
+from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, wing_priors
 from calibration.paper.procedure import fit_masses
 from calibration.result.record import STATE, Reading, prior_samples
 from calibration.static.errors_in_variables import exact_posterior

@@ -26,7 +26,7 @@ from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.assets.resolution import Overrides
-from twin_master.mission.journal import JOURNAL_NAME, read_records
+from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch import teaching, trial
 from twin_master.watch.feeds import file_feed
@@ -81,11 +81,11 @@ def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
         watch.run(file_feed(run / "run.nc", watch.scenario), lambda _decision: None, search=search)
     finally:
         os.close(lock)
-    records = [record for record, _ in read_records(folder / JOURNAL_NAME)]
-    turns = [record for record in records if "filtered" in record]
+    lines = [record for record, *_ in records(folder / JOURNAL_NAME)]
+    turns = [record for record in lines if "filtered" in record]
     filtered, chosen = (np.array([turn[key] for turn in turns]) for key in ("filtered", "next_control"))
     mean = filtered @ watch.models[0].knowledge.model.states.coordinates
-    return Watched(mean, chosen == watch.scenario.control_names.index("3g"), records)
+    return Watched(mean, chosen == watch.scenario.control_names.index("3g"), lines)
 
 
 def said(records: list[dict[str, Any]]) -> tuple[str, int]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.dynamics.records import RingDownRecord
-from calibration.joint.prior import weighed
+from calibration.joint.wing_table import weighed
 from calibration.result.record import Reading
 from calibration.static.experiments import (
     DISPLACEMENT_STANDARD_DEVIATION,
@@ -277,17 +277,12 @@ def measure_lengths(
         Half-width of the 95 % interval of a reading [m].
     """
     generator = np.random.default_rng(child_seed(seed, _PURPOSES["geometry"]))
-    measured = {}
+    measured = []
     for drawn in published_lengths():
-        error = float(generator.normal(0.0, reading_uncertainty / HALF_WIDTH_95))
-        length = getattr(geometry, drawn.name) + error
-        measured[drawn.name] = MeasuredLength(
-            drawn.name,
-            drawn.designed if designed is None else getattr(designed, drawn.name),
-            length,
-            reading_uncertainty=reading_uncertainty,
-        )
-    return Lengths(**measured)
+        length = getattr(geometry, drawn.name) + generator.normal(0.0, reading_uncertainty / HALF_WIDTH_95)
+        intended = drawn.designed if designed is None else getattr(designed, drawn.name)
+        measured.append(MeasuredLength(drawn.name, intended, length, drawn.tolerance, reading_uncertainty))
+    return Lengths(*measured)
 
 
 def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> Reading:

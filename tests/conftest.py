@@ -216,8 +216,7 @@ def synthetic_calibration(
     """A calibration drawn from Gaussians, for a design 2 mm longer than the shipped one, on a coarse mesh."""
     import xarray as xr
 
-    from calibration.joint.prior import wing_priors
-    from calibration.joint.wing_table import QUANTITIES
+    from calibration.joint.wing_table import QUANTITIES, wing_priors
     from calibration.result.record import Calibration, Reading
     from fe.wing.design import load_design
 

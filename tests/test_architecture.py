@@ -46,7 +46,7 @@ ROOMS = {
         "packing", "companions", "structures", "coupling", "check", "ssp",
     ),
     "calibration": (
-        "errors", "lab_folder", "static", "result", "geometry", "dynamics", "published_strains", "joint",
+        "errors", "lab_folder", "static", "result", "geometry", "dynamics", "joint",
         "virtual_wing", "paper", "wing",
     ),
     "twin_master": (

@@ -33,13 +33,13 @@ def calibrate_ringdown(
     ] = None,
 ) -> None:
     """Natural frequencies and damping ratios of two modes from ring-down records."""
-    from calibration.dynamics.extremes import refine_by_extremes
     from calibration.dynamics.records import read_records
     from calibration.dynamics.ringdown import FIRST_PEAK, Frequencies
     from calibration.dynamics.trials import (
         PUBLISHED_DAMPING_RATIOS,
         PUBLISHED_FREQUENCIES,
         fit_trials,
+        refine_by_extremes,
     )
 
     procedure = Frequencies.FITTED if fitted else Frequencies.PEAKS
@@ -162,7 +162,7 @@ def _measure(
 ) -> None:
     """Do all experiments on a bench and write the laboratory folder."""
     from calibration.virtual_wing import measure_lengths, measure_load_test, measure_ring_down, weigh
-    from calibration.wing.laboratory import write_lab_folder
+    from calibration.wing.lab_data import write_lab_folder
 
     write_lab_folder(
         out,

@@ -8,7 +8,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 FloatArray = NDArray[np.float64]
@@ -127,11 +127,6 @@ class Solution(NamedTuple):
         )
 
 
-def damped_waves(pole: ComplexArray, time: ArrayLike) -> ComplexArray:
-    """Return exp(s t), instants [s] by poles."""
-    return np.asarray(np.exp(np.multiply.outer(time, pole)))
-
-
 class DampedCosines:
     """Damped cosines and a line against one record of one or more signals, each with noise of its own.
 
@@ -218,7 +213,9 @@ class DampedCosines:
     def _waves(self, pole: ComplexArray) -> ComplexArray:
         s = np.minimum(pole.real, _GREATEST_GROWTH / self._time[-1]) + 1j * pole.imag
         half = 0.5 * s * self._width
-        return np.asarray((np.sinh(half) / half if self._width else 1.0) * damped_waves(s, self._time))
+        return np.asarray(
+            (np.sinh(half) / half if self._width else 1.0) * np.exp(np.multiply.outer(self._time, s))
+        )
 
     def _basis(self, wave: ComplexArray) -> FloatArray:
         return np.hstack([wave.real, -wave.imag, self._line])

@@ -275,7 +275,16 @@ def _ambient(record: FloatArray, rate: float, lags: int, modes: int) -> _Found:
 
     def covariances(chosen: list[int]) -> list[FloatArray]:
         poles = found.pole[chosen]
-        long = _long_blocks(each, length / rate, float(np.max(-1.0 / poles.real)))
+        # blocks that last as long as the modes remember, by taking some together
+        memory = float(np.max(-1.0 / poles.real))
+        together = int(np.ceil(memory * rate / length))
+        count = BLOCKS // together
+        if count < _FEWEST_BLOCKS:
+            raise ExperimentDataError(
+                f"a mode dies away in {memory:.3g} s, and the record of {size / rate:.3g} s holds that less "
+                f"than {_FEWEST_BLOCKS} times, too few for a covariance: record longer."
+            )
+        long = each[: count * together].reshape(count, together, *whole.shape).mean(axis=1)
         moved = [subspace.moved(_STEP * (one - whole), order, poles) for one in long]
         changes = [
             (np.array([other.values(at) for other in moved]) - found.values(pole)) / _STEP
@@ -284,18 +293,6 @@ def _ambient(record: FloatArray, rate: float, lags: int, modes: int) -> _Found:
         return [change.T @ change / (len(long) * (len(long) - 1)) for change in changes]
 
     return found, covariances
-
-
-def _long_blocks(each: FloatArray, duration: float, memory: float) -> FloatArray:
-    """Return the correlations of blocks that last as long as the modes remember, by taking some together."""
-    together = int(np.ceil(memory / duration))
-    count = len(each) // together
-    if count < _FEWEST_BLOCKS:
-        raise ExperimentDataError(
-            f"a mode dies away in {memory:.3g} s, and the record of {len(each) * duration:.3g} s holds that "
-            f"less than {_FEWEST_BLOCKS} times, too few for a covariance: record longer."
-        )
-    return np.asarray(each[: count * together].reshape(count, together, *each.shape[1:]).mean(axis=1))
 
 
 def _decay(record: FloatArray, rate: float, lags: int) -> _Found:

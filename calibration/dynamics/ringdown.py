@@ -123,25 +123,6 @@ def spectrum(
     return np.asarray(frequency[inside], dtype=np.float64), amplitude
 
 
-def _noise_floor(record: RingDownRecord, band: tuple[float, float]) -> float:
-    """Return the median amplitude of the noise in a spectrum [V].
-
-    A Hann window, of mean square 3/8, hides a mode that dies away at the record's start.
-    """
-    weight = np.hanning(record.count) / math.sqrt(0.375)
-    amplitude = 2.0 / record.count * np.abs(np.fft.rfft(weight * detrend(record.signal)))
-    frequency = np.fft.rfftfreq(record.count, 1.0 / record.sampling_rate)
-    return float(np.median(amplitude[(frequency >= band[0]) & (frequency <= band[1])]))
-
-
-def _smallest_peak(record: RingDownRecord) -> float:
-    """Return the share of the highest amplitude from which a peak counts."""
-    signal = detrend(record.signal)
-    end = signal[-max(int(_END_SHARE * record.count), 8) :]
-    left = math.sqrt(2.0 * float(np.mean(end**2))) / float(np.abs(signal).max())
-    return min(max(left, _SMALLEST_PEAK[0]), _SMALLEST_PEAK[1])
-
-
 def spectral_peaks(record: RingDownRecord, band: tuple[float, float] = SEARCH_BAND) -> tuple[float, float]:
     """Return the two most prominent peaks of the spectrum, by ascending frequency [Hz].
 
@@ -178,10 +159,18 @@ def _peaks(record: RingDownRecord, band: tuple[float, float], decay: float) -> l
     of the first; the decay [1/s] takes both away and moves no frequency.
     """
     weight = np.exp(-decay * (record.time - record.time[0]))
-    floor = _noise_floor(record, band) * math.sqrt(float(np.mean(weight**2)))
+    # The noise in a spectrum: a Hann window, of mean square 3/8, hides a mode that dies away at the start.
+    window = np.hanning(record.count) / math.sqrt(0.375)
+    noise = 2.0 / record.count * np.abs(np.fft.rfft(window * detrend(record.signal)))
+    place = np.fft.rfftfreq(record.count, 1.0 / record.sampling_rate)
+    floor = float(np.median(noise[(place >= band[0]) & (place <= band[1])]))
+    floor *= math.sqrt(float(np.mean(weight**2)))
     faded = RingDownRecord(record.time, weight * detrend(record.signal), source=record.source)
     frequency, amplitude = spectrum(faded if decay else record, band)
-    needed = max(_PROMINENCE * floor, _smallest_peak(faded) * float(amplitude.max()))
+    level = detrend(faded.signal)
+    end = level[-max(int(_END_SHARE * record.count), 8) :]
+    left = math.sqrt(2.0 * float(np.mean(end**2))) / float(np.abs(level).max())
+    needed = max(_PROMINENCE * floor, float(np.clip(left, *_SMALLEST_PEAK)) * float(amplitude.max()))
     places, found = find_peaks(amplitude, prominence=needed)
     return [float(frequency[places[place]]) for place in np.argsort(found["prominences"])[::-1]]
 

@@ -25,8 +25,7 @@ from calibration.static.posterior import GaussianPrior
 
 from .inference import Draws, FloatArray, infer
 from .measurement import check_readings
-from .prior import MODEL_ERROR, wing_priors
-from .wing_table import QUANTITIES, WingTable
+from .wing_table import MODEL_ERROR, QUANTITIES, WingTable, wing_priors
 
 _LIMIT_MARGIN = 0.01  # of the range of e
 _LARGEST_SHARE_AT_LIMIT = 0.05
@@ -99,20 +98,16 @@ def joint_posterior(
         return np.hstack([pairs, read - shown]), np.hstack([scatter, np.hypot(spread, relative * shown)])
 
     found = infer(priors, compare, seed=seed, count=count)
-    _refuse_limit(found.samples[:, 0], priors[0])
-    return found
-
-
-def _refuse_limit(factor: FloatArray, prior: ParameterPrior) -> None:
-    margin = _LIMIT_MARGIN * (prior.high - prior.low)
-    for limit in (prior.low, prior.high):
-        share = float(np.mean(np.abs(factor - limit) < margin))
+    limits = priors[0].low, priors[0].high
+    for limit in limits:
+        share = float(np.mean(np.abs(found.samples[:, 0] - limit) < _LIMIT_MARGIN * (limits[1] - limits[0])))
         if share > _LARGEST_SHARE_AT_LIMIT:
             raise OutsideValidityError(
                 f"{share:.0%} of the joint posterior of e is pressed against {limit:g}, where the model "
                 "ends: load test and frequencies contradict each other; check them, or allow the model a "
                 "larger error of its frequencies."
             )
+    return found
 
 
 def _refuse_negative(readings: Mapping[str, Reading]) -> None:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.paper.particle_filter import ParticlePosterior
+from calibration.paper.load_test import ParticlePosterior
 from calibration.result.record import Calibration
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
@@ -131,13 +131,10 @@ def write_table_1(rows: tuple[TableRow, ...], path: Path) -> Path:
     reporting.errors.FileNotWrittenError
         If the file cannot be written.
     """
-    columns: list[list[str]] = [[] for _ in _CSV_COLUMNS]
+    lines = []
     for row in rows:
-        paper = row.paper
-        values = (
-            *row.prior, *row.found, *row.paper_way, paper.mean, paper.standard_deviation, *row.differences,
-        )  # fmt: skip
+        found = row.paper.mean, row.paper.standard_deviation
+        values = (*row.prior, *row.found, *row.paper_way, *found, *row.differences)
         numbers = ["" if value is None else f"{value:.10g}" for value in values]
-        for column, cell in zip(columns, (row.name, *numbers, paper.source), strict=True):
-            column.append(cell)
-    return atomic_write_text(path, table_text(_CSV_COLUMNS, columns))
+        lines.append((row.name, *numbers, row.paper.source))
+    return atomic_write_text(path, table_text(_CSV_COLUMNS, [*zip(*lines, strict=True)]))

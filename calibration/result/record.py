@@ -331,27 +331,23 @@ class Calibration:
 
     # ------------------------------------------------------------ for a twin
 
-    def stratified_rows(self, name: str, count: int, seed: Seed) -> NDArray[np.int64]:
-        """Return which `count` samples to take, one from each of as many strata of one figure; (count,).
+    def stratified_draws(self, name: str, count: int, seed: Seed) -> Float:
+        """Return `count` draws of one figure, one from each of as many strata; (count,) [unit].
 
         Strata are of equal probability and in shuffled order: means of functions of this figure scatter far
-        less than with independent draws. Other figures of the same rows keep their correlation with it.
+        less than with independent draws.
 
         Raises
         ------
         CalibrationRecordError
             If the calibration has no figure of this name, or `count` is not 1 to `MOST_SAMPLES`.
         """
-        order = np.argsort(self.draws_of(name), kind="stable")
+        values = np.sort(self.draws_of(name))
         check_count(count, CalibrationRecordError)
         generator = np.random.default_rng(child_seed(seed, 0))
         probability = (np.arange(count) + generator.random(count)) / count
-        drawn = order[np.minimum((probability * len(order)).astype(np.int64), len(order) - 1)]
+        drawn = values[np.minimum((probability * len(values)).astype(np.int64), len(values) - 1)]
         return generator.permutation(drawn)
-
-    def stratified_draws(self, name: str, count: int, seed: Seed) -> Float:
-        """Return `count` draws of one figure, one from each of as many strata; see `stratified_rows`."""
-        return self.draws_of(name)[self.stratified_rows(name, count, seed)]
 
     def given(self, name: str, values: Float) -> dict[str, Float]:
         """Return what the other parameters are expected to be where one has these values (n,), [units].

@@ -27,7 +27,8 @@ the residuals of a run then have the covariance S I + k^2 R_0 1 1'.
 """
 
 import math
-from typing import Literal, get_args
+from itertools import pairwise
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,6 +45,9 @@ Measure = Literal["displacement", "load", "ratio"]
 
 GRID_SIZE = 2001
 """Points of the posterior's grid, over +-10 standard deviations."""
+
+NOTICEABLE_SCORE = 2.0
+"""Standard deviations from which a difference between runs, or a pair, is pointed out."""
 
 _REACH = 10.0  # standard deviations
 _LARGEST_PROBABILITY_OUTSIDE = 1e-4
@@ -170,8 +174,15 @@ def exact_posterior(
         As in `log_likelihood`.
     """
     prior = prior or GaussianPrior()
-    lower, upper = _first_window(curve, data, prior)
-    floor = lower
+    # the first window holds the prior and the estimate of each pair alone, where k(e) > 0
+    ratio = data.load / data.displacement
+    relative = data.load_standard_deviation / data.load
+    relative = 6.0 * (relative + data.displacement_standard_deviation / data.displacement)
+    ends = np.concatenate([ratio * np.maximum(1.0 - relative, 0.01), ratio * (1.0 + relative)])
+    alone = curve.young_modulus_factor(ends)
+    beyond = _REACH * prior.standard_deviation
+    lower, upper = min(prior.mean - beyond, alone.min()), max(prior.mean + beyond, alone.max())
+    floor = lower = max(lower, curve.young_modulus_factor(1e-3 * ratio.min()))
     for _ in range(60):
         grid = np.linspace(lower, upper, grid_size)
         log_density = prior.log_density(grid) + log_likelihood(
@@ -194,16 +205,47 @@ def exact_posterior(
     return posterior
 
 
-def _first_window(
-    curve: StiffnessCurve, data: LoadDisplacementData, prior: GaussianPrior
-) -> tuple[float, float]:
-    """Return a window of e that holds the prior and the estimate of each pair alone, where k(e) > 0."""
-    ratio = data.load / data.displacement
-    relative = data.load_standard_deviation / data.load
-    relative = 6.0 * (relative + data.displacement_standard_deviation / data.displacement)
-    ends = np.concatenate([ratio * np.maximum(1.0 - relative, 0.01), ratio * (1.0 + relative)])
-    alone = curve.young_modulus_factor(ends)
-    lower = min(prior.mean - _REACH * prior.standard_deviation, float(alone.min()))
-    upper = max(prior.mean + _REACH * prior.standard_deviation, float(alone.max()))
-    smallest = float(curve.young_modulus_factor(1e-3 * float(ratio.min())))
-    return max(lower, smallest), upper
+class FitQuality(NamedTuple):
+    """Residuals of the measured pairs at one stiffness.
+
+    Attributes
+    ----------
+    standardised_residual : (N,) array
+        (k x - f) / sqrt(R_f + k^2 R_x) [1]; positive where the wing bends more than the model.
+    remarks : tuple of str
+        Sentences on what disagrees; empty if nothing does.
+    """
+
+    standardised_residual: NDArray[np.float64]
+    remarks: tuple[str, ...]
+
+
+def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
+    """Judge the measured pairs, run by run, at one stiffness [N/m]."""
+    scatter = math.sqrt(float(residual_variance(data, stiffness)))
+    residual = data.displacement - data.load / stiffness
+    standardised = residual * stiffness / scatter
+    runs = []
+    for index in data.run_indices:
+        of_run = residual[data.run == index]
+        runs.append((index + 1, float(of_run.mean()), scatter / stiffness / math.sqrt(of_run.size)))
+    remarks = []
+    for (first, offset, error), (second, other, other_error) in pairwise(runs):
+        difference, deviation = abs(offset - other), math.hypot(error, other_error)
+        if difference > NOTICEABLE_SCORE * deviation:
+            remarks.append(
+                f"Loading runs {first} and {second} differ by {difference * 1e3:.2f} mm "
+                f"({difference / deviation:.1f} standard deviations): their offsets are "
+                f"{_signed(offset * 1e3)} mm and {_signed(other * 1e3)} mm, as if the zero of "
+                "the displacement had moved between them."
+            )
+    remarks.extend(
+        f"Pair {pair + 1} ({data.load[pair]:.3g} N, {data.displacement[pair] * 1e3:.3g} mm) lies "
+        f"{abs(standardised[pair]):.1f} standard deviations from the calibrated line."
+        for pair in np.flatnonzero(np.abs(standardised) > NOTICEABLE_SCORE)
+    )
+    return FitQuality(standardised, tuple(remarks))
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.2f}".replace("-", "−")

@@ -1,7 +1,7 @@
 """Tip stiffness as a function of the Young's modulus factor: Kapteyn et al. 2021, eq. (14)."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -37,12 +37,9 @@ class StiffnessCurve:
 
     polynomial: Chebyshev
     name: str
-    _slope: Chebyshev = field(init=False, repr=False)
-    _table: tuple[NDArray[np.float64], NDArray[np.float64]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        factors = np.linspace(self.lower, self.upper, _INVERSE_TABLE_SIZE)
-        stiffnesses = np.asarray(self.polynomial(factors))
+        stiffnesses, factors = self._table()
         rise = np.diff(stiffnesses)
         if not (np.all(np.isfinite(stiffnesses)) and stiffnesses[0] > 0.0 and np.all(rise > 0.0)):
             worst = int(np.argmin(rise))
@@ -51,8 +48,6 @@ class StiffnessCurve:
                 f"{stiffnesses[worst]:g} to {stiffnesses[worst + 1]:g} N/m between e = {factors[worst]:g} "
                 f"and {factors[worst + 1]:g}."
             )
-        object.__setattr__(self, "_slope", self.polynomial.deriv())
-        object.__setattr__(self, "_table", (stiffnesses, factors))
 
     @property
     def lower(self) -> float:
@@ -64,23 +59,27 @@ class StiffnessCurve:
         """Largest e of the range."""
         return float(self.polynomial.domain[1])
 
+    def _table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        factors = np.linspace(self.lower, self.upper, _INVERSE_TABLE_SIZE)
+        return np.asarray(self.polynomial(factors)), factors
+
     def stiffness(self, young_modulus_factor: ArrayLike) -> NDArray[np.float64]:
         """Return k(e) [N/m], elementwise."""
         factor = np.asarray(young_modulus_factor, dtype=float)
         inside = np.clip(factor, self.lower, self.upper)
-        return np.asarray(self.polynomial(inside) + (factor - inside) * self._slope(inside))
+        return np.asarray(self.polynomial(inside) + (factor - inside) * self.slope(inside))
 
     def slope(self, young_modulus_factor: ArrayLike) -> NDArray[np.float64]:
         """Return dk/de [N/m], elementwise."""
-        return np.asarray(self._slope(np.clip(young_modulus_factor, self.lower, self.upper)))
+        return np.asarray(self.polynomial.deriv()(np.clip(young_modulus_factor, self.lower, self.upper)))
 
     def young_modulus_factor(self, stiffness: ArrayLike) -> NDArray[np.float64]:
         """Return the inverse e(k), elementwise; `stiffness` in N/m."""
         value = np.asarray(stiffness, dtype=float)
-        stiffnesses = self._table[0]
+        stiffnesses, factors = self._table()
         inside = np.clip(value, stiffnesses[0], stiffnesses[-1])
-        end_slope = np.where(value < inside, self._slope(self.lower), self._slope(self.upper))
-        return np.asarray(np.interp(inside, *self._table) + (value - inside) / end_slope)
+        end_slope = np.where(value < inside, *self.slope([self.lower, self.upper]))
+        return np.asarray(np.interp(inside, stiffnesses, factors) + (value - inside) / end_slope)
 
 
 def stiffness_line(

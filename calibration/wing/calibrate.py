@@ -1,9 +1,7 @@
 """The calibration of a wing: from the measurements of its laboratory to what tailors its twin."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -11,8 +9,7 @@ from numpy.typing import NDArray
 
 from calibration.geometry import Lengths, tailored_design
 from calibration.joint.posterior import joint_posterior
-from calibration.joint.prior import wing_priors
-from calibration.joint.wing_table import QUANTITIES, tabulate_wing
+from calibration.joint.wing_table import QUANTITIES, tabulate_wing, wing_priors
 from calibration.paper.load_test import StaticCalibration, calibrate_static
 from calibration.paper.procedure import fit_masses
 from calibration.paper.table_1 import TableRow, table_1
@@ -25,9 +22,9 @@ from calibration.result.record import (
     check_name,
     prior_samples,
 )
+from calibration.static.errors_in_variables import assess_fit
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import child_seed
-from calibration.static.quality import assess_fit
 from calibration.static.stiffness_curve import PUBLISHED_LINE
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
@@ -147,6 +144,13 @@ def calibrate(
     prior = prior_samples(priors, SAMPLE_COUNT, seed)
     prior = np.column_stack([prior, table.outputs(prior)])
 
+    provenance = collect_provenance(
+        seed,
+        input_hashes={**lab.input_hashes, "design": drawn.hash},
+        packages=("calibration", "fe"),
+        distributions=("uav-twin", "numpy", "scipy", "scikit-fem"),
+    ).as_dict()
+
     def record(way: Procedure, state: Float) -> Calibration:
         lengths = _lengths(lab.lengths, len(state), seed)
         found = Calibration(
@@ -162,7 +166,7 @@ def calibrate(
             channels=_fits(static, float(state[:, 0].mean())),
             source="; ".join(origin.text for origin in lab.origins),
             seed=seed,
-            provenance=_provenance(lab, drawn, seed),
+            provenance=provenance,
             design_hash=tailored.hash,
             quantities=QUANTITIES,
             readings=_readings(lab),
@@ -173,16 +177,6 @@ def calibrate(
 
     ways = record("joint", joint.samples), record("paper", paper.samples)
     return WingCalibration(*ways, procedure, lab, model, static, published)
-
-
-def _provenance(lab: LabData, drawn: WingDesign, seed: int) -> Mapping[str, Any]:
-    """Return of what the calibration was made."""
-    return collect_provenance(
-        seed,
-        input_hashes={**lab.input_hashes, "design": drawn.hash},
-        packages=("calibration", "fe"),
-        distributions=("uav-twin", "numpy", "scipy", "scikit-fem"),
-    ).as_dict()
 
 
 def _fits(static: StaticCalibration, factor: float) -> tuple[ChannelFit, ...]:
@@ -222,18 +216,12 @@ def _readings(lab: LabData) -> tuple[Reading, ...]:
 
 def _measured(pairs: LoadDisplacementData) -> xr.Dataset:
     """Return the load test as arrays with units."""
-    columns = {
-        "load": (pairs.load, "N", pairs.load_standard_deviation),
-        "displacement": (pairs.displacement, "m", pairs.displacement_standard_deviation),
-        "run": (pairs.run, "1", 0.0),
-    }
-    return xr.Dataset(
-        {
-            name: (
-                "pair",
-                values,
-                {"units": unit, "long_name": f"{name} of the test", "deviation": deviation},
-            )
-            for name, (values, unit, deviation) in columns.items()
-        }
-    )
+    found = xr.Dataset()
+    for name, values, unit, deviation in (
+        ("load", pairs.load, "N", pairs.load_standard_deviation),
+        ("displacement", pairs.displacement, "m", pairs.displacement_standard_deviation),
+        ("run", pairs.run, "1", 0.0),
+    ):
+        attributes = {"units": unit, "long_name": f"{name} of the test", "deviation": deviation}
+        found[name] = "pair", values, attributes
+    return found

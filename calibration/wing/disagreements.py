@@ -1,14 +1,11 @@
 """What of the measurements the calibrated wing does not meet, a sentence each."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from calibration.dynamics.damped_cosine import RingDownMode
 from calibration.dynamics.trials import PUBLISHED_DAMPING_RATIOS, amplitude_dependence
 from calibration.result.record import Calibration
+from calibration.static.errors_in_variables import FitQuality
 from calibration.static.experiments import published_measurements
-from calibration.static.quality import FitQuality
 from reporting.words import plus_minus
 
 from .lab_data import LabData
@@ -67,23 +64,16 @@ def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
         key=lambda point: point.amplitude,
     )
     if len(points) >= 6:
+        figures = np.array([(p.frequency, 100 * p.damping_ratio, 1e3 * p.amplitude) for p in points])
         third = len(points) // 3
-        small, large = points[:third], points[-third:]
-        low, high = (float(np.mean([point.frequency for point in part])) for part in (large, small))
-        if abs(high / low - 1.0) > 0.003:
-            damping = [
-                100 * float(np.mean([point.damping_ratio for point in part])) for part in (large, small)
-            ]
+        large, small = figures[-third:].mean(axis=0).tolist(), figures[:third].mean(axis=0).tolist()
+        if abs(small[0] / large[0] - 1.0) > 0.003:
             found.append(
-                f"The wing is not linear: in windows of 0.8 s the first mode has {low:.3f} Hz and "
-                f"{damping[0]:.1f} % damping at {1e3 * _amplitude(large):.2g} mV, and {high:.3f} Hz and "
-                f"{damping[1]:.1f} % at {1e3 * _amplitude(small):.2g} mV. The linear model has one frequency."
+                f"The wing is not linear: in windows of 0.8 s the first mode has {large[0]:.3f} Hz and "
+                f"{large[1]:.1f} % damping at {large[2]:.2g} mV, and {small[0]:.3f} Hz and {small[1]:.1f} % "
+                f"at {small[2]:.2g} mV. The linear model has one frequency."
             )
     return found
-
-
-def _amplitude(points: Sequence[RingDownMode]) -> float:
-    return float(np.mean([point.amplitude for point in points]))
 
 
 def _percent(value: float) -> str:

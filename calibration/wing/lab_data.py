@@ -1,18 +1,21 @@
-"""What a lab folder holds for the three steps of the calibration, and what is published instead."""
+"""What a lab folder holds for the three steps of the calibration, written and read, or published."""
 
+import io
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from calibration.dynamics.extremes import refine_by_extremes
-from calibration.dynamics.records import STEP_FOLDER, find_records, read_records
+import numpy as np
+
+from calibration.dynamics.records import STEP_FOLDER, RingDownRecord, find_records, read_records
 from calibration.dynamics.ringdown import Frequencies
-from calibration.dynamics.trials import RingDownTrials, fit_trials
-from calibration.errors import ExperimentFileError
-from calibration.geometry import GEOMETRY_FILE, Lengths, published_lengths, read_lengths
+from calibration.dynamics.trials import RingDownTrials, fit_trials, refine_by_extremes
+from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, Lengths, published_lengths, read_lengths
 from calibration.joint.measurement import PUBLISHED_MODES, measured_modes
-from calibration.joint.prior import weighed
-from calibration.lab_folder import lab_place
+from calibration.joint.wing_table import weighed
+from calibration.lab_folder import lab_place, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
 from calibration.result.record import Reading
 from calibration.static.experiments import (
@@ -21,9 +24,99 @@ from calibration.static.experiments import (
     published_measurements,
     read_measurements,
 )
+from reporting.files import atomic_write_text
 from reporting.provenance import hash_file, hash_record
+from reporting.table_file import table_text
 
-from .laboratory import WEIGHED_MASS_FILE, read_weighed_mass
+WEIGHED_MASS_FILE = STEP_FOLDER / "weighed_mass.csv"
+"""The weighed total of servos and pitot tube [g]; the authors give theirs in the paper alone."""
+
+_WEIGHED_COLUMNS = ("mass", "standard_deviation")
+
+
+def write_lab_folder(
+    folder: Path,
+    *,
+    lengths: Lengths,
+    load_test: LoadDisplacementData,
+    records: Sequence[RingDownRecord],
+    total_mass: Reading | None = None,
+) -> tuple[Path, ...]:
+    """Write measurements as the readers of `calibration` take them; every file is whole or not there.
+
+    Parameters
+    ----------
+    folder : Path
+        Where `step1`, `step2` and `step3` are made.
+    lengths : Lengths
+        Lengths, to `step1/geometry_data.csv` [mm].
+    load_test : LoadDisplacementData
+        Pairs in the order of their runs, to `step2/load_displacement_measurements.csv` [N], [mm].
+    records : sequence of RingDownRecord
+        Records, to `step3/initialconditiondata_N.DAT`: time [s], spanwise signal [V], and a chordwise column
+        of zeros, because the wing model has no chordwise gauge.
+    total_mass : Reading, optional
+        Weighed total, to `step3/weighed_mass.csv` [g].
+
+    Returns
+    -------
+    tuple of Path
+        The files.
+
+    Raises
+    ------
+    reporting.errors.FileNotWrittenError
+        If a file cannot be written.
+    """
+
+    def write(name: Path, **columns: Iterable[float | str]) -> Path:
+        cells = [
+            [item if isinstance(item, str) else f"{item:.10g}" for item in of] for of in columns.values()
+        ]
+        return atomic_write_text(Path(folder) / name, table_text([*columns], cells))
+
+    designed, measured = ([1e3 * getattr(item, of) for item in lengths] for of in ("designed", "measured"))
+    files = [
+        write(GEOMETRY_FILE, parameter=PUBLISHED_NAMES, designed=designed, manufactured=measured),
+        write(MEASUREMENTS_FILE, load=load_test.load, displacement=load_test.displacement * 1e3),
+    ]
+    for number, record in enumerate(records, start=1):
+        table = np.column_stack([record.time, record.signal, np.zeros(record.count)])
+        lines = io.StringIO()
+        np.savetxt(lines, table, fmt=("%.6f", "%.9e", "%d"), delimiter="\t")
+        file = Path(folder) / STEP_FOLDER / f"initialconditiondata_{number}.DAT"
+        files.append(atomic_write_text(file, lines.getvalue()))
+    if total_mass is not None:
+        grams = [total_mass.value * 1e3], [total_mass.deviation * 1e3]
+        files.append(write(WEIGHED_MASS_FILE, **dict(zip(_WEIGHED_COLUMNS, grams, strict=True))))
+    return tuple(files)
+
+
+def read_weighed_mass(file: Path) -> Reading:
+    """Read the weighed total of a laboratory.
+
+    Raises
+    ------
+    ExperimentFileError
+        If the file cannot be read, lacks a column, has not exactly one row, or a cell is no number.
+    ExperimentDataError
+        If a figure is not a positive finite number of grams, or looks like kg.
+    """
+    table = lab_table(file, WEIGHED_MASS_FILE)
+    if len(table) != 1:
+        raise ExperimentFileError(
+            f"{file} needs a header `mass,standard_deviation` and one row in grams, and {len(table)} came."
+        )
+    mass, deviation = (float(table.positive_numbers(name, "a weighing")[0]) for name in _WEIGHED_COLUMNS)
+    for wrong, unit in ((mass < 10.0, "kg"), (mass > 1e5, "mg")):
+        if wrong:
+            raise ExperimentDataError(f"{file}: mass is {mass:g} g, which looks like {unit}: give it in g.")
+    if deviation >= mass:
+        raise ExperimentDataError(
+            f"{file}: the standard deviation, {deviation:g} g, must be less than the mass, {mass:g} g."
+        )
+    return weighed(1e-3 * mass, 1e-3 * deviation)
+
 
 Targets = Literal["measured", "published"]
 """Whose frequencies and damping ratios step 3 aims at."""
@@ -135,7 +228,11 @@ def read_lab_folder(
         hashes["load_test"] = pairs.sha256
         origins[2] = StepOrigin(2, True, f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs")
     if records and targets != "published":
-        found["trials"] = trials = _fitted(path, frequencies)
+        trials = fit_trials(read_records(path), frequencies)
+        if all(fit.record.lowest is not None for fit in trials.fits):
+            # extremes are averages of the signal; the middle of the ink is none
+            trials = refine_by_extremes(trials)
+        found["trials"] = trials
         modes = measured_modes(trials)
         hashes |= {f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)}
         names = records[0].name if len(records) == 1 else f"{records[0].name} to {records[-1].name}"
@@ -156,13 +253,6 @@ _PUBLISHED = {
     2: "not measured; published pairs (Kapteyn et al. 2021, Fig. 5)",
     3: "published frequencies and damping ratios (the authors' step 3)",
 }
-
-
-def _fitted(path: Path, frequencies: Frequencies) -> RingDownTrials:
-    records = read_records(path)
-    trials = fit_trials(records, frequencies)
-    # Of a record read off a plot the extremes are averages of the signal; the middle of the ink is none.
-    return refine_by_extremes(trials) if all(record.lowest is not None for record in records) else trials
 
 
 def _hash_of_lengths(lengths: Lengths) -> str:

@@ -11,8 +11,9 @@ from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_ports import LINEAR, FmuPorts
-from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State, is_affine
+from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
 from discrepancy.models.linear_system import solved
+from discrepancy.models.memory import Memory
 from discrepancy.models.port_coupling import coupled_motion, stepper
 from discrepancy.models.port_system import PortSystem
 from fe.runtime.motion import Laws
@@ -51,7 +52,7 @@ class FmuMotion:
         self._linear: dict[Hashable, bool] = {}
         self._units: dict[Hashable, float] = {}
         self._refinements: dict[Hashable, tuple[int, float]] = {}
-        self._frequencies: dict[Hashable, float] = {}
+        self._frequencies = Memory()
         self._silent: dict[Hashable, bool] = {}
         self._free_linear: dict[Hashable, bool] = {}
         self._resting: State | None = None
@@ -152,18 +153,15 @@ class FmuMotion:
         if self.description.scales.angular_frequency is not None:
             return self.description.scales.angular_frequency
         key = (trial.interval, len(trial.time))
-        if key not in self._frequencies:
-            self._frequencies[key] = self.measured_frequency(trial, self.nominal)
-        return self._frequencies[key]
+        return self._frequencies.get(key, lambda: self.measured_frequency(trial, self.nominal))
 
     def measured_frequency(self, trial: Trial, state: State) -> float:
         """Return what `angular_frequency` does, measured in a state at a trial's interval."""
         step = self.description.motion.step or trial.interval
         system = self.ports.system(state, step, len(trial.time)) if self._ports else None
-        if system is not None:
-            frequency, shape = system.modes(system.outputs[self.ports.x[0]], 0)
-            if len(frequency):
-                return float(frequency[np.argmax(shape / frequency**2)])
+        mode = None if system is None else system.most_flexible(self.ports.x[0], 0)
+        if mode is not None:
+            return mode[0]
         way = self.description.release
         if way is not None:
             kind = "displacement" if way.displacement is not None else "hold"
@@ -295,14 +293,16 @@ class FmuMotion:
         else:
             zero = self._runs.remembered((key, "zero"), lambda: answer([0.0] * len(loads)))
             self._silent.setdefault(kind, not np.any(zero))
-        if kind not in self._linear:
-            half = answer([0.5 * size for size in units])
-            self._linear[kind] = is_affine(zero, parts, half, LINEAR)
+        moved, result = [part - zero for part in parts], zero.copy()
+        if kind not in self._linear:  # half of all excitations gives half of the sum of what each gives
+            half = answer([0.5 * size for size in units]) - zero
+            size = np.atleast_2d(np.sum(np.abs(moved), axis=0)).max(axis=0)
+            allowed = LINEAR * size + 1e-12 * np.atleast_2d(np.abs(zero)).max(axis=0)
+            self._linear[kind] = bool(np.all(np.abs(half - 0.5 * np.sum(moved, axis=0)) <= allowed))
             if not self._linear[kind]:
                 return asked([value for _, value in loads])
-        result = zero.copy()
-        for (_, value), size, part in zip(loads, units, parts, strict=True):
-            result += value / size * (part - zero)
+        for (_, value), unit_size, part in zip(loads, units, moved, strict=True):
+            result += value / unit_size * part
         return result
 
     # ------------------------------------------------------------ laws
@@ -327,14 +327,8 @@ class FmuMotion:
         strength = float(np.max(np.abs(laws.values[:, 0])))
         exponents = np.round(np.clip(laws.values[:, 1:3], -9.0, 9.0), 1)  # what is rough needs shorter steps
         watched = sorted({*seen, *self.ports.x})
-        key = (
-            tuple(watched),
-            trial.kind,
-            trial.interval,
-            laws.ports,
-            laws.numbers.tobytes(),
-            exponents.tobytes(),
-        )
+        kinds = laws.ports, laws.numbers.tobytes(), exponents.tobytes()
+        key = (tuple(watched), trial.kind, trial.interval, *kinds)
         known, tried = self._refinements.get(key, (1, 0.0))
         if strength > 2.0 * tried:
             known = self._converged(laws, excite, known, watched)

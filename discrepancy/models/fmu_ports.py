@@ -147,8 +147,6 @@ class FmuPorts:
             stiffness = size / (still[1] - still[0])
             return stiffness, stiffness
         at_rest = 1.0 / float(system.gain()[column, number])
-        frequency, shape = system.modes(system.outputs[column], number)
-        if not len(frequency) or np.max(shape / frequency**2) * at_rest < 1e-6:
-            return at_rest, at_rest
-        first = int(np.argmax(shape / frequency**2))
-        return float(frequency[first] ** 2 / shape[first]), at_rest
+        frequency, shape = system.most_flexible(column, number) or (1.0, 0.0)
+        of_mode = shape / frequency**2
+        return (at_rest if of_mode * at_rest < 1e-6 else 1.0 / of_mode), at_rest

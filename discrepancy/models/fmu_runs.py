@@ -346,13 +346,3 @@ def binding_file(description: FmuModelDescription, folder: Path) -> Path | None:
     """Return the binding file that a description names, a shipped one or one seen from its folder."""
     given = description.binding
     return None if given is None else binding_files().get(given, folder / given)
-
-
-def is_affine(zero: FloatArray, parts: Sequence[FloatArray], half: FloatArray, tolerance: float) -> bool:
-    """Whether half of all excitations gives half of the sum of what each gives; columns by their size."""
-    expected = zero + 0.5 * sum((part - zero for part in parts), np.zeros_like(zero))
-    size = sum((np.abs(part - zero) for part in parts), np.zeros_like(zero))
-    if size.ndim == 2:
-        size = size.max(axis=0)
-    allowed = tolerance * size + 1e-12 * np.max(np.abs(zero), axis=0 if zero.ndim == 2 else None)
-    return bool(np.all(np.abs(half - expected) <= allowed))

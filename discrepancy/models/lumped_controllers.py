@@ -73,15 +73,11 @@ class Loop:
             )
         course = Course.of(trial.time, item.values + offset, item.hold)
         found: list[Load] = [(self.gains[0] * self.acts, course)]
-        if self._follows_slopes:
+        if self.gains[1] != 0.0 and section.derivative_of == "error":
             found.append((self.gains[1] * self.acts, _slope(course, trial, section)))
         if self.state is not None:
             found.append((np.eye(len(self.acts))[self.state], course))
         return found
-
-    @property
-    def _follows_slopes(self) -> bool:
-        return self.gains[1] != 0.0 and self.section.derivative_of == "error"
 
     def effort(self, loads: Sequence[Load]) -> Shown:
         """Return what it gives, from the `loads` of its reference (none where there is no reference)."""

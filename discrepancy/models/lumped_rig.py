@@ -22,6 +22,7 @@ from discrepancy.models.interface import Conditions, Place
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
 from discrepancy.models.lumped_sections import InputSection
+from discrepancy.models.memory import Memory
 from discrepancy.models.questions import LoadChange, place_among, release_of
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
@@ -70,7 +71,7 @@ class LumpedRig:
             self._change(change)
         self._eigen: tuple[FloatArray, FloatArray, int] | None = None
         self._parts["damping"] = self._damping(self._parts["mass"], self._parts["stiffness"])
-        self._systems: dict[tuple[str, ...], SecondOrderSystem] = {}
+        self._systems = Memory()
         self._constant = sum(
             (self._vector(item.vector, item.through, item.name) for item in description.load),
             np.zeros(self.width),
@@ -136,17 +137,11 @@ class LumpedRig:
             row = whole
         return np.asarray(self.factors.get(name, 1.0) * row)
 
-    def system(self, drives: tuple[str, ...] = ()) -> SecondOrderSystem:
-        """Return the system with the motions of some inputs prescribed."""
-        if drives not in self._systems:
-            self._systems[drives] = self._made(drives)
-        return self._systems[drives]
+    def system(self, drives: tuple[str, ...] = (), *, closed: bool = True) -> SecondOrderSystem:
+        """Return the system with the motions of some inputs prescribed, with its controllers or without."""
+        return self._systems.get((drives, closed), lambda: self._made(drives, closed=closed))
 
-    def open(self) -> SecondOrderSystem:
-        """Return the system without its controllers."""
-        return self._made((), closed=False)
-
-    def _made(self, drives: tuple[str, ...], *, closed: bool = True) -> SecondOrderSystem:
+    def _made(self, drives: tuple[str, ...], *, closed: bool) -> SecondOrderSystem:
         description, n, m = self.description, self.description.size, self.description.states
         own = slice(n, n + m)
         mass, damping, stiffness = np.zeros((3, self.width, self.width))

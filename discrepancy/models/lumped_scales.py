@@ -63,7 +63,7 @@ class PortSizes:
     """
 
     def __init__(self, lumped: LumpedRig, *, driven_only: bool = False) -> None:
-        self._open, self._driven_only = lumped.open(), driven_only
+        self._open, self._driven_only = lumped.system(closed=False), driven_only
         self.rows = np.array(list(self._open.ports.values())).reshape(-1, lumped.width)
         self._turns, self._follows = np.zeros(len(self.rows), bool), np.ones(len(self.rows), bool)
         self._sizes = np.zeros((3, len(self.rows)))

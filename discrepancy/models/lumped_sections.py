@@ -38,17 +38,15 @@ def _numbers(value: object) -> tuple[float, ...]:
 
 def _matrix(value: object) -> tuple[tuple[float, ...], ...] | tuple[float, ...]:
     """Return a matrix by rows, a diagonal, or one number as what it is."""
-    if isinstance(value, list | tuple) and value and all(isinstance(row, list | tuple) for row in value):
-        if all(row and all(_is_number(item) for item in row) for row in value):
-            return tuple(tuple(float(item) for item in row) for row in value)
-    elif not isinstance(value, list | tuple) or value:
-        found = value if isinstance(value, list | tuple) else (value,)
-        if all(_is_number(item) for item in found):
-            return tuple(float(item) for item in found)
-    raise ValueError(
-        "a matrix of finite numbers by rows such as [[2.0, -1.0], [-1.0, 2.0]] is expected, or its diagonal, "
-        f"or one number, but {shown(value)} came"
-    )
+    try:
+        if isinstance(value, list | tuple) and value and all(isinstance(row, list | tuple) for row in value):
+            return tuple(map(_numbers, value))
+        return _numbers(value)
+    except ValueError:
+        raise ValueError(
+            "a matrix of finite numbers by rows such as [[2.0, -1.0], [-1.0, 2.0]] is expected, or its "
+            f"diagonal, or one number, but {shown(value)} came"
+        ) from None
 
 
 Vector = Annotated[tuple[Number, ...], BeforeValidator(_numbers)]

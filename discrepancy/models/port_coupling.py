@@ -12,7 +12,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.models.compiled_motion import law_functions
-from discrepancy.models.port_system import PortRows, PortSystem
+from discrepancy.models.port_system import PortSystem
 from fe.compilation import callable_when_compiled, compiled
 from fe.runtime import laws
 from fe.runtime.motion import Laws
@@ -134,16 +134,18 @@ def first_memory(internal: Laws, positions: FloatArray) -> FloatArray:
 
 
 def coupled_motion(
-    system: PortSystem, rows: PortRows, free_x: FloatArray, free_v: FloatArray, laws: Laws, port_of: list[int]
-) -> tuple[FloatArray, FloatArray]:
+    system: PortSystem, rows: tuple[FloatArray, ...], free_x: FloatArray, free_v: FloatArray,
+    laws: Laws, port_of: list[int],
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Return states (N + 1, n) and applied forces (N, P) of a linear system with laws at its ports.
 
-    Free motion (N + 1, P), displacement and velocity, is that without the laws; `port_of` the port of each.
+    `rows` are the system's `port_rows`. Free motion (N + 1, P), displacement and velocity, is that without
+    the laws; `port_of` the port of each.
     """
     index = np.array(port_of, dtype=np.int64)
     steps, width = len(free_x) - 1, free_x.shape[1]
     states, applied = np.zeros((steps + 1, len(system.transition))), np.zeros((steps, width))
-    gain = rows.speed @ system.drive + rows.speed_direct
+    gain = rows[2] @ system.drive + rows[3]
     arrays = (system.transition, system.drive, *rows, free_x, free_v, gain[np.ix_(index, index)])
     *given, free_x, free_v, gain = (np.ascontiguousarray(item, dtype=np.float64) for item in arrays)
     _compiled(couple)(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from scipy.linalg import expm, logm
@@ -14,19 +14,8 @@ from discrepancy.models.interface import PortedSystem
 MOST_STATES = 40
 """Largest order of a linear system that is made from records."""
 HANKEL_ROWS = 160
-ROUNDING = 1e-11
-"""Largest error of a matrix put together from its eigenvectors, as a share of its largest entry."""
 FIT = 1e-7
 """Largest error of a linear system against the record that it is made of, as a share of the record."""
-
-
-class PortRows(NamedTuple):
-    """Rows (P, n) by which ports move, and what they show of forces (P, P) at once."""
-
-    position: FloatArray
-    position_direct: FloatArray
-    speed: FloatArray
-    speed_direct: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,23 +39,11 @@ class PortSystem:
     step: float
 
     @cached_property
-    def _spectrum(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Eigenvalues (n,) of A, its eigenvectors and their inverse; None where too close to tell."""
-        values, shapes = np.linalg.eig(self.transition)
-        try:
-            inverse = np.linalg.inv(shapes)
-        except np.linalg.LinAlgError:
-            return None
-        error = np.max(np.abs((shapes * values) @ inverse - self.transition))
-        return (values, shapes, inverse) if error <= ROUNDING * np.max(np.abs(self.transition)) else None
-
-    @cached_property
     def generator(self) -> FloatArray:
         """Matrix (n, n) of the motion in time, s' = G s without forces [1/s]."""
-        if self._spectrum is None:
+        with catch_warnings():  # of rounding in what decays within a step
+            simplefilter("ignore", RuntimeWarning)
             return np.asarray(np.real(logm(self.transition)) / self.step)
-        values, shapes, inverse = self._spectrum
-        return np.asarray(np.real((shapes * np.log(values.astype(complex))) @ inverse) / self.step)
 
     @property
     def largest_turn(self) -> float:
@@ -128,33 +105,24 @@ class PortSystem:
         shown : sequence of (int, int)
             Columns of the outputs, and how often each is derived.
         """
-        order = len(self.transition)
-        powers = [np.eye(order)]
-        for _ in range(max([1, *(times for _, times in shown)])):
-            powers.append(powers[-1] @ self.generator)
-        rows = np.array([self.outputs[column] @ powers[times] for column, times in shown])
-        at_once = np.array(
-            [
-                self.outputs[column] @ powers[times - 1] @ self.push if times else self.direct[column]
-                for column, times in shown
-            ]
-        )
-        moving = self.port_rows(at, speeds)
-        return PortedSystem(
-            self.generator, ports, self.push.T, moving.position, moving.speed,
-            rows.reshape(-1, order), at_once.reshape(-1, len(ports)).T,
-        )  # fmt: skip
+        position, _, speed, _ = self.port_rows(at, speeds)
+        rows, at_once = self.rows(shown)
+        return PortedSystem(self.generator, ports, self.push.T, position, speed, rows, at_once.T)
 
-    def port_rows(self, at: Sequence[int], speeds: Sequence[int]) -> PortRows:
-        """Return the rows of the ports from the columns of their positions and velocities, see `ported`."""
-        x, v = np.array(at), np.array(speeds)
-        known = (v >= 0)[:, None]
-        return PortRows(
-            self.outputs[x],
-            self.direct[x],
-            np.where(known, self.outputs[v], self.outputs[x] @ self.generator),
-            np.where(known, self.direct[v], 0.0),
-        )
+    def rows(self, shown: Sequence[tuple[int, int]]) -> tuple[FloatArray, FloatArray]:
+        """Return what outputs, see `ported`, show of the state (K, n), and of forces at once (K, P)."""
+        rows, at_once = np.empty((len(shown), len(self.push))), np.empty((len(shown), self.push.shape[1]))
+        for number, (column, times) in enumerate(shown):
+            row, once = self.outputs[column], self.direct[column]
+            for _ in range(times):
+                row, once = row @ self.generator, row @ self.push
+            rows[number], at_once[number] = row, once
+        return rows, at_once
+
+    def port_rows(self, at: Sequence[int], speeds: Sequence[int]) -> tuple[FloatArray, ...]:
+        """Return what `rows` does of the ports' positions, then of their speeds; columns as in `ported`."""
+        moving = [(v, 0) if v >= 0 else (x, 1) for x, v in zip(at, speeds, strict=True)]
+        return *self.rows([(x, 0) for x in at]), *self.rows(moving)
 
     def motion(self, forces: FloatArray) -> FloatArray:
         """Return the outputs (N + 1, C) under forces (N, P), from rest."""
@@ -202,19 +170,20 @@ class PortSystem:
         still = np.linalg.solve(np.eye(len(self.transition)) - self.transition, self.drive)
         return np.asarray(self.outputs @ still + self.direct)
 
-    def modes(self, row: FloatArray, port: int) -> tuple[FloatArray, FloatArray]:
-        """Return the modes that a port sees: angular frequencies [rad/s] and squared shapes at it [1/kg].
+    def most_flexible(self, column: int, port: int) -> tuple[float, float] | None:
+        """Return the mode that gives an output the most at rest under a port's force; None if none vibrates.
 
-        `row` (n,) is that of the port's displacement.
+        Its angular frequency [rad/s], and the squared shape that both see [1/kg].
         """
-        values, shapes = np.linalg.eig(self.transition)
-        into = np.linalg.solve(shapes, self.drive[:, port].astype(complex))
-        keep = (values.imag > 1e-12) & (np.abs(values) > 0.0)
-        values, into, out = values[keep], into[keep], (row @ shapes)[keep]
-        rate = np.log(values) / self.step
-        # over a step the force adds (e^(rate h) - 1) / rate of what it gives at once
-        residue = out * into * rate / (values - 1.0)
-        return np.abs(rate), np.abs(2.0 * rate.imag * residue)
+        rates, shapes = np.linalg.eig(self.generator)
+        into = np.linalg.solve(shapes, self.push[:, port].astype(complex))
+        residues = (self.outputs[column] @ shapes) * into
+        found = [
+            (float(abs(rate)), float(abs(2.0 * rate.imag * residue)))
+            for rate, residue in zip(rates, residues, strict=True)
+            if rate.imag > 1e-9 * abs(rate)
+        ]
+        return max(found, key=lambda mode: mode[1] / mode[0] ** 2, default=None)
 
 
 def _largest(matrix: FloatArray, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from calibration.errors import CalibrationError
-from calibration.joint.prior import wing_priors
+from calibration.joint.wing_table import wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE
 from discrepancy.campaign.records import FloatArray, Quantity, Trial

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.paper.procedure import RESULTS_FILE, read_published_results
-from calibration.published_strains import FILE_NAME, read_published_strains
+from twin_master.assets.strain_library import FILE_NAME, load_strain_library
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -151,6 +151,8 @@ def read_targets(data: Path | str) -> Targets:
         If a file is missing, cannot be read or lacks an entry or a column.
     ExperimentDataError
         If a value is not a finite number, or the library has other states or gauges than published.
+    InvalidStrainLibraryError
+        If the library is none.
     """
     data = Path(data)
     if not data.is_dir():
@@ -158,18 +160,18 @@ def read_targets(data: Path | str) -> Targets:
             f"{data} is not a folder; give the one that holds the authors' two folders."
         )
     strain_file, results_file = _find_library(data), _find_results(data)
-    library = read_published_strains(strain_file)
+    library = load_strain_library(strain_file)
     if CONTROL not in library.controls:
         raise ExperimentDataError(
             f"{strain_file} has no control {CONTROL}, only {', '.join(library.controls)}."
         )
-    for name, levels in zip(("z1", "z2"), library.levels, strict=True):
-        if len(levels) != len(LEVELS) or not np.allclose(levels, LEVELS, atol=1e-9):
+    for region in library.states.factors:
+        if len(region.levels) != len(LEVELS) or not np.allclose(region.levels, LEVELS, atol=1e-9):
             raise ExperimentDataError(
-                f"{strain_file}: the levels of {name} are {levels}, but {LEVELS} are expected."
+                f"{strain_file}: the levels of {region.name} are {region.levels}, but {LEVELS} are expected."
             )
     control = library.controls.index(CONTROL)
-    strain = library.strain[:, :, control]
+    strain = library.strain.reshape(*library.states.shape, *library.strain.shape[1:])[:, :, control]
     if strain.min() <= 0.0 or strain.max() > 0.1:
         raise ExperimentDataError(
             f"{strain_file}: strains at {CONTROL} must be positive and below 100,000 microstrain, but reach "
@@ -177,7 +179,7 @@ def read_targets(data: Path | str) -> Targets:
         )
     if not 0 <= LIMITING_GAUGE < strain.shape[2]:
         raise ExperimentDataError(f"{strain_file} holds {strain.shape[2]} gauges; at least 17 are expected.")
-    slope = strain_slopes(library.young_modulus_factor, library.strain_per_draw[:, 0, 0, control])
+    slope = strain_slopes(library.young_modulus_factor, library.strain_per_draw[:, 0, control])
     published = read_published_results(results_file)
     factor, servo, pitot = published.samples.T[:3]
     fitted = np.arange(len(servo)) % 2 == 0

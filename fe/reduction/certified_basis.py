@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fe.full.subspace import FunctionalBasis, Norm
-from fe.runtime.reduced import ReducedModel
+from fe.runtime.reduced import ReducedModel, StaticResponse
 
 from .dual_solutions import dual_solutions
 from .settings import TOGETHER
@@ -41,12 +41,23 @@ class StaticReduction:
         The full model.
     norm : Norm
         Energy norm at the reference of the terms.
+    fixed : dict of str to anything
+        What a reduced model holds beside the statics, by the names of its fields.
+    modal_basis : (n, Nm) ndarray
+        Its modal basis.
     advance : callable
         Told one more part, and of what.
     """
 
-    def __init__(self, terms: ReductionTerms, norm: Norm, advance: Callable[[int, str], object]) -> None:
-        self.terms, self.norm, self.advance = terms, norm, advance
+    def __init__(
+        self,
+        terms: ReductionTerms,
+        norm: Norm,
+        fixed: dict[str, Any],
+        modal_basis: FloatArray,
+        advance: Callable[[int, str], object],
+    ) -> None:
+        self.terms, self.norm, self.modal_basis, self.advance = terms, norm, modal_basis, advance
         self.least = terms.least(norm)
         n, count = len(terms.loads), len(terms.stiffness_terms)
         self.basis = ProjectedBasis(norm, [terms.stiffness_terms], drop=1e-7)
@@ -54,7 +65,8 @@ class StaticReduction:
         self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
         self.residual_load = self.residual_basis.extend(terms.loads)
         self.residual_stiffness = np.empty((len(self.residual_load), count, 0))
-        products, self.duals = dual_solutions(terms, norm, advance)
+        products, duals = dual_solutions(terms, norm, advance)
+        self.fixed: dict[str, Any] = fixed | duals
         self.dual_products = np.swapaxes(products, 1, 2)
         self.correction = self.dual_products @ self.residual_basis.vectors
         self.snapshots: list[State] = []
@@ -100,47 +112,51 @@ class StaticReduction:
             )
         )
 
-    def arrays(self) -> dict[str, Any]:
-        """Return the static fields of `ReducedArrays`, and `cross_mass` with the static basis alone."""
-        terms, basis = self.terms, self.basis.vectors
-        return {
-            "static_stiffness": 0.5 * (self.basis.inner[0] + self.basis.inner[0].transpose(0, 2, 1)),
-            "static_load": terms.loads.T @ basis,
-            "static_output": terms.outputs.T @ basis,
-            "bound_reference": terms.reference[:-1],
-            "residual_load": self.residual_load,
-            "residual_stiffness": self.residual_stiffness,
-            # |sum c_q a_j d_qj| <= |c| |a| |d|; plus rounding
-            "residual_allowance": self._largest_coefficients()
-            * float(np.sqrt(self.residual_basis.dropped_square))
-            + 1e-7,
-            "rounding_allowance": max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
-            "dual_correction": self.correction,
-            **self.duals,
-        }
+    def model(self) -> ReducedModel:
+        """Return the reduced model of the present bases."""
+        terms, basis, (stiffness,) = self.terms, self.basis.vectors, self.basis.inner
+        # |sum c_q a_j d_qj| <= |c| |a| |d| with c = (1, theta); plus rounding
+        largest = (terms.reference + terms.farthest())[:-1]
+        dropped = np.sqrt((2.0 + largest @ largest) * self.residual_basis.dropped_square)
+        return ReducedModel(
+            static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
+            static_load=terms.loads.T @ basis,
+            static_output=terms.outputs.T @ basis,
+            bound_reference=terms.reference[:-1],
+            residual_load=self.residual_load,
+            residual_stiffness=self.residual_stiffness,
+            residual_allowance=float(dropped) + 1e-7,
+            rounding_allowance=max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
+            dual_correction=self.correction,
+            cross_mass=np.stack([self.modal_basis.T @ (term @ basis) for term in terms.mass_terms]),
+            **self.fixed,
+        )
 
-    def cross_mass(self, modal_basis: FloatArray) -> FloatArray:
-        """Return the mass terms (1 + P, Nm, N) between a modal basis (n, Nm) and the static one."""
-        images = [np.asarray(term @ self.basis.vectors) for term in self.terms.mass_terms]
-        return np.stack([modal_basis.T @ image for image in images])
+    def responses(self, model: ReducedModel, state: State) -> list[StaticResponse]:
+        """Return the responses of a reduced model at a state to each load alone."""
+        chosen = model.nominal.copy()
+        chosen[: len(state)] = state
+        return [model.static_response(chosen, load=load) for load in np.eye(len(self.terms.load_factors))]
 
     def bound(self, model: ReducedModel, state: State) -> float:
-        """Return the certified bound of a model of these bases at a state, see `ReductionTerms.bound`."""
-        return self.terms.bound(model, state, self.least)
+        """Return the certified bound of a model of these bases at a state.
 
-    def _largest_coefficients(self) -> float:
-        """Return the largest length of (1, theta), by which load and terms of a residual are multiplied."""
-        largest = (self.terms.reference + self.terms.farthest())[:-1]
-        return float(np.sqrt(2.0 + largest @ largest))
+        It is that of the load where it is largest, by the largest gauge or displacement, or by `least`.
+        """
+        worst = 0.0
+        for number, found in enumerate(self.responses(model, state)):
+            kinds = (
+                (found.strain, found.strain_error_bound),
+                (found.displacement, found.displacement_error_bound),
+            )
+            present = [(values, error) for values, error in kinds if values.size]
+            for (values, error), floor in zip(present, self.least[:, number], strict=True):
+                worst = max(worst, error / max(float(np.abs(values).max()), floor))
+        return worst
 
 
 def greedy(
-    static: StaticReduction,
-    model: Callable[[], ReducedModel],
-    states: list[State],
-    *,
-    tolerance: float,
-    most_snapshots: int,
+    static: StaticReduction, states: list[State], *, tolerance: float, most_snapshots: int
 ) -> list[float]:
     """Run the weak greedy search with the certified bound as its surrogate.
 
@@ -148,8 +164,6 @@ def greedy(
     ----------
     static : StaticReduction
         Takes the full solutions.
-    model : callable
-        The reduced model of its present bases.
     states : list of State
         Where it is looked at.
     tolerance : float
@@ -168,8 +182,8 @@ def greedy(
     chosen = [states[int(((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin())]]
     for number in range(1 + ceil((most_snapshots - 1) / TOGETHER)):
         if number:
-            few = len(states) // LOOKED_AT if number > 1 and static.duals["dual_output"].size else 0
-            bounds = _bounds(static, model(), states, known, few, wanted)
+            few = len(states) // LOOKED_AT if number > 1 and static.fixed["dual_output"].size else 0
+            bounds = _bounds(static, states, known, few, wanted)
             history.append(float(bounds.max()))
             if history[-1] <= wanted:
                 return history
@@ -177,20 +191,15 @@ def greedy(
         if not static.add_snapshots(chosen):
             break
         static.advance(len(chosen), f"full solution {len(static.snapshots)}")
-    present = model()
-    return [*history, max(static.bound(present, state) for state in states)]
+    return [*history, float(_bounds(static, states, known, len(states), wanted).max())]
 
 
 def _bounds(
-    static: StaticReduction,
-    present: ReducedModel,
-    states: list[State],
-    known: FloatArray,
-    few: int,
-    wanted: float,
+    static: StaticReduction, states: list[State], known: FloatArray, few: int, wanted: float
 ) -> FloatArray:
     """Bounds of the `few` states that were worst when last looked at; of all where these are good enough."""
-    bounds, order, first = np.zeros(len(states)), np.argsort(-known, kind="stable"), 0
+    present, bounds = static.model(), np.zeros(len(states))
+    order, first = np.argsort(-known, kind="stable"), 0
     for count in (few, len(states)):
         for number in order[first:count]:
             bounds[number] = known[number] = static.bound(present, states[number])
@@ -276,7 +285,7 @@ def fewest_directions(
     """
     solutions = []
     for state in states:
-        for response in static.terms.responses(model, state):
+        for response in static.responses(model, state):
             solutions.append(response.coordinates / np.linalg.norm(response.coordinates))
     directions = np.linalg.svd(np.array(solutions).T, full_matrices=False)[0]
 

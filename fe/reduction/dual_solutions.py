@@ -54,7 +54,9 @@ def dual_solutions(
         tolerance = COMBINED_TOLERANCE if combined else DUAL_TOLERANCE
         found += solved_together(terms, norm, chosen, terms.outputs, [start] * len(chosen), tolerance)
         advance(len(chosen), "dual solutions")
-    duals, arrays = (_combined if combined else _nearest)(terms, norm, np.stack(found))
+    solutions = np.stack(found)
+    del found  # as large as they are
+    duals, arrays = (_combined if combined else _nearest)(terms, norm, solutions)
     return np.stack([norm.whitened(norm.product(dual)) for dual in duals]), arrays
 
 
@@ -77,22 +79,22 @@ def _combined(
     terms: ReductionTerms, norm: Norm, solutions: FloatArray
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Make the solutions (M, n, O) at states orthonormal for each output, to be combined."""
-    bases, kept = [], 0
-    for dual in solutions.transpose(2, 1, 0):
+    duals, kept = np.ascontiguousarray(solutions.transpose(2, 1, 0)), 0  # (O, n, M)
+    for dual in duals:
         square, turn = np.linalg.eigh(dual.T @ norm.product(dual))
         used = np.flatnonzero(square > DEPENDENT**2 * square[-1])[::-1]
-        bases.append(np.zeros_like(dual))
-        bases[-1][:, : len(used)] = dual @ (turn[:, used] / np.sqrt(square[used]))
+        basis = dual @ (turn[:, used] / np.sqrt(square[used]))
+        dual[:, : len(used)], dual[:, len(used) :] = basis, 0.0
         kept = max(kept, len(used))
-    duals = np.stack(bases)[:, :, :kept]  # (O, n, M)
-    images = [[np.asarray(term @ dual) for term in terms.stiffness_terms] for dual in duals]
-    stiffness = np.array([[dual.T @ part for part in own] for dual, own in zip(duals, images, strict=True)])
+    duals = duals[:, :, :kept]
+    stiffness = np.empty((len(duals), len(terms.stiffness_terms), kept, kept))
+    factors = []
+    for dual, output, inner in zip(duals, terms.outputs.T, stiffness, strict=True):
+        images = [np.asarray(term @ dual) for term in terms.stiffness_terms]
+        inner[:] = [dual.T @ image for image in images]
+        factors.append(_factor(norm, np.column_stack((output, *images))))
     absent = np.asarray(~duals.any(axis=1))
     stiffness[:, -1] += absent[:, :, np.newaxis] * np.eye(kept)  # a function that is not there gets no part
-    factors = [
-        _factor(norm, np.column_stack((output, *own)))
-        for output, own in zip(terms.outputs.T, images, strict=True)
-    ]
     return duals.transpose(2, 1, 0), {
         "dual_residual": np.array([factors]),
         "dual_stiffness": stiffness,

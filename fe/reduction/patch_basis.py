@@ -197,7 +197,8 @@ def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
         plainly = 10.0 if number == 0 else 1.0  # the wing as it was is looked at most
         shapes = np.concatenate((solutions, modes), axis=1) * plainly
         all_snapshots += shapes @ shapes.T
-    return _leading(all_snapshots, settings.vectors)
+    first = max(0, wing.size - settings.vectors)
+    return np.asarray(eigh(all_snapshots, subset_by_index=[first, wing.size - 1])[1][:, ::-1])
 
 
 LOAD_WEIGHT = 3.0
@@ -205,13 +206,6 @@ LOAD_WEIGHT = 3.0
 TURNED_WEIGHT = 0.4
 """How much representatives of strain across a gauge and of shear count."""
 MODE_WEIGHTS = np.array([3.0, 3.0, 4.0, 3.0, 1.5, 1.0, 0.5, 0.3])
-
-
-def _leading(gram: FloatArray, count: int) -> FloatArray:
-    """Return the `count` eigenvectors (N, count) of the largest eigenvalues."""
-    size = len(gram)
-    first = max(0, size - count)
-    return np.asarray(eigh(gram, subset_by_index=[first, size - 1])[1][:, ::-1])
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
@@ -222,16 +216,9 @@ def _patched_state(
     wing: PatchedWing, settings: PatchSettings, generator: np.random.Generator, *, plain: bool
 ) -> tuple[PatchedStructure, FloatArray]:
     """Return a random state and its loads (N, 3 + 2 L); `plain`: of the wing as it was."""
-    arrays, ranges, span = wing.arrays, settings.ranges, wing.span
-    e, *losses, servo, pitot = (
-        float(generator.uniform(*pair))
-        for pair in (
-            ranges.young_modulus_factor,
-            *(ranges.stiffness_loss,) * len(arrays.regions),
-            ranges.servo_mass,
-            ranges.pitot_mass,
-        )
-    )
+    arrays, span = wing.arrays, wing.span
+    drawn = np.array(generator.uniform(*arrays.validity_box[:-2].T))  # all but the loads
+    e, *losses, servo, pitot = drawn.tolist()
     damaged, *changed = generator.random(4) < (0.5, 0.75, 0.4, 0.6)
     start, length = generator.uniform(-0.05, 0.9) * span, generator.uniform(0.02, 0.3) * span
     changes = (

@@ -89,15 +89,12 @@ def reduce_structure(
     with progress.stage("Factorising the structure"):
         norm = Norm(affine_sum(terms.reference, terms.stiffness_terms))
     with progress.stage("Reducing the modes") as stage:
-        modes = _modes(terms, norm, name, settings.modal, stage.advance, followed_load)
+        basis, modal = _modes(terms, norm, name, settings.modal, stage.advance, followed_load)
     with progress.stage("Reducing the statics") as stage:
-        static, states = StaticReduction(terms, norm, stage.advance), terms.training()
+        fixed = {**_named(terms, name), **modal, "mode_count": settings.modal.mode_count}
+        static, states = StaticReduction(terms, norm, fixed, basis, stage.advance), terms.training()
         history = greedy(
-            static,
-            lambda: _model(static, name, modes, settings.modal.mode_count),
-            states,
-            tolerance=settings.bound_tolerance,
-            most_snapshots=settings.most_snapshots,
+            static, states, tolerance=settings.bound_tolerance, most_snapshots=settings.most_snapshots
         )
     if history[-1] > settings.bound_tolerance:
         raise ReductionError(
@@ -106,12 +103,12 @@ def reduce_structure(
             f"raise most_solutions (now {settings.most_snapshots}) or tolerance in the table [reduction] of "
             "a structure file, or narrow the ranges of parameters and losses."
         )
-    model = _model(static, name, modes, settings.modal.mode_count)
+    model = static.model()
     directions = fewest_directions(model, static, states, settings.bound_tolerance)
     return Reduction(
         compressed(model, directions),
         static.basis.vectors @ directions,
-        modes[0],
+        basis,
         tuple(static.snapshots),
         tuple(history),
     )
@@ -164,39 +161,32 @@ def _check(terms: ReductionTerms, name: str) -> None:
         )
 
 
-def _model(
-    static: StaticReduction, name: str, modes: tuple[FloatArray, dict[str, Any]], mode_count: int
-) -> ReducedModel:
-    """Return the reduced model of the present bases."""
-    terms, (basis, modal) = static.terms, modes
+def _named(terms: ReductionTerms, name: str) -> dict[str, Any]:
+    """Return the fields of `ReducedArrays` that no basis changes: names, ranges, factors, damping."""
     structure = terms.structure
     chosen = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
     nominal = structure.parameters | structure.masses | structure.controls
-    return ReducedModel(
-        design_hash=structure.design_hash,
-        name=name,
-        region_names=" ".join(structure.regions),
-        parameter_names=" ".join(structure.parameters),
-        mass_names=" ".join(structure.masses),
-        control_names=" ".join(structure.controls),
-        control_units=" ".join(structure.control_units[name] for name in structure.controls),
-        gauge_names=" ".join(structure.gauges),
-        displacement_names=" ".join(structure.displacements),
-        acceleration_names=" ".join(structure.accelerations),
-        validity_box=np.array([structure.ranges[name] for name in chosen], dtype=np.float64),
-        nominal=np.array([nominal.get(name, 0.0) for name in chosen], dtype=np.float64),
-        damping=np.array((structure.damping_alpha, structure.damping_beta)),
-        stiffness_factors=terms.stiffness_factors,
-        load_factors=terms.load_factors,
-        dual_counts=np.array(terms.counts, dtype=np.int64),
-        dual_split=np.concatenate(
+    return {
+        "design_hash": structure.design_hash,
+        "name": name,
+        "region_names": " ".join(structure.regions),
+        "parameter_names": " ".join(structure.parameters),
+        "mass_names": " ".join(structure.masses),
+        "control_names": " ".join(structure.controls),
+        "control_units": " ".join(structure.control_units[name] for name in structure.controls),
+        "gauge_names": " ".join(structure.gauges),
+        "displacement_names": " ".join(structure.displacements),
+        "acceleration_names": " ".join(structure.accelerations),
+        "validity_box": np.array([structure.ranges[name] for name in chosen], dtype=np.float64),
+        "nominal": np.array([nominal.get(name, 0.0) for name in chosen], dtype=np.float64),
+        "damping": np.array((structure.damping_alpha, structure.damping_beta)),
+        "stiffness_factors": terms.stiffness_factors,
+        "load_factors": terms.load_factors,
+        "dual_counts": np.array(terms.counts, dtype=np.int64),
+        "dual_split": np.concatenate(
             [loss_splits(ends, count) for ends, count in zip(terms.losses, terms.counts, strict=True)]
         ),
-        cross_mass=static.cross_mass(basis),
-        mode_count=mode_count,
-        **modal,
-        **static.arrays(),
-    )
+    }
 
 
 def reduce_model(

@@ -71,15 +71,11 @@ def measured_errors(
         stiffness, mass, load = structure.at(dict(zip(model.chosen, vector.tolist(), strict=True)))
         full = Factorisation(stiffness).solve(load)
         found = model.static_response(vector)
-        for what, rows, came, error in (
-            ("strain", structure.gauge_output, found.strain, found.strain_error_bound),
-            (
-                "displacement",
-                structure.displacement_output,
-                found.displacement,
-                found.displacement_error_bound,
-            ),
+        for what, rows in (
+            ("strain", structure.gauge_output),
+            ("displacement", structure.displacement_output),
         ):
+            came, error = getattr(found, what), getattr(found, f"{what}_error_bound")
             wanted = np.asarray(rows @ full)
             if wanted.size:
                 size, missed = float(np.abs(wanted).max()), float(np.abs(came - wanted).max())

@@ -10,7 +10,6 @@ from scipy.stats import qmc
 
 from fe.full.affine import AffineSum
 from fe.full.subspace import BlockDiagonal, Norm, OrthonormalBasis, conjugate_gradients
-from fe.runtime.reduced import ReducedModel, StaticResponse
 from fe.structure.affine import AffineStructure
 
 from .settings import MOST_GRID_REGIONS, default_anchors, remaining_levels
@@ -200,28 +199,6 @@ class ReductionTerms:
             of_others = UNSEEN_SHARE * (size * largest).max() / largest
             found.append(np.where(size < least, np.maximum(least, of_others), least))
         return np.array(found)
-
-    def responses(self, model: ReducedModel, state: State) -> list[StaticResponse]:
-        """Responses of a reduced model at a state to each load alone."""
-        chosen = model.nominal.copy()
-        chosen[: len(state)] = state
-        return [model.static_response(chosen, load=load) for load in np.eye(len(self.load_factors))]
-
-    def bound(self, model: ReducedModel, state: State, least: FloatArray) -> float:
-        """Certified bound at a state, of the load where it is largest, by the largest gauge or displacement.
-
-        Outputs (groups, L) that are smaller than `least` are judged by it.
-        """
-        worst = 0.0
-        for number, found in enumerate(self.responses(model, state)):
-            kinds = (
-                (found.strain, found.strain_error_bound),
-                (found.displacement, found.displacement_error_bound),
-            )
-            present = [(values, error) for values, error in kinds if values.size]
-            for (values, error), floor in zip(present, least[:, number], strict=True):
-                worst = max(worst, error / max(float(np.abs(values).max()), floor))
-        return worst
 
 
 class ProjectedBasis:

@@ -115,34 +115,7 @@ def _check_parts(mesh: StructureMesh) -> None:
 
 def read_by_meshio(path: Path) -> Deck:
     """Read the mesh of a file of any other format, see `read_mesh`."""
-    meshio = meshio_with_wedges()
-    if not path.is_file():
-        raise MeshError(f"The mesh file {path} is not there.")
-    said = io.StringIO()
-    try:
-        # meshio writes what it thinks of a file to the terminal, and ends the program where it fails.
-        with (
-            contextlib.redirect_stdout(io.StringIO()),
-            contextlib.redirect_stderr(said),
-            warnings.catch_warnings(),
-        ):
-            warnings.simplefilter("ignore")
-            found = meshio.read(path)
-    except meshio.ReadError as error:
-        raise MeshError(
-            f"The mesh file {path} cannot be read: {str(error).strip('. ') or 'its format is not known'}; "
-            "write it as .msh, .inp, .med or .bdf."
-        ) from None
-    except OSError as error:
-        raise MeshError(f"The mesh file {path} cannot be read: {error.strerror}.") from None
-    except SystemExit:
-        why = " ".join(said.getvalue().split()).removeprefix("Error: ").rstrip(".")
-        raise MeshError(f"The mesh file {path} cannot be read as {path.suffix}: {why}.") from None
-    except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
-        raise MeshError(
-            f"The mesh file {path} cannot be read as {path.suffix}: the reader (meshio) says {str(error)!r}; "
-            "it is damaged, cut off, or of another dialect. Write it anew, or as .msh or .inp."
-        ) from None
+    found = _found_by_meshio(path)
     deck, where, suffix = Deck(path), str(path), path.suffix.lower()
     points = np.atleast_2d(found.points)
     points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
@@ -178,6 +151,38 @@ def read_by_meshio(path: Path) -> Deck:
         for name, chosen in _named(found, label, [array], 0):
             deck.members("NSET", name).extend((chosen + 1).tolist())
     return deck
+
+
+def _found_by_meshio(path: Path) -> Any:
+    """Return what meshio reads of a file, or say in one sentence why it does not."""
+    meshio = meshio_with_wedges()
+    if not path.is_file():
+        raise MeshError(f"The mesh file {path} is not there.")
+    said = io.StringIO()
+    try:
+        # meshio writes what it thinks of a file to the terminal, and ends the program where it fails.
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(said),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")
+            return meshio.read(path)
+    except meshio.ReadError as error:
+        raise MeshError(
+            f"The mesh file {path} cannot be read: {str(error).strip('. ') or 'its format is not known'}; "
+            "write it as .msh, .inp, .med or .bdf."
+        ) from None
+    except OSError as error:
+        raise MeshError(f"The mesh file {path} cannot be read: {error.strerror}.") from None
+    except SystemExit:
+        why = " ".join(said.getvalue().split()).removeprefix("Error: ").rstrip(".")
+        raise MeshError(f"The mesh file {path} cannot be read as {path.suffix}: {why}.") from None
+    except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
+        raise MeshError(
+            f"The mesh file {path} cannot be read as {path.suffix}: the reader (meshio) says {str(error)!r}; "
+            "it is damaged, cut off, or of another dialect. Write it anew, or as .msh or .inp."
+        ) from None
 
 
 def _named(found: Any, label: str, arrays: list[Any], number: int) -> Iterator[tuple[str, IntArray]]:

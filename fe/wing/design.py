@@ -164,6 +164,14 @@ def _check_ribs(design: WingDesign) -> None:
             raise ValueError(f"ribs[{first}] and ribs[{second}] overlap at {start:.4g} m from the root")
 
 
+def _require_on_box(design: WingDesign, what: str, front: float, rear: float) -> None:
+    if not design.front_chord <= front <= rear <= design.rear_chord:
+        raise ValueError(
+            f"{what} lies outside the skin of the box from chord {design.front_chord:g} to "
+            f"{design.rear_chord:g}"
+        )
+
+
 def _check_regions(design: WingDesign) -> None:
     span = design.planform.semi_span
     for index, defect in enumerate(design.defects):
@@ -172,11 +180,8 @@ def _check_regions(design: WingDesign) -> None:
             raise ValueError(f"{where} must end behind its start, along the span and along the chord")
         if defect.span_end > span:
             raise ValueError(f"{where} ends {defect.span_end:g} m from the root, off the wing of {span:g} m")
-        if defect.chord_start < design.front_chord or defect.chord_end > design.rear_chord:
-            raise ValueError(
-                f"{where} covers chord {defect.chord_start:g} to {defect.chord_end:g}, outside the skin of "
-                f"the box from {design.front_chord:g} to {design.rear_chord:g}"
-            )
+        ends = defect.chord_start, defect.chord_end
+        _require_on_box(design, f"{where}, from chord {ends[0]:g} to {ends[1]:g},", *ends)
     for (first, one), (second, two) in itertools.combinations(enumerate(design.defects), 2):
         if min(one.span_end, two.span_end) > max(one.span_start, two.span_start) and min(
             one.chord_end, two.chord_end
@@ -207,22 +212,14 @@ def _check_gauges(design: WingDesign) -> None:
         for end in (distance - along, distance + along):
             local = design.planform.chord(end / span)
             middle = chord * design.planform.chord(distance / span)
-            reach = [(middle - across) / local, (middle + across) / local]
-            if reach[0] < design.front_chord or reach[1] > design.rear_chord:
-                raise ValueError(
-                    f"gauges.positions[{index}] at chord {chord:g} does not lie, with its averaging length, "
-                    f"on the skin of the box from chord {design.front_chord:g} to {design.rear_chord:g}"
-                )
+            where = f"gauges.positions[{index}] at chord {chord:g}, with its averaging length,"
+            _require_on_box(design, where, (middle - across) / local, (middle + across) / local)
 
 
 def _check_places(design: WingDesign) -> None:
     places = [(f"point_masses[{i}]", place.chord) for i, place in enumerate(design.point_masses)]
     for where, chord in [*places, ("tip_load", design.tip_load.chord)]:
-        if not design.front_chord <= chord <= design.rear_chord:
-            raise ValueError(
-                f"{where} at chord {chord:g} does not lie on the box from {design.front_chord:g} to "
-                f"{design.rear_chord:g}"
-            )
+        _require_on_box(design, f"{where} at chord {chord:g}", chord, chord)
     if design.tip_load.distance_from_tip >= design.planform.semi_span:
         raise ValueError("tip_load.distance_from_tip reaches beyond the root")
 

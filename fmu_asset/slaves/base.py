@@ -123,16 +123,13 @@ class Slave:
         self._values = [0.0 if row.start is None else float(row.start) for row in self._table]
         causalities = [row.causality for row in self._table]
         self._input_count = next(n for n, causality in enumerate(causalities) if causality != "input")
-        self._inputs = list(range(self._input_count))
         self._first_output = causalities.index("output")
         self._end = len(causalities) - causalities[::-1].index("output")
         self._tuned = {row.name: row.reference for row in self._table[self._end :]}
         self._status = next(row.reference for row in self._table if row.name == "status")
-        self._later = contents.later
+        self._later = [(frozenset(range(part.start, part.stop)), part) for part in contents.later]
         self._pending = [True] * len(self._later)
         self._stale = True
-        # what was read last, the slice that it is, and the groups of later outputs in it
-        self._read: tuple[list[int], slice | None, list[int]] = ([], None, [])
         self._phase = INSTANTIATED
         self._time = self._start_time = 0.0
 
@@ -228,11 +225,7 @@ class Slave:
 
     def set_real(self, vrs: Sequence[int], values: Sequence[float]) -> None:
         """Set inputs and tunable parameters at any time, others before the end of initialisation."""
-        if vrs == self._inputs:  # all inputs in their order, as most masters send them
-            self._values[: self._input_count] = values
-            self._stale = True
-        else:
-            self._set("Real", vrs, values)
+        self._set("Real", vrs, values)
 
     def set_integer(self, vrs: Sequence[int], values: Sequence[int]) -> None:
         """Set integers and enumerations, as `set_real`."""
@@ -259,38 +252,27 @@ class Slave:
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
         """Return values; some outputs are computed when they are asked for."""
-        references, part, groups = self._read
-        if vrs != references:
-            references = list(vrs)
-            unknown = [vr for vr in references if not 0 <= vr < len(self._values)]
-            if unknown:
-                self._refuse(STATUS_BAD_CALL, f"there is no value reference {unknown[0]}")
-                return [math.nan] * len(references)
-            first, last = (references[0], references[-1]) if references else (0, -1)
-            part = slice(first, last + 1) if references == list(range(first, last + 1)) else None
-            groups = [
-                number
-                for number, rows in enumerate(self._later)
-                if any(rows.start <= vr < rows.stop for vr in references)
-            ]
-            self._read = references, part, groups
+        values = self._values
+        if min(vrs, default=0) < 0 or max(vrs, default=0) >= len(values):
+            unknown = next(vr for vr in vrs if not 0 <= vr < len(values))
+            self._refuse(STATUS_BAD_CALL, f"there is no value reference {unknown}")
+            return [math.nan] * len(vrs)
         if self._stale and self._phase == INITIALISING:
             self._initialise()
-        if groups and self._phase not in (INSTANTIATED, REFUSED):
-            self._complete(groups)
-        return self._values[part] if part else [self._values[vr] for vr in references]
+        if self._phase not in (INSTANTIATED, REFUSED):
+            for number, (rows, part) in enumerate(self._later):
+                if self._pending[number] and not rows.isdisjoint(vrs):
+                    self._complete(number, part)
+        return [values[vr] for vr in vrs]
 
-    def _complete(self, groups: Sequence[int]) -> None:
-        """Compute groups of outputs that are asked for and not known yet."""
-        for number in groups:
-            if self._pending[number]:
-                part = self._later[number]
-                try:
-                    self._values[part] = self._behaviour.later(number)
-                    self._pending[number] = False
-                except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
-                    self._refuse(STATUS_INTERNAL, f"values could not be read: {error!r}")
-                    self._values[part] = [math.nan] * (part.stop - part.start)
+    def _complete(self, number: int, part: slice) -> None:
+        """Compute a group of outputs that is asked for and not known yet."""
+        try:
+            self._values[part] = self._behaviour.later(number)
+            self._pending[number] = False
+        except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
+            self._refuse(STATUS_INTERNAL, f"values could not be read: {error!r}")
+            self._values[part] = [math.nan] * (part.stop - part.start)
 
     def get_integer(self, vrs: Sequence[int]) -> list[int]:
         """Return integers and enumerations."""

@@ -109,8 +109,6 @@ class StructureBehaviour:
         """Advance by one step of `duration` [s] with inputs and effects held; raises as `start`."""
         if self._vector is None:
             raise RuntimeError("the structure was not initialised")
-        if self._effects is None:
-            return self._go(time, duration, inputs)
         return self._whole(lambda: self._go(time, duration, inputs))
 
     def later(self, group: int) -> list[float]:
@@ -122,9 +120,8 @@ class StructureBehaviour:
             frequency = modes.frequency[:MODE_COUNT]
             return [*frequency.tolist(), *rayleigh_damping_ratio(*self._damping, frequency).tolist()]
         if group == POINT_OR_BOUND and self._roles.load_point is not None:
-            return [
-                self._shown[-1] if self._shown else self._point()
-            ]  # as sensors show it, where they are on
+            # as sensors show it, where they are on
+            return [self._shown[-1] if self._shown else self._point()]
         self._static = self._static or self._model.static_response(self._vector)
         bounds = self._static.strain_error_bound, self._static.displacement_error_bound
         return [bounds[group]]

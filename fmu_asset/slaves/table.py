@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE, WING
 
-from .variables import QUASI_STATIC, TRANSIENT, FmuVariable, Table
+from .variables import QUASI_STATIC, TRANSIENT, Causality, FmuVariable, Table
 
 RESERVED = ("response", "status", "strain_error_bound", "displacement_error_bound")
 """Names that controls and parameters of a structure cannot have: its FMU has variables of that name."""
@@ -24,10 +24,19 @@ _OF_THE_WING = {
     "load_factor": "Load factor of the turn, lift over weight",
     "tip_force": "Upward force at the load point near the tip",
     "young_modulus_factor": "Factor on Young's modulus of the skin (e)",
-    "servo_mass": "Mass of each of the two servos",
-    "pitot_mass": "Mass of the pitot tube at the tip",
-    "tip": "Displacement of the tip, positive upwards",
+    "mass.servo": "Mass of each of the two servos",
+    "mass.pitot": "Mass of the pitot tube at the tip",
+    "tip_displacement": "Displacement of the tip, positive upwards",
 }
+
+
+_CHOSEN: Mapping[str, tuple[str, Causality, str, str, str | None]] = {
+    "parameters": ("", "parameter", "Factor {} on the stiffness", "1", None),
+    "regions": ("health.", "input", "Stiffness that the region {} has lost, as a fraction", "1", "%"),
+    "masses": ("mass.", "parameter", "Mass of {}", "kg", "g"),
+    "controls": ("", "input", "Control {} of the loads", "", None),
+}
+"""Of what can be chosen: prefix of the variable, causality, text, unit (of a control its own), display."""
 
 
 @dataclass(frozen=True)
@@ -82,36 +91,26 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
     table, wing = Table(start), is_wing(model)
     texts = _OF_THE_WING if wing else {}
     nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
-    validity = model.validity
-    health = {name: f"health.{name}" for name in model.regions}
-    mass = {name: f"mass.{name.removesuffix('_mass') if wing else name}" for name in model.masses}
+    control_unit = dict(zip(model.controls, model.control_units.split(), strict=True))
+    variables: dict[str, str] = {}
 
-    def add_controls(part: slice) -> None:
-        for name, unit in list(zip(model.controls, model.control_units.split(), strict=True))[part]:
-            text = texts.get(name, f"Control {name} of the loads")
-            table.add(name, "input", text, unit=unit, box=validity[name], default=nominal[name])
+    def add(group: str, part: slice = slice(None)) -> None:
+        prefix, causality, text, unit, display = _CHOSEN[group]
+        for name in getattr(model, group)[part]:
+            variable = f"{prefix}{name.removesuffix('_mass') if wing and group == 'masses' else name}"
+            table.add(
+                variable, causality, texts.get(variable, text.format(name)), display=display,
+                unit=unit or control_unit[name], box=model.validity[name], default=nominal[name],
+            )  # fmt: skip
+            variables[name] = variable
 
     first = 1 if wing else len(model.controls)  # its value references are those that it always had
-    add_controls(slice(0, first))
-    for name, variable in health.items():
-        table.add(
-            variable, "input", f"Stiffness that the region {name} has lost, as a fraction",
-            unit="1", display="%", box=validity[name],
-        )  # fmt: skip
-    add_controls(slice(first, None))
-    for name in model.parameters:
-        text = texts.get(name, f"Factor {name} on the stiffness")
-        table.add(name, "parameter", text, unit="1", box=validity[name], default=nominal[name])
-
-    def add_masses() -> None:
-        for name, variable in mass.items():
-            table.add(
-                variable, "parameter", texts.get(name, f"Mass of {name}"), unit="kg", display="g",
-                box=validity[name], default=nominal[name],
-            )  # fmt: skip
-
+    add("controls", slice(first))
+    add("regions")
+    add("controls", slice(first, None))
+    add("parameters")
     if not wing:
-        add_masses()
+        add("masses")
     for name, what, unit, value in zip(
         ("alpha", "beta"), ("Mass", "Stiffness"), ("1/s", "s"), model.damping.tolist(), strict=True
     ):
@@ -120,7 +119,7 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
             unit=unit, box=(0.0, None), default=value,
         )  # fmt: skip
     if wing:
-        add_masses()
+        add("masses")
         table.add(
             "initial_tip_displacement", "parameter",
             "Transient only: displacement of the tip from its equilibrium, released at the start",
@@ -138,7 +137,7 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
         )  # fmt: skip
     for name in model.displacements:
         variable = "tip_displacement" if wing else f"displacement.{name}"
-        table.add(variable, "output", texts.get(name, f"Displacement {name}"), unit="m", display="mm")
+        table.add(variable, "output", texts.get(variable, f"Displacement {name}"), unit="m", display="mm")
     for name in model.accelerations:
         table.add(
             f"acceleration.{name}", "output", f"Acceleration {name}; zero where the response is quasi-static",
@@ -161,7 +160,7 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
         table.add(f"frequency[{mode}]", "output", f"Natural frequency of mode {mode}", unit="Hz")
     for mode in modes:
         table.add(f"damping_ratio[{mode}]", "output", f"Damping ratio of mode {mode}", unit="1", display="%")
-    chosen = (*model.parameters, *health.values(), *mass.values(), *model.controls)
+    chosen = tuple(variables[name] for name in model.chosen)
     outputs = model.static_count + len(model.accelerations)
     if wing:
         names = ("initial_tip_displacement", "load_point_displacement")

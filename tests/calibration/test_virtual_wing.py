@@ -14,7 +14,7 @@ from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import published_lengths, read_lengths
-from calibration.joint.prior import weighed
+from calibration.joint.wing_table import weighed
 from calibration.static.experiments import published_measurements, read_measurements
 from calibration.virtual_wing import (
     RECORDED_GAUGE,
@@ -26,7 +26,7 @@ from calibration.virtual_wing import (
     measure_ring_down,
     weigh,
 )
-from calibration.wing.laboratory import WEIGHED_MASS_FILE, read_weighed_mass, write_lab_folder
+from calibration.wing.lab_data import WEIGHED_MASS_FILE, read_weighed_mass, write_lab_folder
 from fe.runtime.errors import OutsideModelError
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE, DigitalState, Geometry

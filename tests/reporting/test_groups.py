@@ -74,7 +74,7 @@ def test_a_run_is_flown_and_stored_without_heavy_libraries() -> None:
     """`uav-twin run --no-report` reads the program's modules and none of these."""
     code = (
         "import sys, twin_master.workflow, twin_master.assets.design_source\n"
-        "import calibration.paper.load_test, calibration.paper.particle_filter\n"
+        "import calibration.paper.load_test\n"
         "import calibration.static.errors_in_variables, calibration.static.experiments\n"
         "import calibration.static.stiffness_curve\n"
         "heavy = {'xarray', 'pandas', 'dask', 'distributed', 'zarr', 'matplotlib', 'bokeh', 'skfem', 'pymor',"

@@ -12,7 +12,7 @@ from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
 from calibration.geometry import read_lengths
 from calibration.static.experiments import read_measurements
-from calibration.wing.laboratory import read_weighed_mass
+from calibration.wing.lab_data import read_weighed_mass
 from fe.wing.design import SHIPPED_DESIGN
 from tests.command_line import call, said
 

@@ -21,11 +21,11 @@ from fmpy import read_model_description
 from fmpy.validation import validate_fmu
 
 from calibration.geometry import published_lengths
-from calibration.joint.prior import weighed
+from calibration.joint.wing_table import weighed
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE, Calibration
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
-from calibration.wing.laboratory import write_lab_folder
+from calibration.wing.lab_data import write_lab_folder
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState

@@ -111,8 +111,7 @@ def draw_parameter(
 def _draws_of_load_test(calibration: Calibration, seed: int, model: "ReducedModel | None") -> ParameterDraws:
     """Return draws of e from the published load test, on the stiffness of a model or the published line."""
     # A scenario can be read without any of this, and it takes a while to load.
-    from calibration.paper.load_test import push_forward
-    from calibration.paper.particle_filter import particle_filter
+    from calibration.paper.load_test import particle_filter, push_forward
     from calibration.static.errors_in_variables import exact_posterior
     from calibration.static.experiments import published_measurements
     from calibration.static.posterior import GaussianPrior

@@ -7,21 +7,24 @@ whose state may lie between the levels of the grid.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.errors import CalibrationError
-from calibration.published_strains import FILE_NAME, PublishedStrains, read_published_strains
+from reporting.json_file import read_json
 from twin_master.errors import InvalidStrainLibraryError
 from twin_master.network.graphical_model import Factor, StateSpace
 
-__all__ = ["FILE_NAME", "StrainLibrary", "load_strain_library"]
-
 Float = NDArray[np.float64]
 
+FILE_NAME = "UAVconfig.json"
+"""Name of the file in the authors' repository UAV-Digital-Twin."""
+
 REGION_NAMES = ("z1", "z2")
+PERCENT, MICROSTRAIN = 1e-2, 1e-6
 
 
 @dataclass(frozen=True)
@@ -114,38 +117,53 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
     Raises
     ------
     InvalidStrainLibraryError
-        If the file is missing, is no JSON, or lacks an entry; the entry is named.
+        If the file cannot be read, is no JSON, lacks an entry (it is named), or has values that are not in
+        the published format.
     """
     path = Path(path)
     file = path / FILE_NAME if path.is_dir() else path
+    content = read_json(file, InvalidStrainLibraryError, what="strain library")
     try:
-        return _arranged(read_published_strains(file))
-    except CalibrationError as error:
-        raise InvalidStrainLibraryError(str(error)) from error
+        return _arranged(content)
     except KeyError as error:
         raise InvalidStrainLibraryError(
             f"the strain library {file} lacks the entry {error}; is it the file {FILE_NAME} as published?"
         ) from error
-    except (TypeError, ValueError, AttributeError, RecursionError) as error:
+    except (TypeError, ValueError, AttributeError, IndexError) as error:
         raise InvalidStrainLibraryError(
             f"the strain library {file} is not in the published format: {error}"
         ) from error
 
 
-def _arranged(published: PublishedStrains) -> StrainLibrary:
-    """Add the states and the planning problem to the published arrays."""
-    states = StateSpace(
-        tuple(Factor(name, levels) for name, levels in zip(REGION_NAMES, published.levels, strict=True))
+def _arranged(content: Mapping[str, Any]) -> StrainLibrary:
+    levels = content["states"]
+    if len(levels) != len(REGION_NAMES):
+        raise ValueError(
+            f"expected the levels of {len(REGION_NAMES)} regions under 'states', got {len(levels)}"
+        )
+    controls = tuple(str(control) for control in content["controls"])
+    observations, probabilities = content["observations"], content["transition_probabilities"]
+    first = observations[str(levels[0][0])][str(levels[1][0])][controls[0]]
+    draws = [key for key in first if key != "mean"]
+    gauges = len(first["mean"])
+    rows = []
+    for draw, z1, z2, control in product(("mean", *draws), *levels, controls):
+        row = observations[str(z1)][str(z2)][control][draw]
+        if np.shape(row) != (gauges,) or not np.all(np.isfinite(np.asarray(row, dtype=np.float64))):
+            raise ValueError(f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauges} finite strains")
+        rows.append(row)
+    table = np.array(rows, dtype=np.float64).reshape(len(draws) + 1, -1, len(controls), gauges) * MICROSTRAIN
+    table.setflags(write=False)
+    factors = (
+        Factor(name, tuple(float(level) * PERCENT for level in given))
+        for name, given in zip(REGION_NAMES, levels, strict=True)
     )
-    strain = published.strain.reshape(states.size, *published.strain.shape[2:])
-    per_draw = published.strain_per_draw
-    probabilities = published.content["transition_probabilities"]
     return StrainLibrary(
-        states=states,
-        controls=published.controls,
-        young_modulus_factor=published.young_modulus_factor,
-        strain_per_draw=per_draw.reshape(len(per_draw), *strain.shape),
-        strain=strain,
-        discount=float(published.content["gamma"]),
-        worsening_probability={control: float(probabilities[control]) for control in published.controls},
+        states=StateSpace(tuple(factors)),
+        controls=controls,
+        young_modulus_factor=np.array([float(draw) for draw in draws]),
+        strain_per_draw=table[1:],
+        strain=table[0],
+        discount=float(content["gamma"]),
+        worsening_probability={control: float(probabilities[control]) for control in controls},
     )

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -89,7 +89,7 @@ class JournalFile:
         self._path, self._flush_seconds = folder / JOURNAL_NAME, flush_seconds
         self._flushed = time.monotonic()
         try:
-            next(read_lines(self._path, config_hash), None)
+            next(records(self._path, config_hash=config_hash), None)
             self.size = next((end for _, _, end in records_backwards(self._path)), 0)
             self._descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
             os.truncate(self._descriptor, self.size)
@@ -145,59 +145,58 @@ def line_of(record: Mapping[str, Any]) -> bytes:
     return sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
 
 
-def read_lines(path: Path, config_hash: str | None) -> Iterator[tuple[bytes, int]]:
-    """Return the JSON text of each whole line with the position of its end in bytes, the header first.
+def records(
+    path: Path, begin: int = 0, config_hash: str | None = None
+) -> Iterator[tuple[dict[str, Any], int, int]]:
+    """Return the record of each whole line with where it begins and ends in bytes; the header is left out.
 
     A journal that does not exist, or whose header was cut off, has no lines.
 
     Parameters
     ----------
     path : Path
-    config_hash : str or None
-        Of the configuration that it must belong to; None takes any.
+    begin : int
+        Of the first line, in bytes.
+    config_hash : str, optional
+        Of the configuration that it must belong to.
 
     Raises
     ------
     NotResumableError
         A line was changed or is damaged, or the journal belongs to another configuration.
     """
-    if not path.exists():
-        return
+    if path.exists():
+        with path.open("rb") as file:
+            yield from records_of(file, path, begin, config_hash)
+
+
+def records_of(
+    file: BinaryIO, path: Path, begin: int = 0, config_hash: str | None = None
+) -> Iterator[tuple[dict[str, Any], int, int]]:
+    """Return the records of an open journal, see `records`."""
     header = None if config_hash is None else line_of({"config_hash": config_hash})
-    end = 0
-    with path.open("rb") as file:
-        for number, line in enumerate(file):
-            if not line.endswith(b"\n") and (number or header is None or header.startswith(line)):
-                return  # cut off by a kill
-            end += len(line)
-            text = line[_DIGEST + 1 :].rstrip(b"\n")
-            if not _is_whole(line):
-                behind = sum(_is_whole(other) for other in file)
-                raise damaged(path, number, "it does not have the hash that stands before it", behind)
-            if not number and header is not None and line != header:
-                raise NotResumableError(
-                    f"the journal {path} belongs to another configuration than the config.json beside it: "
-                    "begin again with --replace."
-                )
-            yield text, end
-
-
-def read_records(path: Path, config_hash: str | None = None) -> Iterator[tuple[dict[str, Any], int]]:
-    """Return the record of each turn with the position of its end in bytes; the header is left out.
-
-    Raises
-    ------
-    NotResumableError
-        As `read_lines`.
-    """
-    for number, (text, end) in enumerate(read_lines(path, config_hash)):
-        if number:
-            yield record_of(path, number, text), end
+    file.seek(begin)
+    for line in file:
+        if not line.endswith(b"\n") and (begin or header is None or header.startswith(line)):
+            return  # cut off by a kill
+        record = whole_record(line)
+        if record is None:
+            raise damaged(path, begin, "it does not have the hash that stands before it")
+        if begin:
+            yield record, begin, begin + len(line)
+        elif header is not None and line != header:
+            raise NotResumableError(
+                f"the journal {path} belongs to another configuration than the config.json beside it: "
+                "begin again with --replace."
+            )
+        begin += len(line)
 
 
 def whole_record(line: bytes) -> dict[str, Any] | None:
     """Return the record of a line, None of a damaged one: each has a hash of its own."""
-    record = json.loads(line[_DIGEST + 1 :]) if _is_whole(line) else None
+    text = line[_DIGEST + 1 :].rstrip(b"\n")
+    whole = sha256(text).hexdigest().encode("ascii") == line[:_DIGEST]
+    record = json.loads(text) if whole else None
     return record if isinstance(record, dict) else None
 
 
@@ -236,8 +235,7 @@ def records_backwards(path: Path, end: int | None = None) -> Iterator[tuple[dict
                 if record is not None:
                     yield record, after, after + len(line)
                 elif line.endswith(b"\n") or after + len(line) < size:  # else cut off by a kill
-                    for number, (text, _) in enumerate(read_lines(path, None)):  # which says where
-                        record_of(path, number, text)
+                    raise damaged(path, after, "it does not have the hash that stands before it")
 
 
 def last_turn(path: Path, limit: float = math.inf) -> tuple[int, int]:
@@ -252,39 +250,17 @@ def last_turn(path: Path, limit: float = math.inf) -> tuple[int, int]:
     return next(((turn, end) for turn, end in lines if turn <= limit), (-1, 0))
 
 
-def records_behind(path: Path, end: int) -> Iterator[tuple[dict[str, Any], int]]:
-    """Return the record of each whole line behind the first `end` bytes, with the position of its own end."""
+def damaged(path: Path, begin: int, why: str) -> NotResumableError:
+    """Return the exception for the line that begins at so many bytes, which cannot be believed."""
+    number, whole, end = 1, {True: 0, False: 0}, 0
     with path.open("rb") as file:
-        file.seek(end)
         for line in file:
-            if not line.endswith(b"\n") or not _is_whole(line):
-                return
+            number += end < begin
+            whole[end < begin] += end != begin and whole_record(line) is not None
             end += len(line)
-            yield json.loads(line[_DIGEST + 1 :]), end
-
-
-def _is_whole(line: bytes) -> bool:
-    text = line[_DIGEST + 1 :].rstrip(b"\n")
-    return sha256(text).hexdigest().encode("ascii") == line[:_DIGEST]
-
-
-def record_of(path: Path, number: int, text: bytes) -> dict[str, Any]:
-    """Return the record of a line."""
-    record = json.loads(text)
-    if not isinstance(record, dict):
-        raise damaged(path, number, "it is no record")
-    return record
-
-
-def damaged(path: Path, number: int, why: str, behind: int | None = None) -> NotResumableError:
-    """Return the exception for a line, counted from 0, that cannot be believed.
-
-    `behind` is how many whole lines follow it, where that was looked at.
-    """
-    rest = "" if behind is None else f"; the {number} before it are whole, and {behind} behind it"
     return NotResumableError(
-        f"line {number + 1} of the journal {path} was changed or is damaged ({why}){rest}: begin again with "
-        "--replace."
+        f"line {number} of the journal {path} was changed or is damaged ({why}); {whole[True]} before it are "
+        f"whole, and {whole[False]} behind it: begin again with --replace."
     )
 
 

@@ -24,7 +24,7 @@ from twin_master.mission.journal import (
     damaged,
     line_of,
     plain,
-    read_records,
+    records,
 )
 from twin_master.mission.truth import Plant
 from twin_master.mission.turns import Happened, History, Reading, Turn
@@ -181,23 +181,24 @@ class CheckpointFile(JournalFile):
         path = folder / JOURNAL_NAME
         readings: list[Reading] = []
         decided: list[int] = []
-        whole, state, size, end = 0, "", 0, len(line_of({"config_hash": config_hash}))
+        whole, state, size, place, end = 0, "", 0, 0, len(line_of({"config_hash": config_hash}))
         self._state_bytes = 0
-        for record, behind in read_records(path, config_hash):
+        for record, begin, behind in records(path, config_hash=config_hash):
             if record.get("turn") != len(readings):
-                raise damaged(path, len(readings) + 1, f"turn {len(readings)} was expected")
+                raise damaged(path, begin, f"turn {len(readings)} was expected")
             try:
                 readings.append(_reading(record))
                 decided.append(int(record["next_control"]))
                 size += len(record["asset_state"] or "")
             except (KeyError, TypeError, ValueError, AttributeError) as error:
-                raise damaged(path, len(readings), f"it has another layout, {error}") from error
+                raise damaged(path, begin, f"it has another layout, {error}") from error
             if record["asset_state"] is not None:
-                whole, state, self._state_bytes, end = len(readings), record["asset_state"], size, behind
+                whole, state, self._state_bytes = len(readings), record["asset_state"], size
+                place, end = begin, behind
         try:
             content = zlib.decompress(base64.b64decode(state)) if whole else b""
         except (TypeError, ValueError, zlib.error, binascii.Error) as error:
-            raise damaged(path, whole, f"it has another layout, {error}") from error
+            raise damaged(path, place, f"it has another layout, {error}") from error
         self.turns = whole
         self.checkpoint = Checkpoint(readings[:whole], decided[:whole], content) if whole else None
         super().__init__(folder, config_hash)

@@ -10,6 +10,7 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from reporting.json_file import read_json
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import Expected, LearntExpectation
 from twin_master.learning.setup import learning_filter
-from twin_master.mission.journal import JOURNAL_NAME, array_of, damaged, whole_record
+from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
 from twin_master.network.estimator import Learnt, Notice
 from twin_master.network.inference import known_control, predict
@@ -108,7 +109,7 @@ class GrowingJournal:
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / JOURNAL_NAME
-        self._end = self._lines = self._file_number = 0
+        self._end = self._file_number = 0
 
     def begun_anew(self) -> bool:
         """Return whether another file took the place of the one read, or lines were taken back.
@@ -121,7 +122,7 @@ class GrowingJournal:
             return False
         if found.st_size >= self._end and self._file_number in (0, found.st_ino):
             return False
-        self._end = self._lines = self._file_number = 0
+        self._end = self._file_number = 0
         return True
 
     def news(self, most: int) -> list[tuple[int, dict[str, Any]]]:
@@ -137,15 +138,9 @@ class GrowingJournal:
             return found
         with suppress(FileNotFoundError), self._path.open("rb") as file:
             self._file_number = os.fstat(file.fileno()).st_ino
-            file.seek(self._end)
-            for line in file:
-                if len(found) == most or not line.endswith(b"\n"):  # one that is being written
-                    break
-                record = self._record(line, self._lines)
-                if self._end:  # not the heading
-                    found.append((self._end, record))
-                self._end += len(line)
-                self._lines += 1
+            for record, begin, end in islice(records_of(file, self._path, self._end), most):
+                found.append((begin, record))
+                self._end = end
         return found
 
     def read(self, places: Sequence[int]) -> list[SeenTurn] | None:
@@ -159,18 +154,8 @@ class GrowingJournal:
         with suppress(FileNotFoundError), self._path.open("rb") as file:
             if os.fstat(file.fileno()).st_ino != self._file_number:
                 return None
-            found = []
-            for place in places:
-                file.seek(place)
-                found.append(SeenTurn.of(self._record(file.readline(), 0)))
-            return found
+            return [SeenTurn.of(next(records_of(file, self._path, place))[0]) for place in places]
         return None
-
-    def _record(self, line: bytes, number: int) -> dict[str, Any]:
-        record = whole_record(line)
-        if record is None:
-            raise damaged(self._path, number, "it does not have the hash that stands before it")
-        return record
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
     last_turn,
-    read_lines,
+    records,
     records_backwards,
 )
 from twin_master.mission.loop import Source, operate
@@ -119,7 +119,7 @@ class Watch:
 
     def _take_up(self) -> None:
         """Take in the journal, and believe the patches that were adopted, as far as that is not done yet."""
-        next(read_lines(self._path, self._hash), None)  # it is that of this configuration
+        next(records(self._path, config_hash=self._hash), None)  # it is that of this configuration
         notice = self.scenario.notice
         self.standing = Standing(Teaching(1.0 if notice is None else notice.threshold))
         self.standing.read(self._path)

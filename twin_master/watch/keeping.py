@@ -16,7 +16,6 @@ from twin_master.mission.journal import (
     belief_record,
     damaged,
     plain,
-    read_lines,
     records_backwards,
 )
 from twin_master.mission.turns import Turn
@@ -80,8 +79,7 @@ class Standing:
                 behind.append(record)
                 before = record.get("standing")
                 if before is not None and before["begin"] != begin:
-                    number = sum(after <= begin for _, after in read_lines(path, None))
-                    raise damaged(path, number, "lines before it are missing, or not its own")
+                    raise damaged(path, begin, "lines before it are missing, or not its own")
         if before is not None:
             self.adopted = list(before["adopted"])
             self.teaching.restore(before["teaching"])

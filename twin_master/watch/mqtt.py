@@ -17,7 +17,7 @@ from typing import Any
 
 from reporting.files import atomic_write_text, write_error
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME, records_behind
+from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.broker import PASSWORD_VARIABLE, Broker
 from twin_master.watch.feeds import Fed, parsed, shown
@@ -317,7 +317,7 @@ class Outbox:
             return
         scenario, model = self._watch.scenario, self._watch.models[-1].knowledge.model
         with self._alone():
-            for line, end in records_behind(self._journal, self._read):
+            for line, _, end in records(self._journal, self._read):
                 if not self._session.room:
                     return
                 decision = journalled_decision(line, scenario, model)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.errors import NotResumableError
-from twin_master.mission.journal import array_of, damaged, read_lines, records_backwards
+from twin_master.mission.journal import array_of, damaged, records_backwards
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.network.graphical_model import GraphicalModel
@@ -148,8 +148,7 @@ def replay(
                 observed = array_of(record["observed"]), int(record["control_index"])
                 seen.setdefault(int(record["observation_turn"]), observed)
         except (KeyError, TypeError, ValueError, zlib.error) as error:
-            number = sum(after <= begin for _, after in read_lines(path, None))
-            raise damaged(path, number, f"it has another layout, {error}") from error
+            raise damaged(path, begin, f"it has another layout, {error}") from error
     found = _filtered(settled, seen, [*models, *([question] if question else [])], lag)
     if last is not None and question is None and last["next_control"] != found.twin.proposed_control:
         raise NotResumableError(

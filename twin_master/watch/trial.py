@@ -25,7 +25,7 @@ from reporting.progress import Progress, SilentProgress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
 from twin_master.errors import MissionInputError, TwinMasterError
-from twin_master.mission.journal import array_of, records_behind
+from twin_master.mission.journal import array_of, records
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
@@ -105,7 +105,7 @@ class Outcome:
         twin = self.model.knowledge.twin(lag=self.trial.scenario.watch.lag)
         twin.restore_state(self.state)
         alarms = [*self.alarms]
-        for record, _ in records_behind(self.trial.journal, self.trial.end):
+        for record, *_ in records(self.trial.journal, self.trial.end):
             if "observed" not in record:
                 continue
             at, observed = int(record["observation_turn"]), array_of(record["observed"])

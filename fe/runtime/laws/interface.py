@@ -98,6 +98,18 @@ def power(base: float, exponent: float) -> float:
     return float(base**exponent)
 
 
+def decayed(size: float, exponent: float, strength: float, duration: float) -> float:
+    """Return a positive s after s' = -strength s^exponent alone, zero where it is spent."""
+    if exponent == 1.0:
+        return float(size * np.exp(-strength * duration))
+    if exponent == 2.0:
+        return size / (1.0 + strength * duration * size)
+    if exponent == 0.0:
+        return max(size - strength * duration, 0.0)
+    root = size ** (1.0 - exponent) - (1.0 - exponent) * strength * duration
+    return float(root ** (1.0 / (1.0 - exponent))) if root > 0.0 else 0.0
+
+
 # ---------------------------------------------------------------- a law of position
 
 

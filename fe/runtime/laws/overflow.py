@@ -7,9 +7,7 @@ imports only: this file is copied into the FMU.
 
 from typing import Annotated, ClassVar
 
-import numpy as np
-
-from .interface import FloatArray, PortForce, power
+from .interface import FloatArray, PortForce, decayed, power
 
 
 class Overflow(PortForce):
@@ -56,12 +54,5 @@ def resistance(law: FloatArray, unit: float, speed: float) -> float:
 
 def kick(law: FloatArray, speed: float, strength: float, duration: float, through: bool) -> float:
     """Return the level after s' = -strength (s - l)^n alone."""
-    above, n = speed - law[2], law[1]
-    if above <= 0.0:
-        return speed
-    if n == 1.0:
-        return float(law[2] + above * np.exp(-strength * duration))
-    root = power(above, 1.0 - n) - (1.0 - n) * strength * duration
-    if root <= 0.0:
-        return float(law[2])
-    return float(law[2] + power(root, 1.0 / (1.0 - n)))
+    above = speed - law[2]
+    return float(law[2] + decayed(above, law[1], strength, duration)) if above > 0.0 else speed

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from .interface import FloatArray, PortForce, power
+from .interface import FloatArray, PortForce, decayed, power
 
 
 class PowerDamping(PortForce):
@@ -93,26 +93,14 @@ def kick(law: FloatArray, speed: float, strength: float, duration: float, throug
     size = abs(speed)
     if size == 0.0 or (exponent > 1.0 and size < 1e-60):
         return speed
-    if exponent == 1.0:
-        return float(speed * np.exp(-strength * duration))
-    if exponent == 2.0:
-        return speed / (1.0 + strength * duration * size)
-    if exponent == 0.0:
-        size -= strength * duration
-        return 0.0 if size <= 0.0 else (size if speed > 0.0 else -size)
-    root = size ** (1.0 - exponent) - (1.0 - exponent) * strength * duration
-    if root <= 0.0:
-        return 0.0
-    size = float(root ** (1.0 / (1.0 - exponent)))
+    size = decayed(size, exponent, strength, duration)
     return size if speed > 0.0 else -size
 
 
 def holding_limit(law: FloatArray, strength: float, duration: float) -> float:
     """Return the largest speed that `kick` brings to rest within `duration`, p below one."""
-    exponent = law[1]
-    if exponent == 0.0:
-        return strength * duration
-    return float(((1.0 - exponent) * strength * duration) ** (1.0 / (1.0 - exponent)))
+    rest = 1.0 - law[1]
+    return power(rest * strength * duration, 1.0 / rest)
 
 
 def crossing(

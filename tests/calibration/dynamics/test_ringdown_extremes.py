@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.dynamics.extremes import refine_by_extremes
 from calibration.dynamics.records import RingDownRecord, read_records
-from calibration.dynamics.trials import fit_trials
+from calibration.dynamics.trials import fit_trials, refine_by_extremes
 from calibration.errors import RingDownError
 
 WIDTH = 0.00811

@@ -24,8 +24,7 @@ from calibration.errors import (
 from calibration.joint.inference import Draws, infer
 from calibration.joint.measurement import PUBLISHED_MODES, modal_readings
 from calibration.joint.posterior import joint_posterior as joint_posterior_of
-from calibration.joint.prior import MODEL_ERROR, weighed, wing_priors
-from calibration.joint.wing_table import WingTable, tabulate_wing
+from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, weighed, wing_priors
 from calibration.result.record import STATE, ParameterPrior, Reading, prior_samples
 from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import LoadDisplacementData, published_measurements

@@ -8,8 +8,8 @@ from scipy.stats import chi2
 
 from calibration.paper.figures import calibration_figure
 from calibration.paper.load_test import StaticCalibration, calibrate_static
+from calibration.static.errors_in_variables import assess_fit
 from calibration.static.experiments import published_measurements
-from calibration.static.quality import assess_fit
 from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
 
 COUNT = 40_000

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.errors import DegenerateFilterError, PosteriorError
-from calibration.paper.particle_filter import kernel_density, normal_reference_bandwidth, particle_filter
+from calibration.paper.load_test import kernel_density, normal_reference_bandwidth, particle_filter
 from calibration.static.errors_in_variables import exact_posterior, pair_log_likelihoods
 from calibration.static.experiments import published_measurements
 from calibration.static.posterior import GaussianPrior

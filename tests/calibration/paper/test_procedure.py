@@ -19,8 +19,7 @@ from calibration.errors import (
     OutsideValidityError,
 )
 from calibration.joint.measurement import PUBLISHED_MODES
-from calibration.joint.prior import TOTAL_MASS, weighed
-from calibration.joint.wing_table import tabulate_wing
+from calibration.joint.wing_table import TOTAL_MASS, tabulate_wing, weighed
 from calibration.paper.procedure import damping_coefficients, fit_masses, read_published_results
 from calibration.result.record import Reading
 from fe.runtime.modal_system import rayleigh_damping_ratio

@@ -150,8 +150,6 @@ def test_what_is_drawn_together_stays_together(told: tuple[Calibration, Float]) 
     given = found.given("p1", found.mean("p1") + np.array([-0.01, 0.0, 0.01]))["p2"]
     slope = np.cov(found.samples, rowvar=False)[0, 1] / found.samples[:, 0].var()
     np.testing.assert_allclose(np.diff(given), 0.01 * slope, rtol=1e-3)
-    rows = found.stratified_rows("p1", 50, 1)
-    np.testing.assert_array_equal(found.draws_of("p1")[rows], found.stratified_draws("p1", 50, 1))
 
 
 def test_one_parameter_is_integrated_as_densely_as_one_likes(tmp_path: Path) -> None:

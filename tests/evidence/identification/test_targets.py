@@ -19,6 +19,7 @@ from evidence.identification.targets import (
     read_targets,
     strain_slopes,
 )
+from twin_master.errors import InvalidStrainLibraryError
 
 RESULTS = Path("calibration") / "step3" / "massoptimizationresults.csv"
 LIBRARY = Path("library") / "UAVconfig.json"
@@ -124,10 +125,11 @@ def test_other_levels_and_signs_are_refused(published_folder: Path) -> None:
 
         return change
 
-    refused(put(float("nan")), "NaN is no number in JSON", ExperimentFileError)
+    refused(put(float("nan")), "NaN is no number in JSON", InvalidStrainLibraryError)
     refused(
         lambda content: content["observations"]["20"]["0"]["3g"]["mean"].pop(),
         r"\[20\]\[0\]\[3g\]\[mean\] must hold 24 finite",
+        InvalidStrainLibraryError,
     )
     refused(put(-5.0), "must be positive")
     refused(lambda content: content["states"][0].pop(), "the levels of z1")

@@ -26,7 +26,7 @@ from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import begun, lines, soon_quiet, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
-from twin_master.mission.journal import JOURNAL_NAME, line_of, read_records, whole_record
+from twin_master.mission.journal import JOURNAL_NAME, line_of, records, whole_record
 from twin_master.mission.turns import History
 from twin_master.network.estimator import ExactFilter
 from twin_master.report.reading import open_run as stored_run
@@ -274,7 +274,7 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(
     lines = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(b"".join([*lines[:3], lines[3].replace(b'"turn": 2}', b'"turn": 1}'), *lines[4:]]))
     watch.run(feed, lambda _decision: None, turns=198)
-    with pytest.raises(NotResumableError, match=r"line 4 .*the 3 before it are whole"):
+    with pytest.raises(NotResumableError, match=r"line 4 .*; 3 before it are whole"):
         watch.told(0)
     for wrong, said in (
         (lines[:3] + lines[4:], r"line 192 .*lines before it are missing"),
@@ -410,7 +410,7 @@ def test_a_changed_journal_and_other_folders_are_refused(
     shutil.copytree(whole, tmp_path / "copy")
     journal = tmp_path / "copy" / JOURNAL_NAME
     journal.write_bytes(journal.read_bytes().replace(b'"turn": 9}', b'"turn": 8}', 1))
-    sentence = r"line 11 .*damaged.*the 10 before it are whole, and 40 behind it"
+    sentence = r"line 11 .*damaged.*; 10 before it are whole, and 40 behind it"
     with pytest.raises(NotResumableError, match=sentence) as caught:
         resume_watch(tmp_path / "copy", None, SilentProgress())
     # Another watch takes in all but what the line said, and refuses that by name.
@@ -501,7 +501,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: History
 def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
     before = (whole / JOURNAL_NAME).read_bytes()
     with flown(whole, 3, 20, SilentProgress()) as copy:
-        ended = [record for record, _ in read_records(copy / JOURNAL_NAME)]
+        ended = [record for record, *_ in records(copy / JOURNAL_NAME)]
         assert (copy / "run.nc").is_file()
     assert [record["turn"] for record in ended] == list(range(21))
     assert not copy.exists()

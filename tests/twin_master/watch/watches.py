@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from paho.mqtt import client as paho
 
-from twin_master.mission.journal import JOURNAL_NAME, read_records
+from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.scenario.tables import Noticing
 from twin_master.watch.folder import Watch
 from twin_master.watch.replay import BelievedModel
@@ -64,7 +64,7 @@ def wait_until(found: Callable[[], object]) -> None:
 
 
 def lines(watch: Watch) -> list[dict[str, Any]]:
-    return [record for record, _ in read_records(watch.folder / JOURNAL_NAME)]
+    return [record for record, *_ in records(watch.folder / JOURNAL_NAME)]
 
 
 PASSWORD = "a password"
