@@ -3,7 +3,6 @@
 A wave is the real part of A exp(s t) with the pole s = -decay rate + i damped angular frequency [1/s].
 """
 
-import cmath
 import math
 from typing import NamedTuple
 
@@ -59,11 +58,6 @@ class RingDownMode(NamedTuple):
     def amplitude(self) -> float:
         """Amplitude at the start of the record [V]."""
         return abs(self.wave)
-
-    @property
-    def phase(self) -> float:
-        """Phase there [rad]."""
-        return cmath.phase(self.wave)
 
     @property
     def frequency_standard_error(self) -> float:
