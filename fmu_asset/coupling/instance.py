@@ -2,7 +2,7 @@
 
 import ctypes
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Self
@@ -16,8 +16,7 @@ from fmu_asset.door.saved_state import PackedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import IDENTITY
 from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, IterationError
-from fmu_asset.instances.plan import Settings
-from fmu_asset.instances.series import Instance, Series, run
+from fmu_asset.instances.plan import Instance, Settings
 
 from .schedule import Schedule
 from .structure import Endpoint, listed
@@ -134,7 +133,7 @@ class CoupledFmus(Housing):
         The FMUs, by the names of the components.
     """
 
-    has_log = lost = False
+    lost = False
 
     def __init__(self, coupling: Coupling, assets: dict[str, FmiAsset]) -> None:
         self._coupling, self.assets = coupling, assets
@@ -228,9 +227,7 @@ class CoupledFmus(Housing):
         self._broken = False
         self.read()
 
-    def run(self, series: Series, report: Callable[[], object]) -> None:
-        """Make many steps; see `series.run`."""
-        run(self, series, report)
+    run = Instance.run
 
     def read(self) -> None:
         """Put the outputs of this moment into the reply block."""

@@ -21,7 +21,7 @@ from fmu_asset.errors import (
     FmuWorkerError,
 )
 from fmu_asset.instances.base import STATUS_NAMES
-from fmu_asset.instances.series import Instance
+from fmu_asset.instances.plan import Instance
 from fmu_asset.worker.client import WorkerInstance
 
 from .binding import Binding, load_binding
@@ -317,7 +317,7 @@ class OpenedFmu:
 
     def _collect_log(self) -> None:
         instance = self._housing.instance
-        if instance is not None and instance.has_log and not instance.lost:
+        if instance is not None and not instance.lost:
             for status, text in instance.take_log():
                 name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
                 self._log.append((name, text))

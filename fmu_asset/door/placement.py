@@ -25,8 +25,7 @@ from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance, forget_modules
-from fmu_asset.instances.plan import Plan, Settings
-from fmu_asset.instances.series import Instance
+from fmu_asset.instances.plan import Instance, Plan, Settings
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 

@@ -5,14 +5,17 @@ from typing import Self
 import numpy as np
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError
-from fmu_asset.instances.series import Instance, Series
+from fmu_asset.instances.plan import Floats, Instance
 from reporting.progress import Progress, SilentProgress, Stage
 
 from .exchange import Values, plain_values
 from .life import OpenedFmu
 from .reading import Observation, ObservationHistory
 from .saved_state import SavedState
-from .simulation import Histories, blocks, request_rows
+from .simulation import Histories, request_rows
+
+_BLOCK_BYTES = 2**20
+"""Of the requests or replies that are sent in one message."""
 
 
 class FmiAsset(OpenedFmu):
@@ -174,8 +177,9 @@ class FmiAsset(OpenedFmu):
         replies = np.full((len(rows), len(self._reply)), np.nan)
         with (progress or SilentProgress()).stage("Simulating", total=len(rows), unit="steps") as stage:
             begin = self._index
-            for series in blocks(rows, replies):
-                ended = self._run(series, stage)
+            length = max(1, _BLOCK_BYTES // max(rows[0].nbytes, replies[0].nbytes))
+            for first in range(0, len(rows), length):
+                ended = self._run(rows[first : first + length], replies[first : first + length], stage)
                 if ended is not None:
                     made = self._index - begin
                     if ended.time is not None and ended.time > moments[made]:
@@ -187,18 +191,17 @@ class FmiAsset(OpenedFmu):
         sentence = "" if ended is None else ended.sentence
         return self._exchange.outputs.history(moments[1:], replies, sentence)
 
-    def _run(self, series: Series, stage: Stage) -> FmuEndedError | None:
+    def _run(self, rows: Floats, replies: Floats, stage: Stage) -> FmuEndedError | None:
         """Make a block of steps; whatever happens, the asset is where the last complete one has left it.
 
         Return how the FMU has ended its simulation, if it has.
         """
-        before, begin, shown = self._request.tobytes(), self._index, 0
-        width = len(before)
+        before, begin, made = np.array(self._request), self._index, 0
 
-        def report() -> None:
-            nonlocal shown
-            stage.advance(series.done - shown)
-            shown = series.done
+        def report(done: int) -> None:
+            nonlocal made
+            stage.advance(done - made)
+            made = done
 
         failure: FmuError | None = None
         instance: Instance | None = self._opened()
@@ -206,28 +209,23 @@ class FmiAsset(OpenedFmu):
             while instance is not None:
                 failure = None
                 try:
-                    instance.run(series, report)
+                    instance.run(rows, replies, report)
                 except FmuError as error:
                     failure = error
                 instance = None
-                if not begin and series.done:
-                    first = np.frombuffer(series.replies[: series.reply_size])
-                    instance = self._stand_in(bytes(series.requests[:width]), first)
-                    series.done *= instance is None
+                if made and not begin and (instance := self._stand_in(rows[0].tobytes(), replies[0])):
+                    report(0)
         finally:
-            made = bytes(series.requests[: series.done * width])
-            self._index += series.done
-            self._request.cast("B")[:] = made[-width:] or before
+            self._index += made
+            self._request[:] = (rows[made - 1] if made else before).data
             if self._recording:
-                self._record += [made[i + 16 : i + width] for i in range(0, len(made), width)]
+                self._record += [row[2:].tobytes() for row in rows[:made]]
         if isinstance(failure, FmuEndedError):
             return failure
         if failure is not None:
             self._fail(failure, f"step {self._index} from t = {self.time:g} s")
-        end = series.done * series.reply_size
-        self._reply[:] = np.frombuffer(series.replies[end - series.reply_size : end])
-        self._refuse_not_finite(f" It was step {begin + series.done - 1}.")
-        report()
+        self._reply[:] = replies[made - 1]
+        self._refuse_not_finite(f" It was step {begin + made - 1}.")
         return None
 
     def observe(self) -> Observation:

@@ -1,20 +1,17 @@
 """Many steps under histories that are checked as a whole."""
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.errors import FmuInputError
-from fmu_asset.instances.series import Series
 
 from .exchange import Exchange
 
 Histories = Mapping[str, npt.ArrayLike]
 """Inputs by the binding's names: a number for all steps, or one for each; (n,) or (N, n) for an array."""
-
-_BLOCK_BYTES = 2**20
 
 
 def request_rows(
@@ -71,12 +68,3 @@ def request_rows(
     for slot, array in arrays:
         rows[:, list(slot.positions)] = array
     return rows
-
-
-def blocks(requests: npt.NDArray[np.float64], replies: npt.NDArray[np.float64]) -> Sequence[Series]:
-    """Return the steps in blocks of a size that is sent in one message."""
-    length = max(1, _BLOCK_BYTES // max(requests[0].nbytes, replies[0].nbytes))
-    return [
-        Series(requests[begin : begin + length], replies[begin : begin + length])
-        for begin in range(0, len(requests), length)
-    ]

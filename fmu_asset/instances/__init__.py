@@ -18,10 +18,9 @@ def open_instance(plan: Plan) -> "FmuInstance":
     """
     if plan.interface == "model-exchange":
         # Its solver is a library of its own; those who do not need it shall not load it.
-        from .model_exchange import MODEL_EXCHANGE
+        from .model_exchange import ModelExchange
 
-        return MODEL_EXCHANGE[plan.fmi_version](plan)
-    from .co_simulation import CoSimulation1, CoSimulation2, CoSimulation3
+        return ModelExchange(plan)
+    from .co_simulation import CoSimulation
 
-    kinds: dict[int, type[FmuInstance]] = {1: CoSimulation1, 2: CoSimulation2, 3: CoSimulation3}
-    return kinds[plan.fmi_version](plan)
+    return CoSimulation(plan)

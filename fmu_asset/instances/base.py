@@ -1,14 +1,12 @@
 """One instance of an FMU in this process: one batched set and get per step, whatever the FMI version.
 
-The worker process runs this; `FmiAsset` runs it directly when it is told not to isolate. Values travel in two
-blocks of doubles that are allocated once: `request` is time, step size, then all inputs; `reply` is all
-outputs. Integers and Booleans are doubles in the blocks.
+The worker process runs this; `FmiAsset` runs it directly when it is told not to isolate.
 """
 
 import ctypes
 import os
 import sys
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,32 +16,26 @@ from fmpy.fmi1 import FMICallException
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, FmuWorkerError
 
-from .block import Block, Lines, prepared
+from .block import Lines, exchanged, prepared
 from .messages import Mailbox, callbacks
-from .plan import Group, Plan, Settings
-from .series import Series, run
+from .plan import Group, Instance, Plan, Settings
 
 STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 OK, WARNING, DISCARD, ERROR, FATAL, PENDING = range(6)
 ACCEPTED = frozenset({OK, WARNING})
 _MESSAGES_IN_ERROR = 10
 
-Calls = list[tuple[str, Callable[[], int], Callable[[], None] | None]]
+Calls = list[tuple[str, Callable[[], int], Callable[[], object] | None]]
 """Name of the function, the prepared call, and what converts the values before or after it, if needed."""
 
 
-class FmuInstance(ABC):
-    """One instance; the subclasses speak the FMI versions.
+class FmuInstance(Instance):
+    """One instance in this process; subclasses speak the interfaces, and the table of classes the versions.
 
     Parameters
     ----------
     plan : Plan
         What is exchanged.
-
-    Attributes
-    ----------
-    request, reply : ctypes array of double
-        The blocks; see the module.
 
     Raises
     ------
@@ -51,22 +43,23 @@ class FmuInstance(ABC):
         If the binary cannot be loaded or the instance cannot be made.
     """
 
+    classes: ClassVar[dict[int, type[Any]]]
+    """fmpy's class for each FMI version: that of FMI 2, or one with its methods."""
+
     def __init__(self, plan: Plan) -> None:
-        self.request = (ctypes.c_double * (2 + plan.input_count))()
-        self.reply = (ctypes.c_double * max(plan.output_count, 1))()
+        super().__init__(plan)
         # Communication point and step size of a step, where they stand in the request.
         self._begin = ctypes.c_double.from_buffer(self.request, 0)
         self._size = ctypes.c_double.from_buffer(self.request, 8)
-        self._plan = plan
-        self._substeps = plan.substeps
+        self._plan, self._version = plan, plan.fmi_version
+        self._prefix = "fmi" if self._version == 1 else f"fmi{self._version}"
         self._lines = Lines(self.request, plan) if plan.linear_count else None
         self._mailbox = Mailbox(plan.instance_name)
-        self._lost = False
         self._ended: float | None = None
         self._phase = "instantiated"
         with _guarded_directory():
             try:
-                self._fmu = self._instantiate(plan, self._mailbox)
+                self._fmu = self._instantiated()
             except Exception as error:
                 messages = self._texts()
                 self._mailbox.close()
@@ -75,64 +68,44 @@ class FmuInstance(ABC):
             # fmpy lets negative statuses pass.
             if getattr(function, "restype", None) is ctypes.c_int:
                 function.errcheck = _refuse_negative
-        self._component = self._fmu.component
         self._values = self.request if self._lines is None else self._lines.values
         self._set = self._blocks("Set", plan.inputs, self._values, 2)
         self._get = self._blocks("Get", plan.outputs, self.reply, 0)
         self._moving = [] if self._lines is None else self._calls_of(self._lines)
 
-    _fmpy_class: ClassVar[type[Any]]
-    """fmpy's class for the FMI version and interface."""
-
-    # ------------------------------------------------------------------ what an FMI version says
-
-    def _made(self, plan: Plan, name: str) -> Any:
-        """Return fmpy's object, not yet instantiated."""
-        return self._fmpy_class(
+    def _instantiated(self) -> Any:
+        """Return fmpy's object, instantiated."""
+        plan, mailbox = self._plan, self._mailbox
+        fmu = self.classes[self._version](
             guid=plan.guid,
             modelIdentifier=plan.model_identifier,
             unzipDirectory=plan.folder,
-            instanceName=name,
+            instanceName=mailbox.name,
         )
-
-    def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
-        """Return fmpy's object, instantiated."""
-        fmu = self._made(plan, mailbox.name)
-        if plan.fmi_version == 3:
+        if self._version == 3:
             fmu.instantiate(loggingOn=True, logMessage=mailbox.log)
         else:
-            given = {"functions" if plan.fmi_version == 1 else "callbacks": callbacks(plan.fmi_version)}
+            given = {"functions" if self._version == 1 else "callbacks": callbacks(self._version)}
             fmu.instantiate(loggingOn=True, **given)
+        if not fmu.component:
+            raise RuntimeError("no instance was returned")
         return fmu
 
-    def _c_name(self, name: str) -> str:
-        """Return what the standard calls a C function such as SetReal."""
-        return f"fmi{name}" if self._plan.fmi_version == 1 else f"fmi{self._plan.fmi_version}{name}"
-
-    def _function(self, name: str, fmu: Any = None) -> Callable[..., int]:
-        """Return a C function such as SetReal, with the types that fmpy has given it."""
-        before = f"{self._plan.model_identifier}_" if self._plan.fmi_version == 1 else ""
-        function: Callable[..., int] = getattr((fmu or self._fmu).dll, before + self._c_name(name))
-        return function
-
-    def _initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
-        """Bring the instance to its first communication point."""
-        self._start(start_time, parameters, with_inputs=with_inputs)
+    # ------------------------------------------------------------------ what an interface says
 
     def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
-        """Initialise, as far as versions 2 and 3 do it alike whatever the interface."""
-        fmu, tolerance = self._fmu, self._plan.tolerance
-        experiment = {"startTime": start_time, "tolerance": tolerance}
-        if self._plan.fmi_version == 2:
+        """Bring the instance to its first communication point."""
+        fmu, experiment = self._fmu, {"startTime": start_time, "tolerance": self._plan.tolerance}
+        if self._version < 3:
             fmu.setupExperiment(**experiment)
         if self._plan.configuration:
             fmu.enterConfigurationMode()
             self._apply(self._plan.configuration)
             fmu.exitConfigurationMode()
         self._apply(parameters)
-        fmu.enterInitializationMode(**(experiment if self._plan.fmi_version == 3 else {}))
+        fmu.enterInitializationMode(**(experiment if self._version == 3 else {}))
         if with_inputs:
-            self._set_values(self._set)
+            self._make(self._set)
         fmu.exitInitializationMode()
 
     @abstractmethod
@@ -145,25 +118,14 @@ class FmuInstance(ABC):
 
     def _send(self) -> None:
         """Set the inputs of the request block."""
-        if self._lines is None:
-            self._set_values(self._set)
-        else:
+        if self._lines is not None:
             self._lines.aim()
-            self._set_values(self._set + self._moving)
+        self._make(self._set + self._moving)
 
     def _follow(self, lines: Lines) -> None:
         """Set the inputs where their lines are at a later communication point of the step."""
         lines.move(self._begin.value)
-        self._set_values(self._set + self._moving)
-
-    def _receive(self) -> None:
-        """Read the outputs into the reply block."""
-        for name, call, convert in self._get:
-            status = call()
-            if status not in ACCEPTED:
-                raise self._call_error(f"fmi{self._plan.fmi_version}{name}", status, "reading outputs")
-            if convert is not None:
-                convert()
+        self._make(self._set + self._moving)
 
     def _free(self) -> None:
         """Terminate and free the instance."""
@@ -175,47 +137,22 @@ class FmuInstance(ABC):
                     return
         self._fmu.freeInstance()
 
-    # ------------------------------------------------------------------ what the twin asks
+    # ------------------------------------------------------------------ what the twin asks; see `Instance`
 
     def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
-        """Set parameters, and inputs if wanted, and bring the instance to its first communication point.
-
-        Parameters
-        ----------
-        start_time : float
-            Start time [s].
-        parameters : Settings
-            What is set before initialisation.
-        with_inputs : bool
-            Whether the inputs of the request block are set, instead of the FMU's own start values.
-
-        Raises
-        ------
-        FmuCallError
-            If a call fails, or the FMU logs an error on the way.
-        """
+        """Set parameters, and inputs if wanted, and go to the first communication point."""
         errors = self._mailbox.errors
         if self._lines is not None:
             self._lines.stand()
         with self._calls("initialisation"):
-            self._initialise(start_time, parameters, with_inputs=with_inputs)
+            self._start(start_time, parameters, with_inputs=with_inputs)
             self._phase = "stepping"
         if self._mailbox.errors > errors:
             raise FmuCallError("The FMU refused its initialisation.", self._texts())
 
     def step(self) -> None:
-        """Make the step that the request block describes; the reply block then holds the outputs.
-
-        Raises
-        ------
-        FmuCallError
-            If a call returns Discard, Error or Fatal.
-        FmuEndedError
-            If the FMU ends its simulation, or has done so before.
-        FmuWorkerError
-            If the instance was lost to an earlier fatal error.
-        """
-        if self._lost:
+        """Make the step that the request block describes."""
+        if self.lost:
             raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
         if self._ended is not None:
             raise FmuEndedError(
@@ -223,41 +160,35 @@ class FmuInstance(ABC):
                 time=self._ended,
             )
         self._send()
-        if self._substeps == 1:
+        if self._plan.substeps == 1:
             self._advance()
         else:
             self._advance_many()
-        self._receive()
+        self._make(self._get, "reading outputs")
 
     def _advance_many(self) -> None:
         first, size = self._begin.value, self._size.value
-        for number in range(self._substeps):
+        for number in range(self._plan.substeps):
             self._begin.value = first + number * size
             try:
                 if number and self._lines is not None:
                     self._follow(self._lines)
                 self._advance()
-            except FmuEndedError:
-                raise
             except FmuError as error:
-                if number == 0:
+                if number == 0 or isinstance(error, FmuEndedError):
                     raise
                 # Between two observations it cannot go back to the last one.
-                self._lost = True
+                self.lost = True
                 raise type(error)(
-                    f"{error.sentence} It was step {number + 1} of the {self._substeps} between two "
+                    f"{error.sentence} It was step {number + 1} of the {self._plan.substeps} between two "
                     "observations: reset the asset or restore a state to go on.",
                     error.messages,
                 ) from error
 
-    def run(self, series: Series, report: Callable[[], object]) -> None:
-        """Make many steps; see `series.run`."""
-        run(self, series, report)
-
     def read(self) -> None:
         """Read the outputs of this moment into the reply block."""
         with self._calls("reading the outputs"):
-            self._receive()
+            self._make(self._get, "reading outputs")
 
     def save(self) -> bytes:
         """Return the serialised FMU state."""
@@ -270,15 +201,7 @@ class FmuInstance(ABC):
                 fmu.freeFMUState(state)
 
     def restore(self, content: bytes) -> None:
-        """Restore a serialised FMU state.
-
-        Raises
-        ------
-        FmuCallError
-            If a call fails.
-        FmuStateError
-            If the FMU refuses the state in its log.
-        """
+        """Restore a serialised FMU state."""
         fmu, errors = self._fmu, self._mailbox.errors
         with self._calls("restoring the state"):
             state = fmu.deserializeFMUState(content)
@@ -298,55 +221,55 @@ class FmuInstance(ABC):
             self._fmu.reset()
             self._phase, self._ended = "instantiated", None
 
+    @property
+    def has_log(self) -> bool:
+        """Whether the FMU has logged messages."""
+        return bool(self._mailbox.messages)
+
     def take_log(self) -> list[tuple[int, str]]:
         """Return and forget the messages that the FMU has logged: status and text."""
         return self._mailbox.take()
 
-    @property
-    def has_log(self) -> bool:
-        """Whether there are messages."""
-        return self._mailbox.filled
-
-    @property
-    def lost(self) -> bool:
-        """Whether a fatal error has made the instance unusable."""
-        return self._lost
-
     def close(self) -> None:
         """Free the instance; one that was lost to a fatal error is left alone, since freeing it can crash."""
         self._mailbox.close()
-        if self._lost:
+        if self.lost:
             return
-        self._lost = True
+        self.lost = True
         with _guarded_directory():
             self._free()
 
     # ------------------------------------------------------------------ inside
 
+    def _prepared(self, name: str, *arguments: Any) -> Callable[[], int]:
+        """Return a call of a C function of the instance such as SetReal, with C values."""
+        before = f"{self._plan.model_identifier}_" if self._version == 1 else ""
+        function = getattr(self._fmu.dll, before + self._prefix + name)
+        return prepared(function, ctypes.c_void_p.from_param(self._fmu.component), *arguments)
+
     def _blocks(self, verb: str, groups: tuple[Group, ...], doubles: Any, begin: int) -> Calls:
         calls: Calls = []
         for group in groups:
-            name = f"{verb}{group.kind}"
-            block = Block(self._plan.fmi_version, self._component, group, doubles, begin)
-            convert = block.to_fmu if verb == "Set" else block.from_fmu
-            call = prepared(self._function(name), *block.arguments)
-            calls.append((name, call, None if block.direct else convert))
+            arguments, convert = exchanged(self._version, group, doubles, begin, sent=verb == "Set")
+            calls.append((verb + group.kind, self._prepared(verb + group.kind, *arguments), convert))
             begin += group.count
         return calls
 
     def _apply(self, parameters: Settings) -> None:
         for kind, reference, values in parameters:
             doubles = (ctypes.c_double * len(values))(*values)
-            group = Group(kind, (reference,), len(values))
-            self._set_values(self._blocks("Set", (group,), doubles, 0))
+            self._make(self._blocks("Set", (Group(kind, (reference,), len(values)),), doubles, 0))
 
-    def _set_values(self, calls: Calls) -> None:
+    def _make(self, calls: Calls, what: str = "setting inputs") -> None:
+        """Make calls that set values, with the conversion before, or that read them."""
         for name, call, convert in calls:
-            if convert is not None:
+            if convert is not None and name[0] == "S":
                 convert()
             status = call()
             if status not in ACCEPTED:
-                raise self._call_error(f"fmi{self._plan.fmi_version}{name}", status, "setting inputs")
+                raise self._call_error(self._prefix + name, status, what)
+            if convert is not None and name[0] == "G":
+                convert()
 
     def _end(self, time: float) -> FmuEndedError:
         """Take note that the FMU has ended its simulation, and return the error that says so."""
@@ -363,7 +286,7 @@ class FmuInstance(ABC):
 
     @contextmanager
     def _calls(self, what: str) -> Iterator[None]:
-        if self._lost:
+        if self.lost:
             raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
         with _guarded_directory():
             try:
@@ -373,18 +296,13 @@ class FmuInstance(ABC):
 
     def _call_error(self, function: str, status: int, what: str) -> FmuCallError:
         name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
-        if status == PENDING:
-            self._lost = True
-            after = "asynchronous steps are not supported; export it to step synchronously"
-        elif not 0 <= status < FATAL:
-            self._lost = True
-            after = "the instance is lost; reset the asset or restore a state"
-        elif status == DISCARD:
-            after = "the FMU did not accept it and stays where it was; other inputs or a smaller step may do"
-        else:
-            # What the standard still allows then is not worth the trouble: another instance is made.
-            self._lost = True
-            after = "its values are no longer to be trusted; reset the asset or restore a state"
+        # What the standard still allows after an error is not worth the trouble: another instance is made.
+        self.lost = self.lost or status != DISCARD
+        after = {
+            DISCARD: "the FMU did not accept it and stays where it was; try other inputs or a smaller step",
+            ERROR: "its values are no longer to be trusted; reset the asset or restore a state",
+            PENDING: "asynchronous steps are not supported; export it to step synchronously",
+        }.get(status, "the instance is lost; reset the asset or restore a state")
         return FmuCallError(f"{function} returned {name} in {what}: {after}.", self._texts())
 
     def _texts(self) -> list[str]:
@@ -400,15 +318,15 @@ def _refuse_negative(status: int, function: Any, arguments: tuple[Any, ...]) -> 
 
 def _why_not_instantiated(error: Exception) -> str:
     text = " ".join(str(error).split())
-    text = text.rpartition(".so: ")[2]  # without our folder
+    text = text.rpartition(".so: ")[2].removesuffix(".")  # without our folder
     if "shared library" in str(error):
         return (
-            f"The FMU's binary cannot be loaded on this machine ({text.removesuffix('.')}); it was built for "
-            "another processor or system, or it needs a library that is not installed."
+            f"The FMU's binary cannot be loaded on this machine ({text}); it was built for another processor "
+            "or system, or it needs a library that is not installed."
         )
     if "undefined symbol" in text:
         return f"The FMU's binary lacks a function that its FMI version requires ({text}); export it again."
-    return f"The FMU could not be instantiated ({text.removesuffix('.')})."
+    return f"The FMU could not be instantiated ({text})."
 
 
 def forget_modules(folder: str) -> None:
@@ -419,10 +337,8 @@ def forget_modules(folder: str) -> None:
     """
     inside = folder.rstrip(os.sep) + os.sep
     sys.path[:] = [entry for entry in sys.path if not (entry + os.sep).startswith(inside)]
-    for (
-        name,
-        module,
-    ) in sys.modules.copy().items():  # one step, unlike a list of items: other threads import too
+    # A copy is one step, unlike a list of items: other threads import too.
+    for name, module in sys.modules.copy().items():
         if str(getattr(module, "__file__", None) or "").startswith(inside):
             sys.modules.pop(name, None)
 

@@ -6,85 +6,60 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from .plan import Group, Plan
+from .plan import Floats, Group, Plan
 
-# Enumerations are integers in FMI 1 and 2 and Int64 in FMI 3; see `archive.exchange_kind`.
-_C_TYPES: dict[tuple[int, str], Any] = {
-    (1, "Real"): ctypes.c_double,
-    (1, "Integer"): ctypes.c_int,
-    (1, "Boolean"): ctypes.c_ubyte,
-    (2, "Real"): ctypes.c_double,
-    (2, "Integer"): ctypes.c_int,
-    (2, "Boolean"): ctypes.c_int,
-    (3, "Float64"): ctypes.c_double,
-    (3, "Float32"): ctypes.c_float,
-    (3, "Int8"): ctypes.c_int8,
-    (3, "UInt8"): ctypes.c_uint8,
-    (3, "Int16"): ctypes.c_int16,
-    (3, "UInt16"): ctypes.c_uint16,
-    (3, "Int32"): ctypes.c_int32,
-    (3, "UInt32"): ctypes.c_uint32,
-    (3, "Int64"): ctypes.c_int64,
-    (3, "UInt64"): ctypes.c_uint64,
-    (3, "Boolean"): ctypes.c_bool,
-}
+_C_TYPES: dict[str, Any] = {
+    "Real": ctypes.c_double, "Float64": ctypes.c_double, "Float32": ctypes.c_float, "Integer": ctypes.c_int,
+    **{name: getattr(ctypes, f"c_{name.lower()}") for bits in (8, 16, 32, 64)
+       for name in (f"Int{bits}", f"UInt{bits}")},
+}  # fmt: skip
+_BOOLEANS: dict[int, Any] = {1: ctypes.c_ubyte, 2: ctypes.c_int, 3: ctypes.c_bool}
 
 
-class Block:
-    """Variables of one base type within a block of doubles.
+def values_of(block: Any) -> Floats:
+    """Return a ctypes array of doubles as an array that shares its memory."""
+    return np.frombuffer(memoryview(block).cast("B"))
+
+
+def exchanged(
+    fmi_version: int, group: Group, doubles: Any, begin: int, *, sent: bool
+) -> tuple[tuple[Any, ...], Callable[[], object] | None]:
+    """Return what a C function that sets or reads variables takes after the instance, and a conversion.
 
     Parameters
     ----------
     fmi_version : int
         1, 2 or 3.
-    component : pointer
-        The instance.
     group : Group
-        The variables.
+        The variables, of one base type; enumerations are integers, see `FmuDescription.exchange_kind`.
     doubles : ctypes array of double
-        The block.
+        The block of their values.
     begin : int
         Where the group begins in it.
+    sent : bool
+        Whether the values are set.
 
-    Attributes
-    ----------
-    arguments : tuple
-        What the C function takes, already as C values.
-    direct : bool
-        Whether the FMU reads and writes the block itself, so that nothing is to be converted.
+    Returns
+    -------
+    tuple of (tuple, callable or None)
+        C values; what converts the numbers of the block before they are set, or into the block after they
+        are read: None where the FMU reads and writes the block itself.
     """
-
-    def __init__(self, fmi_version: int, component: Any, group: Group, doubles: Any, begin: int) -> None:
-        kind = _C_TYPES[fmi_version, group.kind]
-        self._doubles, self._begin, self._count = doubles, begin, group.count
-        self._convert = float if kind is ctypes.c_float else int
-        self.direct = kind is ctypes.c_double
-        if self.direct and group.count:
-            self._values = (kind * group.count).from_buffer(doubles, 8 * begin)
-        else:
-            self._values = (kind * group.count)()
-        references = (ctypes.c_uint * len(group.references))(*group.references)
-        count = ctypes.c_size_t.from_param(len(group.references))
-        counted = (ctypes.c_size_t.from_param(group.count),) if fmi_version == 3 else ()
-        self.arguments: tuple[Any, ...] = (
-            ctypes.c_void_p.from_param(component),
-            ctypes.byref(references),
-            count,
-            ctypes.byref(self._values),
-            *counted,
-        )
-
-    def to_fmu(self) -> None:
-        """Convert the doubles for the FMU."""
-        for index in range(self._count):
-            self._values[index] = self._convert(self._doubles[self._begin + index])
-
-    def from_fmu(self) -> None:
-        """Convert what the FMU gave to doubles."""
-        for index in range(self._count):
-            self._doubles[self._begin + index] = float(self._values[index])
+    kind = _BOOLEANS[fmi_version] if group.kind == "Boolean" else _C_TYPES[group.kind]
+    convert = None
+    if kind is ctypes.c_double and group.count:
+        values = (kind * group.count).from_buffer(doubles, 8 * begin)
+    else:
+        values = (kind * group.count)()
+        pair = [np.ctypeslib.as_array(values), values_of(doubles)[begin : begin + group.count]]
+        target, source = pair if sent else reversed(pair)
+        convert = partial(np.copyto, target, source, casting="unsafe")
+    length = len(group.references)
+    counts = [length, group.count] if fmi_version == 3 else [length]
+    first, *further = [ctypes.c_size_t.from_param(count) for count in counts]
+    references = ctypes.byref((ctypes.c_uint * length)(*group.references))
+    return (references, first, ctypes.byref(values), *further), convert
 
 
 # Without declared types ctypes passes C values as they are: a third of the time of a call that converts.
@@ -139,8 +114,8 @@ class Lines:
         count = plan.linear_count
         self.values = (ctypes.c_double * (len(request) - count))()
         self.slopes = (ctypes.c_double * count)()
-        self._request, self._all = _array(request), _array(self.values)
-        self._moving, self._slopes = self._all[2 : 2 + count], _array(self.slopes)
+        self._request, self._all = values_of(request), values_of(self.values)
+        self._moving, self._slopes = self._all[2 : 2 + count], values_of(self.slopes)
         self._end, self._begin = self._request[2 : 2 + count], self._request[-count:]
         self._substeps, self._start, self._span = plan.substeps, 0.0, 1.0
 
@@ -160,7 +135,3 @@ class Lines:
         share = (time - self._start) / self._span
         there = share >= 1.0 - _ROUNDING
         self._moving[:] = self._end if there else self._begin + share * (self._end - self._begin)
-
-
-def _array(block: Any) -> npt.NDArray[np.float64]:
-    return np.frombuffer(memoryview(block).cast("B"))

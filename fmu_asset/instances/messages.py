@@ -41,13 +41,15 @@ class Mailbox:
     ----------
     name : str
         The unique name.
+    messages : deque of (int, str)
+        The last ones that were not taken yet: status and text.
     errors : int
         How many messages were errors so far.
     """
 
     def __init__(self, wish: str) -> None:
         self.name = f"{wish}-{os.getpid()}-{next(_instance_numbers)}"
-        self._messages: deque[tuple[int, str]] = deque(maxlen=_LONGEST_LOG)
+        self.messages: deque[tuple[int, str]] = deque(maxlen=_LONGEST_LOG)
         self.errors = 0
         _mailboxes[self.name.encode()] = self
 
@@ -55,17 +57,12 @@ class Mailbox:
         """Take a message."""
         self.errors += status in (_ERROR, _FATAL)
         text = (message or b"").decode("utf-8", "replace").rstrip()
-        self._messages.append((int(status), visible(text)))
-
-    @property
-    def filled(self) -> bool:
-        """Whether there are messages."""
-        return bool(self._messages)
+        self.messages.append((int(status), visible(text)))
 
     def take(self) -> list[tuple[int, str]]:
         """Return and forget the messages: status and text."""
-        messages = list(self._messages)
-        self._messages.clear()
+        messages = list(self.messages)
+        self.messages.clear()
         return messages
 
     def close(self) -> None:

@@ -1,11 +1,8 @@
 """Model exchange of FMI 1.0, 2.0 and 3.0 as if it were co-simulation: fmpy's models and CVODE."""
 
 import math
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Any
 
-from fmpy.fmi1 import FMICallException, FMU1Model
+from fmpy.fmi1 import FMU1Model
 from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 
@@ -16,8 +13,52 @@ from .block import Lines
 from .plan import Settings
 from .solver import Solver
 
+# ruff: noqa: N802, N815 - fmpy's names
+
 _MOST_EVENT_ITERATIONS = 100
 _MOST_EVENTS_IN_A_STEP = 10_000
+
+
+class FMU1ModelExchange(FMU1Model):  # type: ignore[misc]
+    """FMI 1.0 model exchange, which has no modes, with the methods of FMI 2.0."""
+
+    getNominalsOfContinuousStates = FMU1Model.getNominalContinuousStates
+
+    def setupExperiment(self, *, startTime: float, tolerance: float | None) -> None:
+        """Set the time, and keep the tolerance."""
+        self._tolerance = tolerance
+        self.setTime(startTime)
+
+    def enterInitializationMode(self) -> None:
+        """Do nothing, as in the other modes."""
+
+    enterEventMode = enterContinuousTimeMode = enterInitializationMode
+
+    def exitInitializationMode(self) -> None:
+        """Initialise, which is the first iteration of an event."""
+        controlled = b"\x00" if self._tolerance is None else b"\x01"
+        self._first = self.initialize(controlled, self._tolerance or 0.0)
+
+    def newDiscreteStates(self) -> tuple[bool, bool, bool, bool, bool, float]:
+        """Iterate once over an event."""
+        converged, _, _, finished, due, time = self._first or self.eventUpdate()
+        self._first = None
+        return not converged, finished, False, False, due, time
+
+    def completedIntegratorStep(self) -> tuple[bool, bool]:
+        """Return whether the FMU wants an event; it cannot want to end."""
+        return bool(super().completedIntegratorStep()), False
+
+    def reset(self) -> None:
+        """Refuse: FMI 1.0 model exchange cannot be reset, so that the asset makes a new instance."""
+        raise FmuCallError("FMI 1.0 model exchange has no reset.")
+
+
+class FMU3ModelExchange(FMU3Model):  # type: ignore[misc]
+    """FMI 3.0 model exchange with the methods of FMI 2.0."""
+
+    getDerivatives = FMU3Model.getContinuousStateDerivatives
+    newDiscreteStates = FMU3Model.updateDiscreteStates
 
 
 class ModelExchange(FmuInstance):
@@ -28,48 +69,14 @@ class ModelExchange(FmuInstance):
     line bends; without a change it keeps its step size and order.
     """
 
+    classes = {1: FMU1ModelExchange, 2: FMU2Model, 3: FMU3ModelExchange}  # noqa: RUF012
     _solver: Solver | None = None
     _next_event: float | None = None
     _sent: bytes | None = None
-    # What fmpy calls these depends on the FMI version.
-    _derivatives = "getDerivatives"
-    _nominals = "getNominalsOfContinuousStates"
-    _update = "newDiscreteStates"
 
-    # ------------------------------------------------------------------ what an FMI version says
-
-    def _update_once(self) -> tuple[bool, bool, float | None]:
-        """Iterate once over an event: whether more is needed, whether to end, next time event."""
-        more, finished, _, _, due, time = getattr(self._fmu, self._update)()
-        return more, finished, time if due else None
-
-    def _enter_event_mode(self) -> None:
-        self._fmu.enterEventMode()
-
-    def _enter_continuous_time_mode(self) -> None:
-        self._fmu.enterContinuousTimeMode()
-
-    def _completed_step(self) -> tuple[bool, bool]:
-        """Return whether the FMU wants an event, and whether it wants to end."""
-        event, end = self._fmu.completedIntegratorStep()
-        return bool(event), bool(end)
-
-    def _functions(self) -> dict[str, Callable[..., Any]]:
-        fmu = self._fmu
-        return {
-            "get_x": fmu.getContinuousStates,
-            "set_x": fmu.setContinuousStates,
-            "get_dx": getattr(fmu, self._derivatives),
-            "get_z": fmu.getEventIndicators,
-            "get_nominals": getattr(fmu, self._nominals),
-            "set_time": fmu.setTime,
-        }
-
-    # ------------------------------------------------------------------ the same for all
-
-    def _initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         self._close_solver()
-        self._start(start_time, parameters, with_inputs=with_inputs)
+        super()._start(start_time, parameters, with_inputs=with_inputs)
         self._iterate_event(start_time)
         self._sent = bytes(self._values)[16:] if with_inputs else None
 
@@ -85,8 +92,8 @@ class ModelExchange(FmuInstance):
             return
         with self._calls("setting inputs"):
             if now != self._sent:
-                self._enter_event_mode()
-                self._set_values(self._set)
+                self._fmu.enterEventMode()
+                self._make(self._set)
                 self._sent = now
                 self._iterate_event(self.request[0])
             if self._solver is not None:
@@ -102,33 +109,22 @@ class ModelExchange(FmuInstance):
         """Set the inputs of a moment [s], where they move."""
         if self._lines is not None:
             self._lines.move(time)
-            self._set_values(self._moving)
+            self._make(self._moving)
 
     def _advance(self) -> None:
         begin, size = self._begin.value, self._size.value
         end = begin + size
-        with self._calls(f"the step from t = {begin:g} s"):
-            if self._solver is None:
-                self._solver = Solver(
-                    start_time=begin,
-                    largest_step=size,
-                    tolerance=self._plan.solver_tolerance,
-                    states=self._plan.states,
-                    event_indicators=self._plan.event_indicators,
-                    functions=self._functions(),
-                    inputs=self,
-                )
+        with self._calls(self._where()):
+            solver = self._solver = self._solver or Solver(self._fmu, self._plan, self, begin, size)
             time = begin
             for _ in range(_MOST_EVENTS_IN_A_STEP):
-                time = self._advance_to_event(self._solver, time, end, 1e-12 * size)
+                time = self._advance_to_event(solver, time, end, 1e-12 * size)
                 if time >= end:
                     self._sent = bytes(self._values)[16:]
                     return
-        self._lost = True
-        raise FmuCallError(
-            f"The FMU had {_MOST_EVENTS_IN_A_STEP} events in the step from t = {begin:g} s and is at "
-            f"t = {time:g} s; its events probably pile up. Reset the asset, and try a smaller step_size.",
-            self._texts(),
+        raise self._lost_to(
+            f"The FMU had {_MOST_EVENTS_IN_A_STEP} events in {self._where()} and is at t = {time:g} s; its "
+            "events probably pile up. Reset the asset, and try a smaller step_size."
         )
 
     def _advance_to_event(self, solver: Solver, time: float, end: float, close: float) -> float:
@@ -140,22 +136,21 @@ class ModelExchange(FmuInstance):
             try:
                 event, time = solver.advance(time, target)
             except RuntimeError as error:
-                self._lost = True
-                raise FmuCallError(
+                raise self._lost_to(
                     f"The solver could not integrate the FMU in the step from t = {time:g} s ({error}); "
-                    "reset the asset, and try a smaller step_size or another tolerance in the binding.",
-                    self._texts(),
+                    "reset the asset, and try a smaller step_size or another tolerance in the binding."
                 ) from error
         if not event and abs(time - end) <= close:
             time = end
         self._fmu.setTime(time)
         self.apply(time)
         if self._plan.completed_step:
-            wanted, finished = self._completed_step()
-            self._heed_end(finished, time)
-            event = event or wanted
+            wanted, finished = self._fmu.completedIntegratorStep()
+            if finished:
+                raise self._end(time)
+            event = event or bool(wanted)
         if event or (due is not None and time >= due - close):
-            self._enter_event_mode()
+            self._fmu.enterEventMode()
             self._iterate_event(time)
             solver.reset(time)
         return time
@@ -163,23 +158,23 @@ class ModelExchange(FmuInstance):
     def _iterate_event(self, time: float) -> None:
         """Update the discrete states until they are settled, and go on in continuous time."""
         for _ in range(_MOST_EVENT_ITERATIONS):
-            more, finished, following = self._update_once()
-            self._heed_end(finished, time)
+            more, finished, _, _, due, following = self._fmu.newDiscreteStates()
+            if finished:
+                raise self._end(time)
             if not more:
                 break
         else:
-            self._lost = True
-            raise FmuCallError(
+            raise self._lost_to(
                 f"The FMU's discrete states do not settle at t = {time:g} s: {_MOST_EVENT_ITERATIONS} event "
-                "iterations were made; the instance is lost.",
-                self._texts(),
+                "iterations were made; the instance is lost."
             )
-        self._next_event = following if following is None or math.isfinite(following) else None
-        self._enter_continuous_time_mode()
+        self._next_event = following if due and math.isfinite(following) else None
+        self._fmu.enterContinuousTimeMode()
 
-    def _heed_end(self, finished: bool, time: float) -> None:
-        if finished:
-            raise self._end(time)
+    def _lost_to(self, sentence: str) -> FmuCallError:
+        """Give the instance up, and return the error that says why."""
+        self.lost = True
+        return FmuCallError(sentence, self._texts())
 
     def _close_solver(self) -> None:
         if self._solver is not None:
@@ -194,67 +189,3 @@ class ModelExchange(FmuInstance):
     def _free(self) -> None:
         self._close_solver()
         super()._free()
-
-
-class ModelExchange1(ModelExchange):
-    """FMI 1.0 model exchange; it has no modes."""
-
-    _fmpy_class = FMU1Model
-    _nominals = "getNominalContinuousStates"
-
-    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
-        self._fmu.setTime(start_time)
-        self._apply(parameters)
-        if with_inputs:
-            self._set_values(self._set)
-        tolerance = self._plan.tolerance
-        converged, _, _, finished, due, time = self._fmu.initialize(
-            toleranceControlled=b"\x00" if tolerance is None else b"\x01", relativeTolerance=tolerance or 0.0
-        )
-        self._heed_end(finished, start_time)
-        self._first: tuple[bool, float | None] | None = (not converged, time if due else None)
-
-    def _update_once(self) -> tuple[bool, bool, float | None]:
-        if self._first is not None:
-            # The initialisation was the first iteration.
-            (more, due), self._first = self._first, None
-            return more, False, due
-        converged, _, _, finished, due_defined, time = self._fmu.eventUpdate()
-        return not converged, finished, time if due_defined else None
-
-    def _enter_event_mode(self) -> None:
-        pass
-
-    def _enter_continuous_time_mode(self) -> None:
-        pass
-
-    def _completed_step(self) -> tuple[bool, bool]:
-        return bool(self._fmu.completedIntegratorStep()), False
-
-    def reset(self) -> None:
-        """Refuse: FMI 1.0 model exchange cannot be reset, so that the asset makes a new instance."""
-        raise FmuCallError("FMI 1.0 model exchange has no reset.")
-
-    def _free(self) -> None:
-        self._close_solver()
-        if self._phase == "stepping":
-            with suppress(FMICallException):
-                self._fmu.terminate()
-        self._fmu.freeInstance()
-
-
-class ModelExchange2(ModelExchange):
-    """FMI 2.0 model exchange."""
-
-    _fmpy_class = FMU2Model
-
-
-class ModelExchange3(ModelExchange):
-    """FMI 3.0 model exchange."""
-
-    _fmpy_class = FMU3Model
-    _derivatives = "getContinuousStateDerivatives"
-    _update = "updateDiscreteStates"
-
-
-MODEL_EXCHANGE: dict[int, type[ModelExchange]] = {1: ModelExchange1, 2: ModelExchange2, 3: ModelExchange3}

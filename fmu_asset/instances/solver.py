@@ -2,7 +2,7 @@
 
 import ctypes
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from fmpy.fmi1 import FMICallException
 from fmpy.sundials import CVodeSolver
@@ -12,6 +12,7 @@ from fmpy.sundials.nvector_serial import N_VDestroy_Serial
 from fmu_asset.errors import FmuError
 
 from .base import DISCARD
+from .plan import Plan
 
 _MOST_INTERNAL_STEPS = 100_000
 
@@ -19,63 +20,49 @@ for _name in ("SUNLinSolFree", "SUNMatDestroy", "SUNContext_Free"):
     getattr(sundials_core, _name).argtypes = [ctypes.c_void_p]
 
 
-class Inputs(Protocol):
-    """What sets inputs that change between communication points."""
-
-    def apply(self, time: float) -> None:
-        """Set the inputs of a moment [s]."""
-
-
 class Solver(CVodeSolver):  # type: ignore[misc]
     """Backward differentiation with root finding for one model-exchange instance.
 
     Parameters
     ----------
+    fmu : fmpy model
+        The FMU, with the methods of FMI 2.0.
+    plan : Plan
+        Its numbers of states and event indicators, and the relative tolerance; absolute ones are this times
+        the nominal values.
+    inputs : ModelExchange
+        Whose `apply` sets the inputs of a moment; asked before each evaluation.
     start_time : float
         Where to begin [s].
     largest_step : float
         Limit of internal steps [s], so that an event indicator that changes sign twice is not missed for
         long.
-    tolerance : float
-        Relative; absolute ones are this times the nominal values.
-    states, event_indicators : int
-        Numbers of continuous states and event indicators.
-    functions : mapping of str to callable
-        `get_x`, `set_x`, `get_dx`, `get_z`, `get_nominals`, `set_time` of fmpy's model.
-    inputs : Inputs
-        Asked before each evaluation.
     """
 
-    def __init__(
-        self,
-        *,
-        start_time: float,
-        largest_step: float,
-        tolerance: float,
-        states: int,
-        event_indicators: int,
-        functions: dict[str, Callable[..., Any]],
-        inputs: Inputs,
-    ) -> None:
+    def __init__(self, fmu: Any, plan: Plan, inputs: Any, start_time: float, largest_step: float) -> None:
         self._failure: Exception | None = None
         self._open = True
-        nominals = functions["get_nominals"]
 
         def get_nominals(values: Any, count: int) -> None:
-            nominals(values, count)
+            fmu.getNominalsOfContinuousStates(values, count)
             for index in range(count):
                 # Zero says nothing of a size, and CVODE takes no tolerance of zero for a state that is zero.
                 values[index] = abs(values[index]) or 1.0
 
         super().__init__(
-            nx=states,
-            nz=event_indicators,
+            nx=plan.states,
+            nz=plan.event_indicators,
+            get_x=fmu.getContinuousStates,
+            set_x=fmu.setContinuousStates,
+            get_dx=fmu.getDerivatives,
+            get_z=fmu.getEventIndicators,
+            get_nominals=get_nominals,
+            set_time=fmu.setTime,
             input=inputs,
             startTime=start_time,
             maxStep=largest_step,
-            relativeTolerance=tolerance,
+            relativeTolerance=plan.solver_tolerance,
             maxNumSteps=_MOST_INTERNAL_STEPS,
-            **(functions | {"get_nominals": get_nominals}),
         )
 
     # An exception that leaves a ctypes callback is printed and forgotten, and CVODE goes on with rubbish.

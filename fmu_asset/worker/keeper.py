@@ -12,6 +12,7 @@ import os
 import select
 import signal
 import time
+from contextlib import suppress
 from typing import NoReturn
 
 from fmu_asset.folders import remove_folder
@@ -24,13 +25,14 @@ _LONGEST_END = 5.0
 _DEATH_SIGNAL, _CHILD_SUBREAPER = 1, 36  # of prctl(2)
 
 
-def keep(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -> NoReturn:
+def keep(scratch: str, shared: str, grants: str) -> NoReturn:
     """Start the worker, await its end or the twin's, clear up, and end as the worker did.
+
+    The pipes to the twin are the standard input and output; the worker has them elsewhere, and there what an
+    FMU prints goes to the log.
 
     Parameters
     ----------
-    incoming, outgoing : int
-        The worker's ends of the pipes.
     scratch, shared : str
         Folder of the worker, and of the extracted FMU; the twin removes them unless it is dead.
     grants : str
@@ -42,40 +44,46 @@ def keep(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) -
     gone = os.pidfd_open(twin)  # the pipe's end does not tell: an FMU can open its other side for itself
     if os.getppid() != twin:
         os._exit(0)
+    incoming, outgoing = os.dup(0), os.dup(1)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.dup2(2, 1)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     prctl = ctypes.CDLL(None).prctl
     prctl(_CHILD_SUBREAPER, 1, 0, 0, 0)
-    woken, waker = os.pipe()
-    os.set_blocking(waker, False)
-    signal.set_wakeup_fd(waker, warn_on_full_buffer=False)
-    worker = 0
     asked = False
+    reaped: dict[int, int] = {}
 
     def end_now(*_: object) -> None:
         nonlocal asked
         asked = True
-        os.kill(worker, signal.SIGKILL)  # it is reaped below only, so that the number is still its own
+        _kill(ended)
 
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-    signal.signal(signal.SIGCHLD, lambda *_: None)
+    def reap(*_: object) -> None:
+        """Reap whoever has ended, and keep the exit status."""
+        with suppress(ChildProcessError):
+            while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                reaped.update([ended])
+
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGCHLD})
     worker = os.fork()
     if worker == 0:
-        signal.set_wakeup_fd(-1)
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-        os.close(woken)
-        os.close(waker)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM, signal.SIGCHLD})
         os.close(gone)
         os.setpgid(0, 0)
         prctl(_DEATH_SIGNAL, int(signal.SIGKILL), 0, 0, 0)
         if os.getppid() != keeper:
             os._exit(0)
         _work(incoming, outgoing, scratch, shared, grants)
+    ended = os.pidfd_open(worker)
+    signal.signal(signal.SIGCHLD, reap)
     signal.signal(signal.SIGTERM, end_now)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM, signal.SIGCHLD})
     os.write(outgoing, WORKER_NUMBER.pack(worker))
     os.close(outgoing)
-    deserted, status = _await_end(worker, incoming, gone, woken)
+    deserted = _await_end(ended, incoming, gone)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # from here on nobody's number is free unseen
+    reap()
+    status = reaped[worker]
     _end_descendants()
     if deserted and not asked and status != 0 and _ended(gone):
         remove_folder(scratch)
@@ -106,41 +114,29 @@ def _work(incoming: int, outgoing: int, scratch: str, shared: str, grants: str) 
     os._exit(OWN_FAILURE)
 
 
-def _await_end(worker: int, incoming: int, gone: int, woken: int) -> tuple[bool, int]:
-    """Return whether the twin let go of its pipe or is gone, and the worker's exit status."""
+def _kill(process: int) -> None:
+    with suppress(ProcessLookupError):
+        signal.pidfd_send_signal(process, signal.SIGKILL)
+
+
+def _await_end(ended: int, incoming: int, gone: int) -> bool:
+    """Await the worker's end; return whether the twin let go of its pipe or is gone."""
     poll = select.poll()
-    poll.register(woken, select.POLLIN)
+    poll.register(ended, select.POLLIN)
     poll.register(incoming, 0)  # the end of a pipe is reported in any case
     poll.register(gone, select.POLLIN)
     deadline: float | None = None
     while True:
-        status = _reaped(worker)
-        if status is not None:
-            return deadline is not None, status
         limit = None if deadline is None else 1000.0 * max(deadline - time.monotonic(), 0.0)
         events = [descriptor for descriptor, _ in poll.poll(limit)]
-        if woken in events:
-            os.read(woken, 4096)
-        for descriptor in {incoming, gone}.intersection(events):
+        if ended in events:
+            return deadline is not None
+        for descriptor in events:
             poll.unregister(descriptor)
             deadline = time.monotonic() + _GRACE
         if deadline is not None and time.monotonic() >= deadline:
-            os.kill(worker, signal.SIGKILL)
+            _kill(ended)
             deadline = time.monotonic() + _GRACE
-
-
-def _reaped(worker: int) -> int | None:
-    """Reap whoever has ended; return the worker's exit status if it was among them."""
-    status = None
-    while True:
-        try:
-            number, its_status = os.waitpid(-1, os.WNOHANG)
-        except ChildProcessError:
-            return status
-        if number == 0:
-            return status
-        if number == worker:
-            status = its_status
 
 
 def _end_descendants() -> None:
@@ -152,25 +148,22 @@ def _end_descendants() -> None:
                 continue
         except ChildProcessError:
             return
-        for child, group in _children():
+        for child in _children():
             os.kill(child, signal.SIGKILL)
-            if group != os.getpgrp():  # at once, so that nobody in it can have a child meanwhile
+            if (group := os.getpgid(child)) != os.getpgrp():  # at once, so that nobody has a child meanwhile
                 os.killpg(group, signal.SIGKILL)
         time.sleep(0.002)
 
 
-def _children() -> list[tuple[int, int]]:
-    """Return the keeper's children with their process groups."""
-    keeper, found = os.getpid(), []
+def _children() -> list[int]:
+    """Return the numbers of the keeper's children."""
+    found = []
     for name in os.listdir("/proc"):  # noqa: PTH208 - pathlib would be loaded for this alone
-        if name.isdigit():
-            try:
+        with suppress(OSError):
+            if name.isdigit():
                 with open(f"/proc/{name}/stat", "rb") as file:  # noqa: PTH123
-                    fields = file.read().rpartition(b")")[2].split()
-            except OSError:
-                continue
-            if int(fields[1]) == keeper:
-                found.append((int(name), int(fields[2])))
+                    parent = file.read().rpartition(b")")[2].split()[1]
+                found += [int(name)] * (int(parent) == os.getpid())
     return found
 
 

@@ -3,10 +3,10 @@
 import contextlib
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -54,7 +54,7 @@ class WorkerProcess:
     number : int
         Process number of the worker.
     outgoing, incoming : int
-        The twin's ends of the pipes; -1 once closed.
+        The twin's ends of the pipes.
 
     Raises
     ------
@@ -65,38 +65,33 @@ class WorkerProcess:
     def __init__(self, folder: Path, shared: str, grants: Grants | None) -> None:
         self._folder = folder
         self._remark = _CONFINED if grants is not None and landlock_version() else ""
-        their_in, self.outgoing = os.pipe()
-        self.incoming, their_out = os.pipe()
         root = str(Path(__file__).parents[2])
         program = (
             "import sys; sys.path.append(sys.argv[1]); from fmu_asset.worker.keeper import keep; "
-            "keep(int(sys.argv[2]), int(sys.argv[3]), *sys.argv[4:])"
+            "keep(*sys.argv[2:])"
         )
         # One thread: the matrices are small, and results do not depend on the number of cores.
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         environment |= {"PYTHONDONTWRITEBYTECODE": "1", "TMPDIR": str(folder)}
         confined = "" if grants is None else json.dumps(asdict(grants))
-        arguments = [root, str(their_in), str(their_out), str(folder), shared, confined]
         try:
             with (folder / "worker.log").open("wb") as log:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-c", program, *arguments],
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
+                    [sys.executable, "-P", "-c", program, root, str(folder), shared, confined],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
                     stderr=log,
+                    bufsize=0,
                     cwd=folder,
                     env=environment,
-                    pass_fds=(their_in, their_out),
                     # What the terminal sends is for the twin alone.
                     start_new_session=True,
                 )
         except OSError as error:
-            os.close(self.outgoing)
-            os.close(self.incoming)
             raise FmuWorkerError(f"The worker process could not be started ({error}).") from error
-        finally:
-            os.close(their_in)
-            os.close(their_out)
+        self._pipes = [pipe for pipe in (self._process.stdin, self._process.stdout) if pipe is not None]
+        self.outgoing, self.incoming = (pipe.fileno() for pipe in self._pipes)
+        self._ended = os.pidfd_open(self._process.pid)
         first = bytearray(WORKER_NUMBER.size)
         if not receive(self.incoming, memoryview(first)):
             self.close_pipes()
@@ -113,6 +108,7 @@ class WorkerProcess:
             except subprocess.TimeoutExpired:  # the worker dies with its keeper
                 self._process.kill()
                 self._process.wait()
+            os.close(self._ended)
             if self._process.returncode == -signal.SIGKILL:  # of the worker, or of the keeper before its work
                 end_processes(self._folder)
 
@@ -121,12 +117,15 @@ class WorkerProcess:
         self._await_end(limit)
         self.kill()
 
+    @property
+    def closed(self) -> bool:
+        """Whether the pipes are closed."""
+        return self._pipes[0].closed
+
     def close_pipes(self) -> None:
         """Close the twin's ends, which is how a worker learns that it is not needed any more."""
-        if self.outgoing >= 0:
-            os.close(self.outgoing)
-            os.close(self.incoming)
-            self.outgoing = self.incoming = -1
+        for pipe in self._pipes:
+            pipe.close()
 
     def death(self, what: str) -> FmuWorkerError:
         """Return the error that says how it died."""
@@ -151,17 +150,11 @@ class WorkerProcess:
 
     def _await_end(self, limit: float) -> bool:
         """Return whether it ended in time; it is not reaped yet."""
-        deadline = time.monotonic() + limit
-        options = os.WEXITED | os.WNOHANG | os.WNOWAIT
-        while True:
-            try:
-                if os.waitid(os.P_PID, self._process.pid, options) is not None:
-                    return True
-            except ChildProcessError:
-                return True
-            if time.monotonic() >= deadline:
-                return False
-            time.sleep(0.002)
+        if self._process.returncode is not None:
+            return True
+        poll = select.poll()
+        poll.register(self._ended, select.POLLIN)
+        return bool(poll.poll(1000.0 * limit))
 
     def _last_words(self) -> list[str]:
         """Return the last lines of its output; of a crash of Python's, not the trace of our own code."""

@@ -1,37 +1,25 @@
 """What twin and worker say to each other.
 
-Two pipes carry binary messages: a header (operation or kind, whether there are log messages, number of the
-request, length), then the payload. A reply bears the number of its request: an FMU that has made a copy of
-the worker's process, which answers too, cannot shift the replies. Texts of the worker are separated by zeros
-and are not JSON, of which an FMU in Python may have changed the module. A step is the request block of an
-instance one way and the reply block the other, without copies. A run is many request blocks in one message;
-their reply blocks come back in parts while it goes on, so that the twin sees how far it is and can stop a
-step that takes too long.
+Two pipes carry binary messages: a header (kind, whether there are log messages, number of the request,
+length), then the payload. A reply bears the number of its request: an FMU that has made a copy of the
+worker's process, which answers too, cannot shift the replies. A step is the request block of an instance one
+way and the reply block the other, without copies. Any other call is a pickle of its name, the request block
+and the arguments; what comes back is never one: bytes, or texts separated by zeros, which are not JSON, of
+which an FMU in Python may have changed the module. The reply blocks of many steps come back in parts while
+these go on, so that the twin sees how far they are and can stop one that takes too long.
 """
 
 import os
 import select
 import struct
 import time
-from enum import IntEnum
 
 HEADER = struct.Struct("<HHIQ")
 WORKER_NUMBER = struct.Struct("<q")
 """First of all, the process number of the worker."""
 LARGEST_MESSAGE = 2**23
 """Bytes of an answer in words; a header that announces more does not come from the other side's program."""
-
-
-class Operation(IntEnum):
-    """What the twin asks: a step, several, the outputs, another method of the instance, or to end."""
-
-    STEP = 1
-    RUN = 2
-    READ = 3
-    CALL = 4
-    CLOSE = 5
-
-
+STEP, CALL = 1, 2
 RESULT, FAILURE, PART = 1, 2, 3
 OWN_FAILURE, PIPES_GONE, DESERTED = 70, 71, 72
 """Exit statuses of a worker: its own program failed, the FMU closed its pipes, the twin is gone."""
@@ -71,9 +59,8 @@ def send(descriptor: int, *parts: bytes | bytearray | memoryview) -> None:
     BrokenPipeError
         If the other side is gone.
     """
-    total = sum(len(part) for part in parts)
     sent = os.writev(descriptor, parts)
-    if sent < total:
+    if sent < sum(len(part) for part in parts):
         rest = memoryview(b"".join(parts))[sent:]
         while rest:
             rest = rest[os.write(descriptor, rest) :]

@@ -150,13 +150,7 @@ def _allow(rules: int, paths: Iterable[str], access: int) -> None:
 
 # ---------------------------------------------------------------------- system calls
 
-_LOAD, _AND, _EQUAL, _AT_LEAST, _RETURN = (
-    0x20,
-    0x54,
-    0x15,
-    0x35,
-    0x06,
-)  # of the packet filter, <linux/bpf_common.h>
+_LOAD, _AND, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x54, 0x15, 0x35, 0x06  # <linux/bpf_common.h>
 _NUMBER, _PROCESSOR, _FIRST_ARGUMENT = 0, 4, 16  # of `seccomp_data`, in bytes; each argument has eight
 _GRANTED, _ERROR = 0x7FFF0000, 0x50000
 _OTHER_NUMBERS = 0x40000000  # of the same calls, for another size of pointers

@@ -9,6 +9,7 @@ import select
 import signal
 import sys
 import traceback
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 import numpy as np
@@ -16,8 +17,7 @@ import numpy as np
 from fmu_asset.errors import FmuError, FmuWorkerError
 from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance
-from fmu_asset.instances.plan import Plan
-from fmu_asset.instances.series import Series
+from fmu_asset.instances.plan import Floats
 
 from .protocol import (
     DESERTED,
@@ -27,14 +27,13 @@ from .protocol import (
     PART,
     PIPES_GONE,
     RESULT,
-    Operation,
+    STEP,
     joined,
     look,
     receive,
     send,
 )
 
-_STEP = int(Operation.STEP)
 LARGEST_FILE = 2 * 1024**3
 """Bytes that an FMU may write to one file, such as an endless log."""
 _NOT_GRANTED = (
@@ -110,104 +109,81 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
     """Answer requests; return whether the end was asked for, and the instance that is still open."""
     if confined:
         sys.addaudithook(_notice)
-    asked, own_number = False, os.getpid()
     instance: FmuInstance | None = None
-    plan: Plan | None = None
-    header = bytearray(HEADER.size)
-    header_view = memoryview(header)
+    header = memoryview(bytearray(HEADER.size))
     reply_header = bytearray(HEADER.size)
     system_error = ctypes.c_int.from_address(_locate_errno())  # what a call of the FMU leaves in `errno`
     request = reply = memoryview(b"")
-    poll = select.poll()
+    own_number, poll = os.getpid(), select.poll()
     poll.register(incoming, select.POLLIN | select.POLLHUP)
-    while receive(incoming, header_view):
-        operation, _, number, length = HEADER.unpack(header)
+
+    def answer(kind: int, payload: bytes | memoryview) -> None:
+        if os.getpid() != own_number:
+            os._exit(0)  # a copy that the FMU has made of this process
+        logged = kind != FAILURE and instance is not None and instance.has_log
+        HEADER.pack_into(reply_header, 0, kind, logged, number, len(payload))
+        send(outgoing, reply_header, payload)
+
+    while receive(incoming, header):
+        kind, _, number, length = HEADER.unpack(header)
         try:
-            if operation == _STEP:
+            if kind == STEP:
                 if not receive(incoming, request) or instance is None:
                     break
                 instance.step()
                 payload: bytes | memoryview = reply
             else:
                 content = bytearray(length)
-                asked, system_error.value = operation == Operation.CLOSE, 0
-                _last_reach.clear()
-                if not receive(incoming, memoryview(content)) or asked:
+                if not receive(incoming, memoryview(content)):
                     break
-                name, arguments = _called(operation, content)
+                name, block, arguments = pickle.loads(content)
+                system_error.value = 0
+                _last_reach.clear()
+                if name == "close":
+                    return True, instance
                 if name == "open":
-                    plan = arguments[0]
-                if name in ("open", "renew") and plan is not None:
                     if instance is not None:
                         instance.close()
-                    instance = open_instance(plan)
+                    instance = open_instance(*arguments)
                     request = memoryview(instance.request).cast("B")
                     reply = memoryview(instance.reply).cast("B")
-                    payload = b""
                 elif instance is None:
                     raise FmuWorkerError("The worker was asked before it had an FMU.")
-                elif operation == Operation.RUN:
-                    payload = _run(instance, content, outgoing, number)
-                elif operation == Operation.READ:
-                    instance.read()
-                    payload = reply
-                else:
-                    payload = _answer(instance, name, arguments)
-            logged = instance is not None and instance.has_log
-            HEADER.pack_into(reply_header, 0, RESULT, logged, number, len(payload))
+                request[:] = block
+                payload = _called(instance, name, arguments, answer) or (reply if name == "read" else b"")
+            answer(RESULT, payload)
         except FmuError as error:
             refused = system_error.value == errno.EACCES or "ermission denied" in str(error)
             sentence = error.sentence + (_refusal() if confined and refused else "")
             lost = instance is None or instance.lost
             time = "" if error.time is None else repr(error.time)
-            payload = joined(type(error).__name__, "lost" * lost, time, sentence, *error.messages)
-            HEADER.pack_into(reply_header, 0, FAILURE, 0, number, len(payload))
-        if os.getpid() != own_number:
-            os._exit(0)  # a copy that the FMU has made of this process
-        send(outgoing, reply_header, payload)
+            answer(FAILURE, joined(type(error).__name__, "lost" * lost, time, sentence, *error.messages))
         look(poll)
-    return asked, instance
+    return False, instance
 
 
-def _called(operation: int, content: bytearray) -> tuple[str, tuple[Any, ...]]:
-    """Return the method that is called, and its arguments; an empty name for another operation."""
-    call: tuple[str, tuple[Any, ...]] = pickle.loads(content) if operation == Operation.CALL else ("", ())
-    return call
-
-
-def _run(instance: FmuInstance, content: bytearray, outgoing: int, number: int) -> memoryview:
-    """Make the steps of a message; send replies in parts, and return those that are not sent yet."""
-    requests = np.frombuffer(content).reshape(-1, len(instance.request))
-    series = Series(requests, np.empty((len(requests), len(instance.reply))))
-    sent, own_number = 0, os.getpid()
-
-    def rest() -> memoryview:
-        nonlocal sent
-        begin, sent = sent, series.done
-        return series.replies[begin * series.reply_size : sent * series.reply_size]
-
-    def report() -> None:
-        part = rest()
-        if os.getpid() != own_number:
-            os._exit(0)
-        send(outgoing, HEADER.pack(PART, instance.has_log, number, len(part)), part)
-
-    try:
-        instance.run(series, report)
-    except FmuError:
-        report()
-        raise
-    return rest()
-
-
-def _answer(instance: FmuInstance, name: str, arguments: tuple[Any, ...]) -> bytes:
-    """Call a method of the instance and return its answer as bytes."""
-    if name == "take_log":
+def _called(
+    instance: FmuInstance, name: str, arguments: tuple[Any, ...], answer: Callable[[int, bytes], None]
+) -> bytes:
+    """Call a method of the instance and return what it answers as bytes."""
+    if name == "run":
+        _run(instance, arguments[0], answer)
+    elif name == "take_log":
         return joined(*(f"{status} {text}" for status, text in instance.take_log()))
-    if name == "initialise":
-        start_time, parameters, inputs = arguments
-        if inputs:
-            memoryview(instance.request).cast("B")[16:] = inputs
-        instance.initialise(start_time, parameters, with_inputs=bool(inputs))
-        return b""
-    return getattr(instance, name)(*arguments) or b""
+    elif name == "initialise":
+        instance.initialise(*arguments[:2], with_inputs=arguments[2])
+    elif name != "open":
+        return getattr(instance, name)(*arguments) or b""
+    return b""
+
+
+def _run(instance: FmuInstance, requests: Floats, answer: Callable[[int, bytes], None]) -> None:
+    """Make many steps, and send the replies in parts."""
+    replies, sent = np.empty((len(requests), len(instance.reply))), 0
+
+    def report(done: int) -> None:
+        nonlocal sent
+        answer(PART, replies[sent:done].tobytes())
+        sent = done
+
+    instance.run(requests, replies, report)

@@ -36,7 +36,7 @@ from fmu_asset.errors import (
     FmuWorkerError,
 )
 from fmu_asset.worker.client import WorkerInstance
-from fmu_asset.worker.protocol import HEADER, Operation
+from fmu_asset.worker.protocol import CALL, HEADER
 
 ROOT = Path(__file__).parents[2]
 HOSTILE: dict[str, Any] = {
@@ -350,7 +350,8 @@ def test_an_answer_to_another_request_is_not_taken(foreign_fmu: Any, described: 
         asset.step()
         instance = asset._housing.instance
         assert isinstance(instance, WorkerInstance)
-        os.write(instance._out, HEADER.pack(Operation.READ, 0, 77, 0))
+        question = instance._pickled("read")
+        os.write(instance._out, HEADER.pack(CALL, 0, 77, len(question)) + question)
         with pytest.raises(FmuWorkerError, match="wrote something else into it"):
             asset.step()
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
-from fmu_asset.door import simulation
+from fmu_asset.door import session, simulation
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.reading import Observation
 from fmu_asset.door.saved_state import SavedState
@@ -155,7 +155,7 @@ def test_whole_arrays_and_model_exchange(foreign_fmu: Any, isolated: bool) -> No
 def test_blocks_follow_one_another(
     spring_mass: Path, spring_binding: Binding, isolated: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(simulation, "_BLOCK_BYTES", 7 * 6 * 8)
+    monkeypatch.setattr(session, "_BLOCK_BYTES", 7 * 6 * 8)
     inputs = {"control": {"push": np.sin(np.arange(30.0))}, "health": {"spring": 3.0}}
     assert_same_as_steps(spring_mass, spring_binding, inputs, 30, isolated=isolated)
 
