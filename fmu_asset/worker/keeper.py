@@ -128,12 +128,12 @@ def _await_end(ended: int, incoming: int, gone: int) -> bool:
     deadline: float | None = None
     while True:
         limit = None if deadline is None else 1000.0 * max(deadline - time.monotonic(), 0.0)
-        events = [descriptor for descriptor, _ in poll.poll(limit)]
-        if ended in events:
-            return deadline is not None
-        for descriptor in events:
+        events = {descriptor for descriptor, _ in poll.poll(limit)}
+        for descriptor in events - {ended}:  # first: a worker that its twin has left may end before we look
             poll.unregister(descriptor)
             deadline = time.monotonic() + _GRACE
+        if ended in events:
+            return deadline is not None
         if deadline is not None and time.monotonic() >= deadline:
             _kill(ended)
             deadline = time.monotonic() + _GRACE

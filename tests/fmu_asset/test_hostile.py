@@ -307,11 +307,30 @@ def await_processes(of: Path, *counts: int) -> None:
         time.sleep(0.01)
 
 
-def kill_keeper(worker: int | None) -> None:
-    status = Path(f"/proc/{worker}/status").read_text()
-    match = re.search(r"PPid:\s+(\d+)", status)
+def keeper_of(worker: int | None) -> int:
+    match = re.search(r"PPid:\s+(\d+)", Path(f"/proc/{worker}/status").read_text())
     assert match is not None
-    os.kill(int(match[1]), signal.SIGKILL)
+    return int(match[1])
+
+
+def kill_keeper(worker: int | None) -> None:
+    os.kill(keeper_of(worker), signal.SIGKILL)
+
+
+def test_nothing_is_left_when_twin_and_worker_end_before_the_keeper_looks(
+    foreign_fmu: Any, scratch: Path
+) -> None:
+    lines = "asset.step()", "print(asset.worker_process_id, flush=True)", "sys.stdin.read()"
+    with twin(foreign_fmu("hostile2"), HOSTILE, *lines) as process:
+        worker = int(process.stdout.readline())
+        keeper = keeper_of(worker)
+        os.kill(keeper, signal.SIGSTOP)
+    deadline = time.monotonic() + 20.0
+    while "\nState:\tZ" not in Path(f"/proc/{worker}/status").read_text():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.kill(keeper, signal.SIGCONT)
+    assert not left_behind(scratch)
 
 
 def test_what_a_dead_twin_without_a_keeper_left_is_ended_by_the_next(foreign_fmu: Any, scratch: Path) -> None:
