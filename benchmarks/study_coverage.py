@@ -75,7 +75,7 @@ def measure(model: ReducedModel, seed: int, model_error: tuple[float, float], pr
 def paper(table: WingTable, wing: Wing, seed: int) -> NDArray[np.float64]:
     """Return (5, 2) intervals of the paper's procedure: samples of e, eqs. (19), (20) and (25)."""
     alone = exact_posterior(wing.static, curve=table.stiffness)
-    factors = alone.samples(seed, PAPER_SAMPLES, stratified=True)
+    factors = alone.samples(seed, PAPER_SAMPLES)
     result = fit_masses(table.frequency, factors, table.validity, wing.readings)
     tail = 0.5 * (1.0 - PROBABILITY)
     return np.quantile(result.samples, [tail, 1.0 - tail], axis=0).T

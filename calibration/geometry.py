@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from calibration.result.record import ParameterPrior, Reading
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import GaussianPrior
@@ -140,21 +142,17 @@ def read_lengths(path: Path) -> Lengths:
         raise ExperimentFileError(
             f"{table.name} lacks the row {' and '.join(lost)}; {', '.join(PUBLISHED_NAMES)} are needed."
         )
-    columns = ("designed", "manufactured")
-    for column in columns:
-        table.cells(column, _USER)
-    found = {}
-    for published, name in PUBLISHED_NAMES.items():
-        row = names.index(published)
-        millimetres = [table.positive_number(column, row) for column in columns]
-        for column, value in zip(columns, millimetres, strict=True):
-            if value < 10.0:
-                raise ExperimentDataError(
-                    f"{table.name}, line {table.lines[row]}: {column} is {value:g} mm, which looks like m: "
-                    "give it in mm."
-                )
-        found[name] = MeasuredLength(name, *(value * 1e-3 for value in millimetres))
-    return Lengths(**found)
+    lengths = {column: table.positive_numbers(column, _USER) for column in ("designed", "manufactured")}
+    for column, values in lengths.items():
+        for row in np.flatnonzero(values < 10.0):
+            raise ExperimentDataError(
+                f"{table.name}, line {table.lines[row]}: {column} is {values[row]:g} mm, which looks like m: "
+                "give it in mm."
+            )
+    rows = {name: names.index(published) for published, name in PUBLISHED_NAMES.items()}
+    return Lengths(
+        *(MeasuredLength(name, *(1e-3 * of[row] for of in lengths.values())) for name, row in rows.items())
+    )
 
 
 def tailored_geometry(lengths: Lengths) -> Geometry:

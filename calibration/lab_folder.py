@@ -2,6 +2,9 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from reporting.table_file import TableErrors, TextTable, read_table
 
@@ -12,6 +15,32 @@ LAB_ERRORS = TableErrors(layout=ExperimentFileError, value=ExperimentDataError)
 
 # Where the folders of the steps lie in the authors' repository, seen from what a user may call its folder.
 _FOLDERS_OF_STEPS = (Path(), Path("datafiles"), Path("src") / "datafiles")
+
+
+def keep_vectors(record: Any, *names: str) -> None:
+    """Make fields of a frozen record vectors that cannot be written, of one length and finite.
+
+    Raises
+    ------
+    ExperimentDataError
+        If one is not; the sentence begins with the record's `source`.
+    """
+    for name in names:
+        column = np.array(getattr(record, name), dtype=np.float64)
+        column.setflags(write=False)
+        object.__setattr__(record, name, column)
+        beside = getattr(record, names[0]).shape
+        if column.ndim != 1 or column.shape != beside:
+            raise ExperimentDataError(
+                f"{record.source}: {' and '.join(names)} must be vectors of one length, but {name} has the "
+                f"shape {column.shape} beside {beside}."
+            )
+        wrong = np.flatnonzero(~np.isfinite(column))
+        if wrong.size:
+            raise ExperimentDataError(
+                f"{record.source}: {name} of reading {wrong[0] + 1} is {column[wrong[0]]:g}; a lost value "
+                "must be left out of a load test, and a ring-down cannot be evaluated with one."
+            )
 
 
 def places_of(folder: Path, name: Path) -> Iterator[Path]:

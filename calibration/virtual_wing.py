@@ -6,8 +6,7 @@ its truth, `twin_master.assets.virtual_experiments` has the FMU behind the same 
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -17,9 +16,7 @@ from calibration.dynamics.records import RingDownRecord
 from calibration.joint.wing_table import weighed
 from calibration.result.record import Reading
 from calibration.static.experiments import (
-    DISPLACEMENT_STANDARD_DEVIATION,
     HALF_WIDTH_95,
-    LOAD_STANDARD_DEVIATION,
     LoadDisplacementData,
     published_measurements,
 )
@@ -158,18 +155,10 @@ def _free_decay(omega: float, zeta: float, time: FloatArray) -> FloatArray:
 # ---------------------------------------------------------------------- the experiments
 
 
-def measure_load_test(
-    bench: TestBench,
-    seed: Seed,
-    *,
-    load: Sequence[float] | None = None,
-    run: Sequence[int] | None = None,
-    load_standard_deviation: float = LOAD_STANDARD_DEVIATION,
-    displacement_standard_deviation: float = DISPLACEMENT_STANDARD_DEVIATION,
-) -> LoadDisplacementData:
-    """Hang weights near the tip and read the displacement.
+def measure_load_test(bench: TestBench, seed: Seed) -> LoadDisplacementData:
+    """Hang the paper's weights near the tip, in its two runs of 250 to 1000 g, and read the displacement.
 
-    The true load is the nominal one; load and displacement are then both read with Gaussian errors.
+    The true load is the nominal one; load and displacement are then both read with the paper's errors.
 
     Parameters
     ----------
@@ -177,24 +166,13 @@ def measure_load_test(
         The wing.
     seed : int or SeedSequence
         Of the reading errors.
-    load, run : sequences, optional
-        Nominal loads [N] and the run of each; the paper's two runs of 250 to 1000 g by default.
-    load_standard_deviation, displacement_standard_deviation : float
-        Of the readings [N], [m]; the paper's by default.
     """
-    published = published_measurements()
-    nominal = np.asarray(published.load if load is None else load, dtype=np.float64)
-    runs = published.run if run is None and load is None else run
+    paper = published_measurements()
     generator = np.random.default_rng(child_seed(seed, _PURPOSES["load"]))
-    displacement = np.array([bench.tip_displacement(float(value)) for value in nominal])
-    return LoadDisplacementData(
-        load=nominal + generator.normal(0.0, load_standard_deviation, nominal.size),
-        displacement=displacement + generator.normal(0.0, displacement_standard_deviation, nominal.size),
-        run=np.zeros(nominal.size, dtype=np.int64) if runs is None else np.asarray(runs),
-        load_standard_deviation=load_standard_deviation,
-        displacement_standard_deviation=displacement_standard_deviation,
-        source="virtual load test",
-    )
+    displacement = np.array([bench.tip_displacement(float(value)) for value in paper.load])
+    load = paper.load + generator.normal(0.0, paper.load_standard_deviation, paper.count)
+    displacement += generator.normal(0.0, paper.displacement_standard_deviation, paper.count)
+    return replace(paper, load=load, displacement=displacement, source="virtual load test")
 
 
 def measure_ring_down(
@@ -261,7 +239,6 @@ def measure_lengths(
     seed: Seed,
     *,
     designed: Geometry | None = None,
-    reading_uncertainty: float = READING_UNCERTAINTY,
 ) -> Lengths:
     """Measure semi-span and chords of a wing.
 
@@ -273,15 +250,13 @@ def measure_lengths(
         Of the reading errors.
     designed : Geometry, optional
         The drawing that it was built to; the published one by default.
-    reading_uncertainty : float
-        Half-width of the 95 % interval of a reading [m].
     """
     generator = np.random.default_rng(child_seed(seed, _PURPOSES["geometry"]))
     measured = []
     for drawn in published_lengths():
-        length = getattr(geometry, drawn.name) + generator.normal(0.0, reading_uncertainty / HALF_WIDTH_95)
+        length = getattr(geometry, drawn.name) + generator.normal(0.0, READING_UNCERTAINTY / HALF_WIDTH_95)
         intended = drawn.designed if designed is None else getattr(designed, drawn.name)
-        measured.append(MeasuredLength(drawn.name, intended, length, drawn.tolerance, reading_uncertainty))
+        measured.append(MeasuredLength(drawn.name, intended, length))
     return Lengths(*measured)
 
 

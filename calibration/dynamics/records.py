@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.lab_folder import LAB_ERRORS, places_of
+from calibration.lab_folder import LAB_ERRORS, keep_vectors, places_of
 from reporting.table_file import TextTable, parse_table
 from reporting.text_file import read_text
 from reporting.words import counted
@@ -63,23 +63,8 @@ class RingDownRecord:
     source: str = "unnamed record"
 
     def __post_init__(self) -> None:
-        for name in ("time", "signal", "lowest", "highest"):
-            if (column := getattr(self, name)) is None:
-                continue
-            column = np.array(column, dtype=np.float64)
-            column.setflags(write=False)
-            object.__setattr__(self, name, column)
-            if column.ndim != 1 or column.shape != self.time.shape:
-                raise ExperimentDataError(
-                    f"{self.source}: {name} must be a vector as long as time, but its shape is "
-                    f"{column.shape} beside {self.time.shape}."
-                )
-            wrong = np.flatnonzero(~np.isfinite(column))
-            if wrong.size:
-                raise ExperimentDataError(
-                    f"{self.source}: {name} of sample {wrong[0] + 1} is {column[wrong[0]]:g}; a record must "
-                    "not hold lost values, because its spectrum needs even spacing."
-                )
+        names = ("time", "signal", "lowest", "highest")
+        keep_vectors(self, *(name for name in names if getattr(self, name) is not None))
         if self.count < MINIMUM_COUNT:
             raise ExperimentDataError(
                 f"{self.source}: the record has {self.count} samples; at least {MINIMUM_COUNT} are needed."

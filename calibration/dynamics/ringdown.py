@@ -111,19 +111,17 @@ def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDow
     return replace(record, time=time[after], signal=signal[after], lowest=lowest, highest=highest)
 
 
-def spectrum(
-    record: RingDownRecord, band: tuple[float, float] = SEARCH_BAND
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def spectrum(record: RingDownRecord) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return frequency [Hz] and amplitude [V] of the zero-padded spectrum of the detrended record."""
     size = _PADDING * record.count
     transform = np.fft.rfft(detrend(record.signal), size)
     frequency = np.fft.rfftfreq(size, 1.0 / record.sampling_rate)
-    inside = (frequency >= band[0]) & (frequency <= min(band[1], 0.5 * record.sampling_rate))
+    inside = (frequency >= SEARCH_BAND[0]) & (frequency <= min(SEARCH_BAND[1], 0.5 * record.sampling_rate))
     amplitude = np.asarray(2.0 / record.count * np.abs(transform[inside]), dtype=np.float64)
     return np.asarray(frequency[inside], dtype=np.float64), amplitude
 
 
-def spectral_peaks(record: RingDownRecord, band: tuple[float, float] = SEARCH_BAND) -> tuple[float, float]:
+def spectral_peaks(record: RingDownRecord) -> tuple[float, float]:
     """Return the two most prominent peaks of the spectrum, by ascending frequency [Hz].
 
     Raises
@@ -133,26 +131,26 @@ def spectral_peaks(record: RingDownRecord, band: tuple[float, float] = SEARCH_BA
         and by 2 % of the highest amplitude (less, down to 0.3 %, if the record has died away at its end),
         in the record itself or in its beginning.
     """
-    if 0.5 * record.sampling_rate < 4.0 * band[0]:
+    if 0.5 * record.sampling_rate < 4.0 * SEARCH_BAND[0]:
         raise RingDownError(
             f"{record.source}: a sampling rate of {record.sampling_rate:.3g} Hz shows nothing above "
             f"{0.5 * record.sampling_rate:.3g} Hz; is the time in s?"
         )
-    found = _peaks(record, band, 0.0)
+    found = _peaks(record, 0.0)
     if len(found) < 2:
-        found = _peaks(record, band, _SEARCH_DECAY)
+        found = _peaks(record, _SEARCH_DECAY)
     if len(found) < 2:
         seen = "none" if not found else f"one, at {found[0]:.3g} Hz"
-        top = min(band[1], 0.5 * record.sampling_rate)
+        top = min(SEARCH_BAND[1], 0.5 * record.sampling_rate)
         raise RingDownError(
-            f"{record.source}: two spectral peaks are needed between {band[0]:.3g} and "
+            f"{record.source}: two spectral peaks are needed between {SEARCH_BAND[0]:.3g} and "
             f"{top:.3g} Hz, but there is {seen}; check the record, its sampling and the release."
         )
     first, second = sorted(found[:2])
     return first, second
 
 
-def _peaks(record: RingDownRecord, band: tuple[float, float], decay: float) -> list[float]:
+def _peaks(record: RingDownRecord, decay: float) -> list[float]:
     """Return the peaks that count [Hz], the most prominent first, of a record times exp(-decay t).
 
     A second mode that is gone after a tenth of the record drowns in the noise of the rest and in the skirts
@@ -163,10 +161,10 @@ def _peaks(record: RingDownRecord, band: tuple[float, float], decay: float) -> l
     window = np.hanning(record.count) / math.sqrt(0.375)
     noise = 2.0 / record.count * np.abs(np.fft.rfft(window * detrend(record.signal)))
     place = np.fft.rfftfreq(record.count, 1.0 / record.sampling_rate)
-    floor = float(np.median(noise[(place >= band[0]) & (place <= band[1])]))
+    floor = float(np.median(noise[(place >= SEARCH_BAND[0]) & (place <= SEARCH_BAND[1])]))
     floor *= math.sqrt(float(np.mean(weight**2)))
     faded = RingDownRecord(record.time, weight * detrend(record.signal), source=record.source)
-    frequency, amplitude = spectrum(faded if decay else record, band)
+    frequency, amplitude = spectrum(faded if decay else record)
     level = detrend(faded.signal)
     end = level[-max(int(_END_SHARE * record.count), 8) :]
     left = math.sqrt(2.0 * float(np.mean(end**2))) / float(np.abs(level).max())
@@ -180,7 +178,6 @@ def fit_ring_down(
     procedure: Frequencies = Frequencies.PEAKS,
     *,
     start: float | None = FIRST_PEAK,
-    band: tuple[float, float] = SEARCH_BAND,
 ) -> RingDownFit:
     """Fit two damped cosines, an offset and a drift to one record by Levenberg-Marquardt.
 
@@ -196,8 +193,6 @@ def fit_ring_down(
         How the frequencies are found.
     start : float, optional
         Where the record is cropped [s]; None if it begins at the release already.
-    band : (float, float)
-        Where spectral peaks are sought [Hz].
 
     Raises
     ------
@@ -206,7 +201,7 @@ def fit_ring_down(
     """
     record = prepare(record, start)
     _refuse_steady(record)
-    omega = 2.0 * math.pi * np.array(spectral_peaks(record, band))
+    omega = 2.0 * math.pi * np.array(spectral_peaks(record))
     model = DampedCosines(record.time, record.signal, record.averaging_width)
     free = procedure is Frequencies.FITTED
     searches = [model.fit((1j - ratio) * omega, frequencies_fitted=free) for ratio in _STARTING_RATIOS]

@@ -194,7 +194,9 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
         found = (model.modes(**dict(zip(_NAMES, state, strict=True))) for state in states.tolist())
         return np.array([modes.frequency[list(modes.followed)] for modes in found])
 
-    curve = stiffness_curve_of(model, "tip stiffness of the tailored model")
+    curve = stiffness_curve_of(
+        model.tip_stiffness, model.validity[_NAMES[0]], "tip stiffness of the tailored model"
+    )
     checks = 2.0 * qmc.Halton(3, scramble=False).random(_CHECKS + 1)[1:] - 1.0
     expected = exact(checks)
     error = np.inf

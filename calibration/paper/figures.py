@@ -36,13 +36,13 @@ def calibration_figure(result: StaticCalibration) -> Figure:
             result.particle.likelihood_grid, result.particle.likelihood[pair], color=OBSERVED, lw=0.7,
             ls=_RUN_LINES[run % len(_RUN_LINES)], label="likelihood of one pair" if pair == 0 else None,
         )  # fmt: skip
-    _draw_densities(factor, result.before, result.exact, result.particle.posterior)
+    _draw_densities(factor, result.before, result.exact, result.particle)
     factor.axvline(PAPER_MEAN, color=REFERENCE, lw=0.7, ls=":", label="mean in the paper")
     factor.set_xlabel("Young's modulus factor $e$", parse_math=True)
     factor.set_ylabel("probability density")
     panel_label(factor, "b", "Prior, likelihoods, posterior")
     after = result.tip_stiffness_exact
-    _draw_densities(stiffness, result.tip_stiffness_prior, after, result.tip_stiffness_particle, 1e-3)
+    _draw_densities(stiffness, result.tip_stiffness_prior, after, result.particle.stiffness, 1e-3)
     stiffness.set_xlabel("tip stiffness $k$ (N/mm)", parse_math=True)
     stiffness.set_ylabel("probability density (mm/N)")
     told = f"{after.mean * 1e-3:.4f} ± {after.standard_deviation * 1e-3:.4f} N/mm"

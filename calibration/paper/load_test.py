@@ -29,15 +29,15 @@ _FEWEST_EFFECTIVE_PARTICLES = 10.0
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class ParticlePosterior:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ParticlePosterior(ScalarPosterior):
     """p(e | measured pairs) as weighted particles, summarised.
+
+    The density is a kernel density of the weighted particles, for plots and samples; `mean` and
+    `standard_deviation` are those of the particles, without the kernel's width.
 
     Attributes
     ----------
-    posterior : ScalarPosterior
-        Kernel density of the weighted particles, for plots and samples; its `mean` and
-        `standard_deviation` are those of the particles, without the kernel's width.
     effective_sample_size : (n_pairs,) array
         1 / sum of squared weights after each pair; the last is that of the posterior.
     particle_count : int
@@ -46,27 +46,15 @@ class ParticlePosterior:
         Values of e at which the likelihoods are kept.
     likelihood : (n_pairs, N) array
         Kernel density of e from each pair alone: the paper's likelihood curves in Fig. 5.
-    stiffness_mean, stiffness_standard_deviation : float
-        Weighted mean and standard deviation of the particles' tip stiffness k(e) [N/m].
+    stiffness : ScalarPosterior
+        The particles' tip stiffness k(e) [N/m], in the same way.
     """
 
-    posterior: ScalarPosterior
     effective_sample_size: FloatArray
     particle_count: int
     likelihood_grid: FloatArray
     likelihood: FloatArray
-    stiffness_mean: float
-    stiffness_standard_deviation: float
-
-    @property
-    def mean(self) -> float:
-        """Weighted mean of the particles."""
-        return self.posterior.mean
-
-    @property
-    def standard_deviation(self) -> float:
-        """Weighted standard deviation of the particles."""
-        return self.posterior.standard_deviation
+    stiffness: ScalarPosterior
 
 
 def reference_bandwidth_factor(count: float) -> float:
@@ -195,13 +183,18 @@ def particle_filter(
     # The spread of the weighted particles, in the rule's place of the median deviation.
     bandwidth = standard_deviation * reference_bandwidth_factor(float(effective[-1]))
     grid, density = kernel_density(particles, bandwidth, window, weight)
+    smooth = ScalarPosterior(grid[::4], density[::4])
+    pushed = push_forward(smooth, curve)
     return ParticlePosterior(
-        ScalarPosterior(grid[::4], density[::4], mean=mean, standard_deviation=standard_deviation),
-        effective,
-        particle_count,
-        kept_at,
-        likelihood,
-        *_moments(weight, curve.stiffness(particles)),
+        grid=smooth.grid,
+        density=smooth.density,
+        mean=mean,
+        standard_deviation=standard_deviation,
+        effective_sample_size=effective,
+        particle_count=particle_count,
+        likelihood_grid=kept_at,
+        likelihood=likelihood,
+        stiffness=ScalarPosterior(pushed.grid, pushed.density, *_moments(weight, curve.stiffness(particles))),
     )
 
 
@@ -253,13 +246,6 @@ class StaticCalibration:
     def tip_stiffness_exact(self) -> ScalarPosterior:
         """p(k | pairs) by quadrature [N/m]."""
         return push_forward(self.exact, self.curve)
-
-    @property
-    def tip_stiffness_particle(self) -> ScalarPosterior:
-        """p(k | pairs) by particles, whose mean and deviation it has [N/m]."""
-        found = push_forward(self.particle.posterior, self.curve)
-        moments = self.particle.stiffness_mean, self.particle.stiffness_standard_deviation
-        return ScalarPosterior(found.grid, found.density, *moments)
 
     @property
     def quality(self) -> FitQuality:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError
-from calibration.lab_folder import lab_table
+from calibration.lab_folder import keep_vectors, lab_table
 from reporting.provenance import hash_record
 
 STANDARD_GRAVITY = 9.81
@@ -73,24 +73,17 @@ class LoadDisplacementData:
     source: str = "unnamed measurements"
 
     def __post_init__(self) -> None:
-        for name, kind in (("load", np.float64), ("displacement", np.float64), ("run", np.int64)):
-            column = np.array(getattr(self, name), dtype=kind)
-            column.setflags(write=False)
-            object.__setattr__(self, name, column)
-        if not (self.load.ndim == 1 and self.load.shape == self.displacement.shape == self.run.shape):
-            raise ExperimentDataError(
-                f"{self.source}: load, displacement and run must be vectors of one length, but their shapes "
-                f"are {self.load.shape}, {self.displacement.shape} and {self.run.shape}."
-            )
+        keep_vectors(self, "load", "displacement", "run")
+        object.__setattr__(self, "run", self.run.astype(np.int64))
+        self.run.setflags(write=False)
         if self.load.size == 0:
             raise ExperimentDataError(f"{self.source}: there is no measurement; at least one pair is needed.")
         for name in ("load", "displacement"):
             column = getattr(self, name)
-            wrong = np.flatnonzero(~(np.isfinite(column) & (column > 0.0)))
-            if wrong.size:
+            for wrong in np.flatnonzero(column <= 0.0):
                 raise ExperimentDataError(
-                    f"{self.source}: {name} of pair {wrong[0] + 1} is {column[wrong[0]]:g}, but every "
-                    f"{name} must be positive and finite; leave out zero readings and lost values."
+                    f"{self.source}: {name} of reading {wrong + 1} is {column[wrong]:g}, but every {name} "
+                    "must be positive; leave out zero readings."
                 )
         deviations = (self.load_standard_deviation, self.displacement_standard_deviation)
         if not all(math.isfinite(value) and value >= 0.0 for value in deviations) or not any(deviations):

@@ -145,8 +145,10 @@ class ScalarPosterior:
         lower, upper = self.quantile([tail, 1.0 - tail])
         return float(lower), float(upper)
 
-    def samples(self, seed: Seed, count: int, *, stratified: bool = False) -> NDArray[np.float64]:
-        """Draw samples by the inverse of the distribution function.
+    def samples(self, seed: Seed, count: int) -> NDArray[np.float64]:
+        """Draw one sample from each of `count` strata of equal probability, in shuffled order.
+
+        Sample means have far less variance than those of independent draws.
 
         Parameters
         ----------
@@ -154,9 +156,6 @@ class ScalarPosterior:
             The same seed gives the same samples, bit for bit.
         count : int
             Number of samples.
-        stratified : bool
-            Draw one sample from each of `count` strata of equal probability, in shuffled order: sample
-            means then have far less variance than independent draws.
 
         Returns
         -------
@@ -169,7 +168,4 @@ class ScalarPosterior:
         """
         check_count(count, PosteriorError)
         generator = np.random.default_rng(child_seed(seed, 0))
-        probability = generator.random(count)
-        if stratified:
-            probability = generator.permutation((np.arange(count) + probability) / count)
-        return self.quantile(probability)
+        return self.quantile(generator.permutation((np.arange(count) + generator.random(count)) / count))

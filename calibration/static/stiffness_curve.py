@@ -1,8 +1,7 @@
 """Tip stiffness as a function of the Young's modulus factor: Kapteyn et al. 2021, eq. (14)."""
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.polynomial import Chebyshev
@@ -94,23 +93,19 @@ PUBLISHED_LINE = stiffness_line(575.2, 101.8, "published line k(e) = 0.5752 e + 
 """Kapteyn et al. 2021, eq. (14): the authors' finite element model at the test point, 5 cm from the tip."""
 
 
-class TipStiffnessModel(Protocol):
-    """What a structural model must offer to be calibrated, as `fe.runtime.reduced.ReducedModel` does."""
-
-    def tip_stiffness(self, young_modulus_factor: float) -> float:
-        """Return load over displacement 5 cm from the tip [N/m]."""
-
-
-def stiffness_curve_of(model: TipStiffnessModel, name: str = "finite element model") -> StiffnessCurve:
+def stiffness_curve_of(
+    tip_stiffness: Callable[[float], float], limits: tuple[float, float], name: str = "finite element model"
+) -> StiffnessCurve:
     """Return the tip stiffness of a structural model over its range of e.
 
     A polynomial must meet the model between its nodes within `TABLE_TOLERANCE`.
 
     Parameters
     ----------
-    model : TipStiffnessModel
-        Offers `tip_stiffness(young_modulus_factor)` [N/m]; the range of e is that of its
-        `validity["young_modulus_factor"]` where it has one, else [0.9, 1.1].
+    tip_stiffness : callable
+        Of a model: e to load over displacement 5 cm from the tip [N/m].
+    limits : (float, float)
+        Range of e in which the model holds.
     name : str
         What the curve is, for reports.
 
@@ -119,21 +114,13 @@ def stiffness_curve_of(model: TipStiffnessModel, name: str = "finite element mod
     StiffnessCurveError
         If the curve is not positive and rising, or too rough for a polynomial.
     """
-    lower, upper = getattr(model, "validity", {}).get("young_modulus_factor", (0.9, 1.1))
-    if not 0.0 < lower < upper < math.inf:
-        raise StiffnessCurveError(
-            f"the range of e must ascend and be positive, but it is [{lower:g}, {upper:g}]."
-        )
-
-    def stiffness(factors: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.array([model.tip_stiffness(float(factor)) for factor in factors])
-
-    polynomial = Chebyshev.interpolate(stiffness, _DEGREE, domain=(lower, upper))
-    between = np.linspace(lower, upper, 2 * _DEGREE)
+    stiffness = np.vectorize(tip_stiffness, otypes=[float])
+    polynomial = Chebyshev.interpolate(stiffness, _DEGREE, domain=limits)
+    between = np.linspace(*limits, 2 * _DEGREE)
     error = float(np.max(np.abs(polynomial(between) / stiffness(between) - 1.0)))
     if error > TABLE_TOLERANCE:
         raise StiffnessCurveError(
-            f"the tip stiffness of {name} over e in [{lower:g}, {upper:g}] is too rough for a polynomial: "
-            f"the relative error is {error:.1g} at degree {_DEGREE}."
+            f"the tip stiffness of {name} over e in [{limits[0]:g}, {limits[1]:g}] is too rough for a "
+            f"polynomial: the relative error is {error:.1g} at degree {_DEGREE}."
         )
     return StiffnessCurve(polynomial, name)

@@ -136,7 +136,7 @@ def calibrate(
         static = calibrate_static(table.stiffness, lab.pairs, seed)
         published = calibrate_static(PUBLISHED_LINE, lab.pairs, seed)
     with progress.stage("Step 3: masses and damping, the paper's procedure"):
-        factors = static.exact.samples(child_seed(seed, _PAPER_PURPOSE), PAPER_SAMPLE_COUNT, stratified=True)
+        factors = static.exact.samples(child_seed(seed, _PAPER_PURPOSE), PAPER_SAMPLE_COUNT)
         paper = fit_masses(table.frequency, factors, table.validity, lab.readings)
     with progress.stage("Step 3: masses and damping, joint posterior"):
         joint = joint_posterior(table, lab.pairs, lab.readings, seed=seed, count=SAMPLE_COUNT)

@@ -88,7 +88,7 @@ def _add_sections(page: Page, calibration: WingCalibration, fields: WingFields, 
     ):
         ways = [("exact", found.exact), *((f"exact, {name}", e) for name, e in found.alternatives.items())]
         pairs = [(way, e, push_forward(e, found.curve)) for way, e in ways]
-        pairs.append(("particle filter", found.particle.posterior, found.tip_stiffness_particle))
+        pairs.append(("particle filter", found.particle, found.particle.stiffness))
         for way, e, k in pairs:
             told = (plus_minus(item.mean, item.standard_deviation) for item in (e, k))
             rows.append((title, way, *told))

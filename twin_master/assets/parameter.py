@@ -1,7 +1,7 @@
 """Draws of the uncertain parameter of the model, from a calibration."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -114,27 +114,32 @@ def _draws_of_load_test(calibration: Calibration, seed: int, model: "ReducedMode
     from calibration.paper.load_test import particle_filter, push_forward
     from calibration.static.errors_in_variables import exact_posterior
     from calibration.static.experiments import published_measurements
-    from calibration.static.posterior import GaussianPrior
+    from calibration.static.posterior import GaussianPrior, ScalarPosterior
     from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of
     from reporting.record_json import plain
 
     sequence, pairs = seed_sequence(seed, "calibration"), published_measurements()
-    curve = PUBLISHED_LINE if model is None else stiffness_curve_of(model)
+    curve = (
+        PUBLISHED_LINE
+        if model is None
+        else stiffness_curve_of(model.tip_stiffness, model.validity["young_modulus_factor"])
+    )
     if calibration.method == "exact":
         posterior = exact_posterior(pairs, curve=curve)
     else:
-        posterior = particle_filter(pairs, seed=int(sequence.generate_state(1)[0]), curve=curve).posterior
+        posterior = particle_filter(pairs, seed=int(sequence.generate_state(1)[0]), curve=curve)
     stiffness = push_forward(posterior, curve)
+    density = [item for item in fields(ScalarPosterior) if item.init]
     return ParameterDraws(
         name=calibration.parameter,
-        values=posterior.samples(sequence, calibration.draws, stratified=True),
+        values=posterior.samples(sequence, calibration.draws),
         mean=posterior.mean,
         standard_deviation=posterior.standard_deviation,
         source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {curve.name}",
         record={
             "parameter": calibration.parameter,
             "prior": plain(GaussianPrior()),
-            "posterior": plain(posterior),
+            "posterior": {item.name: plain(getattr(posterior, item.name)) for item in density},
             "tip_stiffness": {
                 "unit": "N/m",
                 "mean": stiffness.mean,

@@ -262,13 +262,13 @@ FROM_100 = np.arange(TIME.size) >= 100
 @pytest.mark.parametrize(
     ("time", "signal", "words"),
     [
-        (TIME, np.where(np.arange(TIME.size) == 17, math.nan, GOOD), "sample 18 is nan"),
+        (TIME, np.where(np.arange(TIME.size) == 17, math.nan, GOOD), "reading 18 is nan"),
         (TIME, np.clip(GOOD, -0.008, 0.008), "clipped"),
         (TIME, np.zeros(TIME.size), "constant"),
         (TIME[:20], GOOD[:20], "at least 64"),
         (TIME + 0.1 * FROM_100, GOOD, "after sample 100"),
         (TIME[::-1], GOOD, "even steps"),
-        (TIME, GOOD[1:], "as long as time"),
+        (TIME, GOOD[1:], "vectors of one length"),
     ],
 )
 def test_bad_records_are_told_in_one_sentence(

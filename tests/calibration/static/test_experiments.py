@@ -151,7 +151,7 @@ def test_bad_records_are_refused():
         LoadDisplacementData(np.array([]), np.array([]), np.array([]))
     with pytest.raises(ExperimentDataError, match="not both zero"):
         dataclasses.replace(data, load_standard_deviation=0.0, displacement_standard_deviation=0.0)
-    with pytest.raises(ExperimentDataError, match="load of pair 2 is nan"):
+    with pytest.raises(ExperimentDataError, match="load of reading 2 is nan"):
         dataclasses.replace(data, load=np.where(np.arange(8) == 1, np.nan, data.load))
     with pytest.raises(ValueError, match="read-only"):
         data.load[0] = 1.0

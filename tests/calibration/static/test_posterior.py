@@ -59,7 +59,7 @@ def test_samples_repeat_bit_for_bit_and_follow_the_density():
 
 def test_stratified_samples_have_one_in_each_stratum_in_random_order():
     _, posterior = gaussian()
-    samples = posterior.samples(5, 100, stratified=True)
+    samples = posterior.samples(5, 100)
     strata = np.floor(posterior.cumulative(samples) * 100.0 + 1e-9).astype(int)
     assert sorted(strata) == list(range(100))
     assert list(strata) != list(range(100))

@@ -369,7 +369,9 @@ def test_the_published_load_test_gives_the_posterior_of_the_wings_own_calibratio
     That S grows with e is left out, which is worth 0.03 deviations.
     """
     pairs, model = published_measurements(), reduced_model()
-    exact = exact_posterior(pairs, curve=stiffness_curve_of(model))
+    exact = exact_posterior(
+        pairs, curve=stiffness_curve_of(model.tip_stiffness, model.validity["young_modulus_factor"])
+    )
     stiffness = float(model.tip_stiffness(exact.mean))
     noise = np.hypot(pairs.displacement_standard_deviation, pairs.load_standard_deviation / stiffness)
     rows = zip(pairs.load.tolist(), pairs.displacement.tolist(), strict=True)

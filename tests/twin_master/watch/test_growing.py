@@ -11,6 +11,7 @@ from itertools import takewhile
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,6 +87,13 @@ ROTATIONS: dict[str, Rotation] = {
 }
 
 
+def ways(*names: str) -> list[Any]:
+    """Return names of rotations; those by logrotate are skipped where it is not installed."""
+    absent = pytest.mark.skipif(LOGROTATE is None, reason="logrotate is not installed")
+    by_logrotate = "create", "absent", "copytruncate"
+    return [pytest.param(name, marks=absent if name in by_logrotate else ()) for name in names]
+
+
 def new(messages: Iterator[tuple[Message | Refused | None, str]]) -> list[int | str]:
     """Return the turns that have come, and in the place of what was refused its text."""
     came = takewhile(lambda fed: fed[0] is not None, messages)
@@ -111,7 +119,7 @@ def begun_log(base: Watch, tmp_path: Path) -> Begun:
 
 
 @pytest.mark.parametrize("header", [HEADER, ""], ids=["header", "no header"])
-@pytest.mark.parametrize("rotation", ROTATIONS)
+@pytest.mark.parametrize("rotation", ways(*ROTATIONS))
 def test_no_row_is_lost_in_a_rotation(begun_log: Begun, rotation: str, header: str) -> None:
     rotate, cut = ROTATIONS[rotation], rotation == "copytruncate"
     path, messages = begun_log(0, 1)
@@ -133,7 +141,7 @@ def test_no_row_is_lost_in_a_rotation(begun_log: Begun, rotation: str, header: s
         assert new(messages) == [turn, turn + 1]
 
 
-@pytest.mark.parametrize("way", ["logging", "copytruncate"])
+@pytest.mark.parametrize("way", ways("logging", "copytruncate"))
 def test_a_writer_that_does_not_wait_for_its_reader(begun_log: Begun, way: str) -> None:
     (path, messages), turns = begun_log(), 4000
     handler = RotatingFileHandler(path, maxBytes=2000 if way == "logging" else 0, backupCount=1000)
@@ -212,7 +220,7 @@ def test_a_copy_in_the_place_of_a_log_is_read_on(begun_log: Begun) -> None:
     assert new(messages) == [2]
 
 
-@pytest.mark.parametrize("rotation", ["create", "copytruncate"])
+@pytest.mark.parametrize("rotation", ways("create", "copytruncate"))
 def test_a_watch_that_was_down_takes_up_a_rotated_log(
     base: Watch, mission: History, tmp_path: Path, rotation: str
 ) -> None:
