@@ -22,7 +22,7 @@ from rich.table import Table
 
 from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
-from calibration.errors import CalibrationError, RingDownError
+from calibration.errors import CalibrationError, ExperimentDataError
 from calibration.joint.measurement import measured_modes
 from calibration.joint.posterior import joint_posterior
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, wing_priors
@@ -102,7 +102,7 @@ def main() -> int:
         begin = time.perf_counter()
         try:
             wing = measure(model, seed, of_wings, procedure)
-        except RingDownError:
+        except ExperimentDataError:
             not_seen += 1
             continue
         seconds["measuring and fitting"] += time.perf_counter() - begin

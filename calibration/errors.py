@@ -10,32 +10,16 @@ class ExperimentFileError(CalibrationError, ValueError):
 
 
 class ExperimentDataError(CalibrationError, ValueError):
-    """Measurements hold values that no experiment can give, or values in another unit than stated."""
-
-
-class StiffnessCurveError(CalibrationError, ValueError):
-    """A stiffness curve is not positive, not increasing, or cannot be tabulated accurately."""
+    """Measurements hold values that no experiment can give or no model meets, or in another unit."""
 
 
 class PosteriorError(CalibrationError, ValueError):
-    """A density, a prior or a request for quantiles or samples makes no sense."""
+    """A density, a prior, a stiffness curve or a request for quantiles or samples makes no sense."""
 
 
 class OutsideValidityError(CalibrationError, RuntimeError):
     """The posterior reaches beyond the range in which the stiffness curve may be trusted."""
 
 
-class DegenerateFilterError(CalibrationError, RuntimeError):
-    """No particle of the filter explains the measurements."""
-
-
 class CalibrationRecordError(CalibrationError, ValueError):
     """A stored calibration cannot be read back."""
-
-
-class RingDownError(CalibrationError, ValueError):
-    """A ring-down record does not show two decaying modes, or was cut off by the range of its recorder."""
-
-
-class MassConstraintError(CalibrationError, ValueError):
-    """No masses within the range of the model keep the weighed total."""

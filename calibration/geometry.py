@@ -1,7 +1,7 @@
 """Calibration step 1: the planform of the real wing, and the design brought to it."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError
 from fe.runtime.state import Geometry
 from fe.wing.design import WingDesign
+from reporting.provenance import hash_record
 
 from .errors import ExperimentDataError, ExperimentFileError
 from .lab_folder import lab_table
@@ -43,8 +44,6 @@ class MeasuredLength:
         A field of `Lengths`.
     designed, measured : float
         The length on the drawing and on the wing [m].
-    tolerance, reading_uncertainty : float
-        Half-widths of 95 % intervals of the design and of the measurement [m].
 
     Raises
     ------
@@ -55,11 +54,9 @@ class MeasuredLength:
     name: str
     designed: float
     measured: float
-    tolerance: float = TOLERANCE
-    reading_uncertainty: float = READING_UNCERTAINTY
 
     def __post_init__(self) -> None:
-        for what in ("designed", "measured", "tolerance", "reading_uncertainty"):
+        for what in ("designed", "measured"):
             value = getattr(self, what)
             if not (math.isfinite(value) and value > 0.0):
                 raise ExperimentDataError(
@@ -75,13 +72,13 @@ class MeasuredLength:
     def prior(self) -> ParameterPrior:
         """The design and its tolerance."""
         low, high = (self.designed * (1.0 + side * _LARGEST_DEVIATION) for side in (-1.0, 1.0))
-        deviation = self.tolerance / HALF_WIDTH_95
+        deviation = TOLERANCE / HALF_WIDTH_95
         return ParameterPrior(self.name, "m", self.designed, deviation, low, high, "design tolerance")
 
     @property
     def reading(self) -> Reading:
         """What was measured."""
-        return Reading(self.name, "planform", self.measured, self.reading_uncertainty / HALF_WIDTH_95)
+        return Reading(self.name, "planform", self.measured, READING_UNCERTAINTY / HALF_WIDTH_95)
 
     @property
     def posterior(self) -> GaussianPrior:
@@ -101,6 +98,11 @@ class Lengths(NamedTuple):
     semi_span: MeasuredLength
     root_chord: MeasuredLength
     tip_chord: MeasuredLength
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the figures and their uncertainty, the same on every platform."""
+        return hash_record([[*astuple(item), TOLERANCE, READING_UNCERTAINTY] for item in self])
 
 
 def published_lengths() -> Lengths:

@@ -7,7 +7,7 @@ its truth, `twin_master.assets.virtual_experiments` has the FMU behind the same 
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +40,8 @@ RECORDED_GAUGE = 23
 _PURPOSES = {"load": 31, "ring_down": 32, "geometry": 33, "weighing": 34}
 
 
-class RingDownSignal(NamedTuple):
-    """What a recorder saw: instants (N,) from the release on [s] and signal (N,) [V]."""
-
-    time: FloatArray
-    signal: FloatArray
+RingDownSignal = tuple[FloatArray, FloatArray]
+"""What a recorder saw: instants (N,) from the release on [s] and signal (N,) [V]."""
 
 
 class TestBench(Protocol):
@@ -57,6 +54,20 @@ class TestBench(Protocol):
         self, initial_tip_displacement: float, duration: float, sampling_rate: float
     ) -> RingDownSignal:
         """Hold the tip aside [m], let it go, and record for `duration` [s] at `sampling_rate` [Hz]."""
+
+
+def check_recorded(gauges: int) -> None:
+    """Refuse a wing with too few gauges.
+
+    Raises
+    ------
+    ExperimentDataError
+        If it has fewer than `RECORDED_GAUGE`.
+    """
+    if gauges < RECORDED_GAUGE:
+        raise ExperimentDataError(
+            f"the wing has {gauges} gauges, but a release is recorded at gauge {RECORDED_GAUGE}."
+        )
 
 
 def sampling_times(duration: float, sampling_rate: float) -> FloatArray:
@@ -88,15 +99,11 @@ class VirtualWing:
     frequency_error : (float, float)
         Relative differences delta between this wing's two flapwise frequencies and its model's [1]: what
         the model leaves out. Mode shapes and damping ratios stay the model's.
-    gauge : int
-        Whose strain is recorded, counted from 1.
-    sensitivity : float
-        Of the strain signal [V].
 
     Raises
     ------
     ExperimentDataError
-        If the gauge is not there or a frequency error is not above -1.
+        If the wing has fewer gauges than `RECORDED_GAUGE`, or a frequency error is not above -1.
     fe.runtime.errors.OutsideModelError
         If the truth lies outside the model.
     """
@@ -104,14 +111,9 @@ class VirtualWing:
     model: ReducedModel
     truth: DigitalState
     frequency_error: tuple[float, float] = (0.0, 0.0)
-    gauge: int = RECORDED_GAUGE
-    sensitivity: float = SENSITIVITY
 
     def __post_init__(self) -> None:
-        if not 1 <= self.gauge <= self.model.gauge_count:
-            raise ExperimentDataError(
-                f"the wing has the gauges 1 to {self.model.gauge_count}, but {self.gauge} was asked for."
-            )
+        check_recorded(self.model.gauge_count)
         if not all(math.isfinite(error) and error > -1.0 for error in self.frequency_error):
             raise ExperimentDataError(
                 "a relative frequency error must be finite and above -1, but "
@@ -137,9 +139,9 @@ class VirtualWing:
             omega[mode] *= 1.0 + error
         zeta = rayleigh_damping_ratio(truth.damping_alpha, truth.damping_beta, modes.frequency)
         signal = np.zeros_like(time)
-        for mode, strain in enumerate(modes.output[self.gauge - 1] * released):
+        for mode, strain in enumerate(modes.output[RECORDED_GAUGE - 1] * released):
             signal += strain * _free_decay(float(omega[mode]), float(zeta[mode]), time)
-        return RingDownSignal(time, self.sensitivity * initial_tip_displacement * signal)
+        return time, SENSITIVITY * initial_tip_displacement * signal
 
 
 def _free_decay(omega: float, zeta: float, time: FloatArray) -> FloatArray:

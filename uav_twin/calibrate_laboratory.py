@@ -38,6 +38,7 @@ def calibrate_ringdown(
     from calibration.dynamics.trials import (
         PUBLISHED_DAMPING_RATIOS,
         PUBLISHED_FREQUENCIES,
+        ModalFigure,
         fit_trials,
         refine_by_extremes,
     )
@@ -47,13 +48,14 @@ def calibrate_ringdown(
     if extremes:
         trials = refine_by_extremes(trials)
     headings = ("figure", "unit", "found", "between trials", "standard error", "paper")
+    figures: tuple[tuple[ModalFigure, str, str, tuple[float, float]], ...] = (
+        ("frequency", "natural frequency", "Hz", PUBLISHED_FREQUENCIES),
+        ("damping_ratio", "damping ratio", "1", PUBLISHED_DAMPING_RATIOS),
+    )
     rows = [
-        (f"mode {mode + 1}, {name}", unit, (*found(mode), published[mode]))
+        (f"mode {mode + 1}, {title}", unit, (*trials.average(name, mode), published[mode]))
         for mode in (0, 1)
-        for name, unit, found, published in (
-            ("natural frequency", "Hz", trials.frequency, PUBLISHED_FREQUENCIES),
-            ("damping ratio", "1", trials.damping_ratio, PUBLISHED_DAMPING_RATIOS),
-        )
+        for name, title, unit, published in figures
     ]
     terminal.print_table(headings, _cells(rows, ".5g"))
     if out is not None:

@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _GREATEST_GROWTH = 50.0  # exponent at the end of a record; an iteration may pass through growing waves
-_LEAST_VARIANCE = 1e-200  # that a record without noise is not divided by
+_LEAST_VARIANCE = 1e-200  # that a record without noise, or a wave that is gone, is not divided by
 _MOST_EVALUATIONS = 300  # of the least squares, for each unknown
 
 
@@ -60,19 +60,10 @@ class RingDownMode(NamedTuple):
         return abs(self.wave)
 
     @property
-    def frequency_standard_error(self) -> float:
-        """Of the natural frequency [Hz]."""
-        return self._errors[0]
-
-    @property
-    def damping_ratio_standard_error(self) -> float:
-        """Of the damping ratio [1]."""
-        return self._errors[1]
-
-    @property
-    def _errors(self) -> list[float]:
-        slopes = modal_slopes(self.pole)
-        return [math.sqrt(max(float(slope @ self.covariance @ slope), 0.0)) for slope in slopes]
+    def standard_error(self) -> dict[str, float]:
+        """Of `frequency` [Hz] and `damping_ratio` [1], by these names."""
+        slopes = zip(("frequency", "damping_ratio"), modal_slopes(self.pole), strict=True)
+        return {name: math.sqrt(max(float(slope @ self.covariance @ slope), 0.0)) for name, slope in slopes}
 
 
 def modal_slopes(pole: complex) -> FloatArray:
@@ -193,6 +184,7 @@ class DampedCosines:
             columns = np.hstack([turned.real, -turned.imag, basis]) / math.sqrt(variance[channel])
             rows = np.r_[: 2 * count, np.arange(own) + 2 * count + channel * own]
             information[np.ix_(rows, rows)] += columns.T @ columns
+        np.fill_diagonal(information, np.maximum(np.diag(information), _LEAST_VARIANCE))
         size = np.sqrt(np.diag(information))[used]
         scaled = information[np.ix_(used, used)] / np.outer(size, size)
         covariance[np.ix_(used, used)] = np.linalg.pinv(scaled, hermitian=True) / np.outer(size, size)

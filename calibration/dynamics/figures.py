@@ -8,7 +8,7 @@ from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 from reporting.figures import OBSERVED, PAST, PREDICTION, PRESENT, panel_label, panels, publication_style
 
 from .ringdown import RingDownFit, spectrum
-from .trials import RingDownTrials, amplitude_dependence
+from .trials import ModalFigure, RingDownTrials, amplitude_dependence
 
 
 @publication_style()
@@ -19,18 +19,15 @@ def ring_down_figure(trials: RingDownTrials) -> Figure:
     _draw_spectra(spectra, trials)
     points = [point for fit in trials.fits for point in amplitude_dependence(fit)]
     amplitude = [point.amplitude * 1e3 for point in points]
-    for axes, values, mean, ylabel, label, title in (
-        (
-            lower[0], [point.frequency for point in points], trials.frequency(0).mean,
-            "natural frequency (Hz)", "c", "First mode within windows of 0.8 s",
-        ),
-        (
-            lower[1], [100.0 * point.damping_ratio for point in points], 100.0 * trials.damping_ratio(0).mean,
-            "damping ratio (%)", "d", "Its damping",
-        ),
-    ):  # fmt: skip
-        axes.semilogx(amplitude, values, "o", color=OBSERVED, ms=2.4)
-        axes.axhline(mean, color=PAST, lw=1.0, label="whole record")
+    shown: tuple[tuple[Axes, ModalFigure, float, str, str, str], ...] = (
+        (lower[0], "frequency", 1.0, "natural frequency (Hz)", "c", "First mode within windows of 0.8 s"),
+        (lower[1], "damping_ratio", 100.0, "damping ratio (%)", "d", "Its damping"),
+    )
+    for axes, name, scale, ylabel, label, title in shown:
+        axes.semilogx(
+            amplitude, [scale * getattr(point, name) for point in points], "o", color=OBSERVED, ms=2.4
+        )
+        axes.axhline(scale * trials.average(name, 0).mean, color=PAST, lw=1.0, label="whole record")
         axes.set(xlabel="amplitude of the first mode (mV)", ylabel=ylabel)
         axes.xaxis.set_major_formatter(ScalarFormatter())
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -59,7 +56,9 @@ def _draw_spectra(axes: Axes, trials: RingDownTrials) -> None:
         label = f"{len(spectra)} trials" if number == 0 else None
         axes.semilogy(frequency, amplitude * 1e3, color=OBSERVED, lw=0.5, alpha=0.6, label=label)
     for mode, name, style in ((0, "first", "--"), (1, "second", ":")):
-        axes.axvline(trials.frequency(mode).mean, color=PAST, lw=0.8, ls=style, label=f"{name} mode")
+        axes.axvline(
+            trials.average("frequency", mode).mean, color=PAST, lw=0.8, ls=style, label=f"{name} mode"
+        )
     top = 1e3 * max(float(amplitude.max()) for _, amplitude in spectra)
     axes.set(xlim=(0.0, float(spectra[-1][0][-1])), ylim=(2e-4 * top, 2.0 * top))
     axes.set(xlabel="frequency (Hz)", ylabel="amplitude (mV)")

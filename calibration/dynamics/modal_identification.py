@@ -130,11 +130,7 @@ def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[Fl
             "a record of accelerations must be finite numbers, one row for each sample; lost values must be "
             "cut out or filled before."
         )
-    if (
-        limits.ndim != 2
-        or limits.shape[1] != 2
-        or not np.all((limits[:, 0] > 0) & (limits[:, 1] > limits[:, 0]))
-    ):
+    if limits.ndim != 2 or limits.shape[1] != 2 or not np.all(np.diff(limits, prepend=0.0) > 0.0):
         raise ExperimentDataError("each band is its least and its largest frequency [Hz], above zero.")
     if limits.max() > 0.5 * rate:
         raise ExperimentDataError(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import decimate, detrend, find_peaks
 
-from calibration.errors import RingDownError
+from calibration.errors import ExperimentDataError
 
 from .damped_cosine import DampedCosines, RingDownMode
 from .records import MINIMUM_COUNT, RingDownRecord
@@ -82,14 +82,14 @@ def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDow
 
     Raises
     ------
-    RingDownError
+    ExperimentDataError
         If the record is too short, or less than a quarter of it remains.
     """
     time, signal = record.time, record.signal
     lowest, highest = record.lowest, record.highest
     factor = int(record.sampling_rate / WORKING_RATE + 0.5)
     if factor > 1 and record.count // factor < MINIMUM_COUNT:
-        raise RingDownError(
+        raise ExperimentDataError(
             f"{record.source}: {record.count} samples at {record.sampling_rate:.4g} Hz last "
             f"{record.time[-1] - record.time[0]:.3g} s, too short for a ring-down; is the time in s?"
         )
@@ -103,7 +103,7 @@ def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDow
         factor //= stage
     after = time > start if start is not None else np.ones(time.shape, dtype=bool)
     if np.count_nonzero(after) < 0.25 * time.size:
-        raise RingDownError(
+        raise ExperimentDataError(
             f"{record.source}: cropped at {start:g} s, {np.count_nonzero(after)} of {time.size} samples "
             "remain; give the instant of release."
         )
@@ -126,13 +126,13 @@ def spectral_peaks(record: RingDownRecord) -> tuple[float, float]:
 
     Raises
     ------
-    RingDownError
+    ExperimentDataError
         If the record is sampled too slowly, or fewer than two peaks rise by 3.5 times the median noise
         and by 2 % of the highest amplitude (less, down to 0.3 %, if the record has died away at its end),
         in the record itself or in its beginning.
     """
     if 0.5 * record.sampling_rate < 4.0 * SEARCH_BAND[0]:
-        raise RingDownError(
+        raise ExperimentDataError(
             f"{record.source}: a sampling rate of {record.sampling_rate:.3g} Hz shows nothing above "
             f"{0.5 * record.sampling_rate:.3g} Hz; is the time in s?"
         )
@@ -142,7 +142,7 @@ def spectral_peaks(record: RingDownRecord) -> tuple[float, float]:
     if len(found) < 2:
         seen = "none" if not found else f"one, at {found[0]:.3g} Hz"
         top = min(SEARCH_BAND[1], 0.5 * record.sampling_rate)
-        raise RingDownError(
+        raise ExperimentDataError(
             f"{record.source}: two spectral peaks are needed between {SEARCH_BAND[0]:.3g} and "
             f"{top:.3g} Hz, but there is {seen}; check the record, its sampling and the release."
         )
@@ -196,7 +196,7 @@ def fit_ring_down(
 
     Raises
     ------
-    RingDownError
+    ExperimentDataError
         If the record does not decay, or shows fewer than two modes.
     """
     record = prepare(record, start)
@@ -212,10 +212,10 @@ def fit_ring_down(
 
 
 def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
-    """Raise RingDownError for what is no decaying oscillation."""
+    """Raise ExperimentDataError for what is no decaying oscillation."""
     for number, mode in enumerate(modes, start=1):
         if not 0.0 < -mode.pole.real < mode.pole.imag:
-            raise RingDownError(
+            raise ExperimentDataError(
                 f"{source}: mode {number} at {mode.damped_frequency:.3g} Hz is not a decaying oscillation "
                 f"(fitted rate {-mode.pole.real:.3g} 1/s); a ring-down record is needed."
             )
@@ -226,7 +226,7 @@ def _refuse_steady(record: RingDownRecord) -> None:
     third = record.count // 3
     first, last = (math.sqrt(float(np.mean(part**2))) for part in (signal[:third], signal[-third:]))
     if last > _STEADY_SHARE * first:
-        raise RingDownError(
+        raise ExperimentDataError(
             f"{record.source}: the signal does not decay (its last third has {last / first:.2g} times the "
             "rms of its first); a record of free vibration from the release on is needed."
         )

@@ -10,12 +10,12 @@ import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from calibration.errors import RingDownError
+from calibration.errors import ExperimentDataError
 
 from .damped_cosine import DampedCosines, FloatArray, RingDownMode
 from .records import RingDownRecord
@@ -26,6 +26,9 @@ PUBLISHED_FREQUENCIES = (5.6492, 29.9699)
 
 PUBLISHED_DAMPING_RATIOS = (0.0281, 0.0717)
 """Damping ratios found by the authors, mean of five trials [1]."""
+
+ModalFigure = Literal["frequency", "damping_ratio"]
+"""What a mode has."""
 
 
 class Averaged(NamedTuple):
@@ -48,24 +51,12 @@ class RingDownTrials:
 
     fits: tuple[RingDownFit, ...]
 
-    @property
-    def procedure(self) -> Frequencies:
-        """How the frequencies were found."""
-        return self.fits[0].procedure
-
-    def frequency(self, mode: int) -> Averaged:
-        """Return the natural frequency of mode 0 or 1 [Hz]."""
-        return self._average("frequency", mode)
-
-    def damping_ratio(self, mode: int) -> Averaged:
-        """Return the damping ratio of mode 0 or 1 [1]."""
-        return self._average("damping_ratio", mode)
-
-    def _average(self, name: str, mode: int) -> Averaged:
+    def average(self, name: ModalFigure, mode: int) -> Averaged:
+        """Return the natural frequency [Hz] or the damping ratio [1] of mode 0 or 1."""
         values = [float(getattr(fit.modes[mode], name)) for fit in self.fits]
         mean = float(np.mean(values))
         if len(values) == 1:
-            return Averaged(mean, math.nan, getattr(self.fits[0].modes[mode], f"{name}_standard_error"))
+            return Averaged(mean, math.nan, self.fits[0].modes[mode].standard_error[name])
         deviation = float(np.std(values, ddof=1))
         return Averaged(mean, deviation, deviation / math.sqrt(len(values)))
 
@@ -80,11 +71,11 @@ def fit_trials(
 
     Raises
     ------
-    RingDownError
+    ExperimentDataError
         If there is no record, or one does not show two decaying modes.
     """
     if not records:
-        raise RingDownError("there is no ring-down record; at least one is needed.")
+        raise ExperimentDataError("there is no ring-down record; at least one is needed.")
     return RingDownTrials(tuple(fit_ring_down(record, procedure, start=start) for record in records))
 
 
@@ -126,7 +117,7 @@ def refine_by_extremes(trials: RingDownTrials) -> RingDownTrials:
 
     Raises
     ------
-    RingDownError
+    ExperimentDataError
         If a record has no extremes, or a mode no longer decays.
     """
     return RingDownTrials(tuple(_refine(fit) for fit in trials.fits))
@@ -135,7 +126,7 @@ def refine_by_extremes(trials: RingDownTrials) -> RingDownTrials:
 def _refine(fit: RingDownFit) -> RingDownFit:
     record = fit.record
     if record.lowest is None or record.highest is None:
-        raise RingDownError(
+        raise ExperimentDataError(
             f"{record.source}: the record has no lowest and highest values; only one read off a plot does."
         )
     lowest, highest = record.lowest, record.highest

@@ -99,12 +99,8 @@ def measured_modes(trials: RingDownTrials) -> tuple[Reading, ...]:
 
 
 def _mean_of(modes: Sequence[RingDownMode], name: str) -> tuple[float, float]:
-    values, errors = ([getattr(item, which) for item in modes] for which in (name, f"{name}_standard_error"))
-    return _mean(values, errors)
-
-
-def _mean(values: Sequence[float], errors: Sequence[float]) -> tuple[float, float]:
     """Return the mean of the trials and its standard error."""
+    values, errors = [getattr(item, name) for item in modes], [item.standard_error[name] for item in modes]
     count = len(values)
     mean = math.fsum(values) / count
     expected = math.fsum(error**2 for error in errors) / count
@@ -139,7 +135,7 @@ def _amplitude_terms(trials: RingDownTrials) -> tuple[float, float]:
 
 def _choice_terms(trials: RingDownTrials, frequency: float, ratio: float) -> tuple[float, float]:
     """Return what the choice of the fit does to frequency [Hz] and damping ratio [1] of the second mode."""
-    delays = (*((0.0,) if trials.procedure is Frequencies.PEAKS else ()), *_LATER_STARTS)
+    delays = (*((0.0,) if trials.fits[0].procedure is Frequencies.PEAKS else ()), *_LATER_STARTS)
     terms = []
     for delay in delays:
         found = [refitted for fit in trials.fits if (refitted := _refit(fit, delay)) is not None]

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from calibration.errors import ExperimentDataError, MassConstraintError, OutsideValidityError
+from calibration.errors import ExperimentDataError, OutsideValidityError
 from calibration.result.record import ParameterPrior, Reading
 from calibration.static.errors_in_variables import exact_posterior, residual_variance
 from calibration.static.experiments import LoadDisplacementData
@@ -63,10 +63,9 @@ def joint_posterior(
 
     Raises
     ------
-    MassConstraintError
-        If no masses within the model's range keep the weighed total.
     ExperimentDataError
-        If a reading or the model error makes no sense, or the damping ratios need negative coefficients.
+        If a reading or the model error makes no sense, no masses within the model's range keep the weighed
+        total, or the damping ratios need negative coefficients.
     OutsideValidityError
         If the load test alone puts e outside the model, or all measurements together press it against the
         end of the model's range.
@@ -129,7 +128,7 @@ def servo_range(validity: Mapping[str, tuple[float, float]], total_mass: float) 
 
     Raises
     ------
-    MassConstraintError
+    ExperimentDataError
         If there is none.
     """
     servo, pitot = validity["servo_mass"], validity["pitot_mass"]
@@ -137,7 +136,7 @@ def servo_range(validity: Mapping[str, tuple[float, float]], total_mass: float) 
     upper = min(servo[1], 0.5 * (total_mass - pitot[0]))
     if not (math.isfinite(total_mass) and lower < upper):
         least, greatest = 2.0 * servo[0] + pitot[0], 2.0 * servo[1] + pitot[1]
-        raise MassConstraintError(
+        raise ExperimentDataError(
             f"two servos and the pitot tube cannot weigh {total_mass:g} kg: the model takes totals between "
             f"{least:g} and {greatest:g} kg."
         )

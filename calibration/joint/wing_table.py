@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.result.record import CalibratedFigure, ParameterPrior, Reading
-from calibration.static.experiments import HALF_WIDTH_95
-from calibration.static.posterior import PRIOR_HALF_WIDTH
+from calibration.static.posterior import PRIOR_DEVIATION
 from calibration.static.stiffness_curve import StiffnessCurve, stiffness_curve_of
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
@@ -38,15 +37,9 @@ def weighed(mass: float = TOTAL_MASS, deviation: float = 1e-3) -> Reading:
     return Reading("weighed_mass", "weighing", mass, deviation)
 
 
-_OURS = "our choice"
+_PAPER, _OURS = "the paper", "our choice"
 _PRIORS = {
-    "young_modulus_factor": (
-        "1",
-        1.0,
-        PRIOR_HALF_WIDTH / HALF_WIDTH_95,
-        "the paper",
-        "factor on Young's modulus of the skin, e",
-    ),
+    "young_modulus_factor": ("1", 1.0, PRIOR_DEVIATION, _PAPER, "factor on Young's modulus of the skin, e"),
     "servo_mass": ("kg", TOTAL_MASS / 3.0, 0.05, _OURS, "mass of each servo"),
     "pitot_mass": ("kg", TOTAL_MASS / 3.0, 0.10, _OURS, "mass of the pitot tube"),
     "damping_alpha": ("1/s", 0.0, 3.0, _OURS, "mass-proportional Rayleigh damping, alpha"),
@@ -181,7 +174,7 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
     ------
     PosteriorError
         If no polynomial of the degrees tried meets the tolerance.
-    StiffnessCurveError
+    PosteriorError
         As `stiffness_curve_of`.
     """
     limits = np.array([model.validity[name] for name in _NAMES])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from calibration.errors import DegenerateFilterError, OutsideValidityError, PosteriorError
+from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.static.errors_in_variables import FitQuality, Measure, assess_fit, exact_posterior
 from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import GaussianPrior, ScalarPosterior, Seed, check_count, child_seed
@@ -137,11 +137,9 @@ def particle_filter(
 
     Raises
     ------
-    DegenerateFilterError
-        If fewer than ten effective particles remain: prior and measurements contradict each other, or
-        there are too few particles.
     PosteriorError
-        If fewer than a hundred particles are asked for, or more than `MOST_SAMPLES`.
+        If fewer than ten effective particles remain (prior and measurements contradict each other, or there
+        are too few particles), or fewer than a hundred are asked for, or more than `MOST_SAMPLES`.
     """
     prior = prior or GaussianPrior()
     if particle_count < _FEWEST_PARTICLES:
@@ -166,7 +164,7 @@ def particle_filter(
             log_weight += np.log(np.interp(particles, *known, left=0.0, right=0.0))
         largest = float(log_weight.max())
         if largest == -math.inf:
-            raise DegenerateFilterError(
+            raise PosteriorError(
                 f"no particle explains pair {pair + 1} ({load:g} N, {displacement * 1e3:g} mm) of "
                 f"{data.source} and those before it; check the prior N({prior.mean:g}, "
                 f"{prior.standard_deviation:.3g}^2), the units and the curve."
@@ -175,7 +173,7 @@ def particle_filter(
         weight /= weight.sum()
         effective[pair] = 1.0 / float(np.sum(weight**2))
     if effective[-1] < _FEWEST_EFFECTIVE_PARTICLES:
-        raise DegenerateFilterError(
+        raise PosteriorError(
             f"only {effective[-1]:.1f} of {particle_count} particles effectively remain after "
             f"{data.count} pairs; take more particles, or the exact posterior."
         )
@@ -258,7 +256,6 @@ def calibrate_static(
     data: LoadDisplacementData | None = None,
     seed: int = 0,
     *,
-    prior: GaussianPrior | None = None,
     particle_count: int = DEFAULT_PARTICLE_COUNT,
 ) -> StaticCalibration:
     """Find the posterior of e in both ways, and under other assumptions.
@@ -271,18 +268,16 @@ def calibrate_static(
         The measured pairs; the published eight by default.
     seed : int
         Seed of the particle filter.
-    prior : GaussianPrior, optional
-        Prior of e; the paper's by default.
     particle_count : int
         Particles of the filter.
 
     Raises
     ------
-    OutsideValidityError, DegenerateFilterError, PosteriorError
+    OutsideValidityError, PosteriorError
         See `exact_posterior` and `particle_filter`.
     """
     data = published_measurements() if data is None else data
-    prior = prior or GaussianPrior()
+    prior = GaussianPrior()
     exact = exact_posterior(data, curve=curve, prior=prior)
     particle = particle_filter(data, seed=seed, curve=curve, prior=prior, particle_count=particle_count)
     alternatives = {}

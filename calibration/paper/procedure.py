@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from calibration.dynamics.records import STEP_FOLDER
-from calibration.errors import ExperimentDataError, MassConstraintError
+from calibration.errors import ExperimentDataError
 from calibration.joint.measurement import MODAL
 from calibration.joint.posterior import servo_range
 from calibration.lab_folder import lab_table
@@ -66,10 +66,9 @@ def fit_masses(
 
     Raises
     ------
-    MassConstraintError
-        If no masses within the range keep the total, or the best lie at the limit of the range.
     ExperimentDataError
-        If the damping ratios need a negative Rayleigh coefficient.
+        If no masses within the range keep the total, the best lie at the limit of the range, or the damping
+        ratios need a negative Rayleigh coefficient.
     OutsideValidityError
         If a sample of e lies outside the range of the model.
     """
@@ -87,7 +86,7 @@ def fit_masses(
             minimize_scalar(error, bounds=(lower, upper), method="bounded", options={"xatol": 1e-9}).x
         )
         if min(servo - lower, upper - servo) < 1e-6:
-            raise MassConstraintError(
+            raise ExperimentDataError(
                 f"at e = {factor:g} the masses nearest to {wanted[0]:.4g} and {wanted[1]:.4g} Hz lie at the "
                 f"limit of the model, {servo:.4g} kg for a servo under a total of {total_mass:g} kg; check "
                 "the measured frequencies and the total."

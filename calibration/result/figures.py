@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import gaussian_kde
 
 from calibration.result.record import Calibration, Reading
+from calibration.result.text import NOTICEABLE_CORRELATION
 from calibration.static.experiments import HALF_WIDTH_95
 from reporting.figures import (
     BAND_OPACITY,
@@ -25,9 +26,6 @@ from reporting.figures import (
 )
 
 Float = NDArray[np.float64]
-
-NOTICEABLE_CORRELATION = 0.3
-"""From which a correlation is printed in colour."""
 
 _COLOURS = (PAST, PRESENT, REFERENCE)
 _COLUMNS = 3

@@ -15,7 +15,7 @@ from scipy.special import ndtr, ndtri
 
 from calibration.errors import CalibrationRecordError, PosteriorError
 from calibration.static.experiments import HALF_WIDTH_95
-from calibration.static.posterior import Seed, check_count, child_seed
+from calibration.static.posterior import Seed, check_count, child_seed, stratified
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from reporting.words import brief
@@ -345,9 +345,8 @@ class Calibration:
         values = np.sort(self.draws_of(name))
         check_count(count, CalibrationRecordError)
         generator = np.random.default_rng(child_seed(seed, 0))
-        probability = (np.arange(count) + generator.random(count)) / count
-        drawn = values[np.minimum((probability * len(values)).astype(np.int64), len(values) - 1)]
-        return generator.permutation(drawn)
+        place = (stratified(generator, count) * len(values)).astype(np.int64)
+        return values[np.minimum(place, len(values) - 1)]
 
     def given(self, name: str, values: Float) -> dict[str, Float]:
         """Return what the other parameters are expected to be where one has these values (n,), [units].
@@ -402,8 +401,7 @@ def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> 
     columns = []
     for prior in priors:
         low, high = prior.ends
-        strata = generator.permutation((np.arange(count) + generator.random(count)) / count)
-        u = ndtri(low + (high - low) * strata)
+        u = ndtri(low + (high - low) * stratified(generator, count))
         columns.append(np.clip(prior.mean + prior.deviation * u, prior.low, prior.high))
     return np.column_stack(columns)
 

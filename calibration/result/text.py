@@ -9,7 +9,9 @@ from reporting.page import Words
 from reporting.words import between, plus_minus
 
 WORDS = Words("calibration.result")
-NOTED_CORRELATION = 0.3
+NOTICEABLE_CORRELATION = 0.3
+"""From which a correlation is told, and printed in colour."""
+
 PROCEDURES = {
     "quadrature": "by quadrature",
     "Gaussian": "a Gaussian, checked along its axes",
@@ -68,7 +70,7 @@ def correlation_lines(result: Calibration) -> list[str]:
     pairs = [
         (abs(matrix[i, j]), f"Correlation of {names[i]} and {names[j]}: {matrix[i, j]:+.2f}")
         for i, j in zip(*np.triu_indices(len(names), 1), strict=True)
-        if abs(matrix[i, j]) >= NOTED_CORRELATION
+        if abs(matrix[i, j]) >= NOTICEABLE_CORRELATION
     ]
     return [text for _, text in sorted(pairs, key=lambda pair: -pair[0])]
 

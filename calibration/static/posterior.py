@@ -12,8 +12,13 @@ from calibration.errors import PosteriorError
 Seed = int | np.random.SeedSequence
 """A seed: a whole number, or a SeedSequence spawned for the purpose."""
 
-PRIOR_HALF_WIDTH = 0.05
+PRIOR_DEVIATION = 0.05 / 1.96
 """Half-width of the prior's 95 % interval of e (Kapteyn et al. 2021, calibration step 2)."""
+
+
+def stratified(generator: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Return a number from each of `count` equal parts of 0 to 1, in shuffled order (count,)."""
+    return generator.permutation((np.arange(count) + generator.random(count)) / count)
 
 
 def child_seed(seed: Seed, purpose: int) -> np.random.SeedSequence:
@@ -50,7 +55,7 @@ class GaussianPrior:
     """
 
     mean: float = 1.0
-    standard_deviation: float = PRIOR_HALF_WIDTH / 1.96
+    standard_deviation: float = PRIOR_DEVIATION
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.mean) and 0.0 < self.standard_deviation < math.inf):
@@ -168,4 +173,4 @@ class ScalarPosterior:
         """
         check_count(count, PosteriorError)
         generator = np.random.default_rng(child_seed(seed, 0))
-        return self.quantile(generator.permutation((np.arange(count) + generator.random(count)) / count))
+        return self.quantile(stratified(generator, count))

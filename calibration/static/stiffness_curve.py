@@ -7,7 +7,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.errors import StiffnessCurveError
+from calibration.errors import PosteriorError
 
 TABLE_TOLERANCE = 1e-7
 """Largest relative error of a curve between the nodes at which a model was asked."""
@@ -30,7 +30,7 @@ class StiffnessCurve:
 
     Raises
     ------
-    StiffnessCurveError
+    PosteriorError
         If the curve is not finite, positive and rising over its range.
     """
 
@@ -42,7 +42,7 @@ class StiffnessCurve:
         rise = np.diff(stiffnesses)
         if not (np.all(np.isfinite(stiffnesses)) and stiffnesses[0] > 0.0 and np.all(rise > 0.0)):
             worst = int(np.argmin(rise))
-            raise StiffnessCurveError(
+            raise PosteriorError(
                 f"the tip stiffness must be positive and rise with e, but {self.name} goes from "
                 f"{stiffnesses[worst]:g} to {stiffnesses[worst + 1]:g} N/m between e = {factors[worst]:g} "
                 f"and {factors[worst + 1]:g}."
@@ -111,7 +111,7 @@ def stiffness_curve_of(
 
     Raises
     ------
-    StiffnessCurveError
+    PosteriorError
         If the curve is not positive and rising, or too rough for a polynomial.
     """
     stiffness = np.vectorize(tip_stiffness, otypes=[float])
@@ -119,7 +119,7 @@ def stiffness_curve_of(
     between = np.linspace(*limits, 2 * _DEGREE)
     error = float(np.max(np.abs(polynomial(between) / stiffness(between) - 1.0)))
     if error > TABLE_TOLERANCE:
-        raise StiffnessCurveError(
+        raise PosteriorError(
             f"the tip stiffness of {name} over e in [{limits[0]:g}, {limits[1]:g}] is too rough for a "
             f"polynomial: the relative error is {error:.1g} at degree {_DEGREE}."
         )

@@ -51,7 +51,7 @@ def _of_the_ring_down(lab: LabData, *, the_papers: bool) -> list[str]:
     if trials is None:
         return []
     found = []
-    second = trials.damping_ratio(1).mean
+    second = trials.average("damping_ratio", 1).mean
     published = PUBLISHED_DAMPING_RATIOS[1]
     if the_papers and abs(second / published - 1.0) > 0.1:
         found.append(

@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -40,7 +40,7 @@ def write_lab_folder(
     lengths: Lengths,
     load_test: LoadDisplacementData,
     records: Sequence[RingDownRecord],
-    total_mass: Reading | None = None,
+    total_mass: Reading,
 ) -> tuple[Path, ...]:
     """Write measurements as the readers of `calibration` take them; every file is whole or not there.
 
@@ -55,7 +55,7 @@ def write_lab_folder(
     records : sequence of RingDownRecord
         Records, to `step3/initialconditiondata_N.DAT`: time [s], spanwise signal [V], and a chordwise column
         of zeros, because the wing model has no chordwise gauge.
-    total_mass : Reading, optional
+    total_mass : Reading
         Weighed total, to `step3/weighed_mass.csv` [g].
 
     Returns
@@ -86,10 +86,8 @@ def write_lab_folder(
         np.savetxt(lines, table, fmt=("%.6f", "%.9e", "%d"), delimiter="\t")
         file = Path(folder) / STEP_FOLDER / f"initialconditiondata_{number}.DAT"
         files.append(atomic_write_text(file, lines.getvalue()))
-    if total_mass is not None:
-        grams = [total_mass.value * 1e3], [total_mass.deviation * 1e3]
-        files.append(write(WEIGHED_MASS_FILE, **dict(zip(_WEIGHED_COLUMNS, grams, strict=True))))
-    return tuple(files)
+    grams = [total_mass.value * 1e3], [total_mass.deviation * 1e3]
+    return *files, write(WEIGHED_MASS_FILE, **dict(zip(_WEIGHED_COLUMNS, grams, strict=True)))
 
 
 def read_weighed_mass(file: Path) -> Reading:
@@ -155,10 +153,10 @@ class LabData:
     lengths: Lengths
     pairs: LoadDisplacementData
     readings: tuple[Reading, ...]
-    trials: RingDownTrials | None
-    authors: PaperSamples | None
     origins: tuple[StepOrigin, ...]
     input_hashes: dict[str, str]
+    trials: RingDownTrials | None = None
+    authors: PaperSamples | None = None
 
 
 def published_data() -> LabData:
@@ -168,10 +166,8 @@ def published_data() -> LabData:
         lengths=lengths,
         pairs=pairs,
         readings=(weighed(), *PUBLISHED_MODES),
-        trials=None,
-        authors=None,
         origins=tuple(StepOrigin(step, False, text) for step, text in _PUBLISHED.items()),
-        input_hashes={"lengths": _hash_of_lengths(lengths), "load_test": pairs.sha256},
+        input_hashes={"lengths": lengths.sha256, "load_test": pairs.sha256},
     )
 
 
@@ -195,7 +191,7 @@ def read_lab_folder(
     ExperimentFileError
         If the folder does not exist, holds no step at all, or a step's folder lacks its file; and where
         records are asked for and there are none.
-    ExperimentDataError, RingDownError
+    ExperimentDataError
         If what is there cannot be a measurement; see the readers of the steps.
     """
     path = Path(path)
@@ -221,7 +217,7 @@ def read_lab_folder(
     mass, modes = lab.readings[0], lab.readings[1:]
     if 1 in steps:
         found["lengths"] = read_lengths(path)
-        hashes["lengths"] = _hash_of_lengths(found["lengths"])
+        hashes["lengths"] = found["lengths"].sha256
         origins[1] = StepOrigin(1, True, f"{GEOMETRY_FILE.as_posix()} read")
     if 2 in steps:
         found["pairs"] = pairs = read_measurements(path)
@@ -253,7 +249,3 @@ _PUBLISHED = {
     2: "not measured; published pairs (Kapteyn et al. 2021, Fig. 5)",
     3: "published frequencies and damping ratios (the authors' step 3)",
 }
-
-
-def _hash_of_lengths(lengths: Lengths) -> str:
-    return hash_record([[*astuple(item)] for item in lengths])

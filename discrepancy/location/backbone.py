@@ -162,9 +162,9 @@ def _points(time: FloatArray, solution: Solution, noise_deviation: float | None)
                 mode.amplitude * float(np.exp(-np.clip(decay * centre, -50.0, 50.0))),
                 deviation * sqrt(2.0 / effective),
                 mode.frequency,
-                mode.frequency_standard_error * deviation / own,
+                mode.standard_error["frequency"] * deviation / own,
                 mode.damping_ratio,
-                mode.damping_ratio_standard_error * deviation / own,
+                mode.standard_error["damping_ratio"] * deviation / own,
             )
         )
     return points

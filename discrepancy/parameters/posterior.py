@@ -9,6 +9,7 @@ from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
 from calibration.result.record import Procedure
+from calibration.static.posterior import stratified
 from discrepancy.errors import FitError, ModelError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
@@ -170,8 +171,7 @@ def _along_the_widest(
             break
         slices.visit(np.array([0.5 * (slices.nodes[largest] + slices.nodes[largest + 1])]))
         fine, mass = slices.mass()
-    strata = (np.arange(count) + generator.random(count)) / count
-    return slices.others(generator.permutation(np.interp(strata, mass, fine)), generator)
+    return slices.others(np.interp(stratified(generator, count), mass, fine), generator)
 
 
 class Slices:

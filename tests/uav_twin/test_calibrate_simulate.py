@@ -45,8 +45,8 @@ def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         young_modulus_factor=0.99, stiffness_loss=(0.0, 0.0), servo_mass=0.18, pitot_mass=0.11
     )
     first, second = modes.followed
-    assert trials.frequency(0).mean == pytest.approx(modes.frequency[first], rel=1e-3)
-    assert trials.frequency(1).mean == pytest.approx(modes.frequency[second], rel=5e-3)
+    assert trials.average("frequency", 0).mean == pytest.approx(modes.frequency[first], rel=1e-3)
+    assert trials.average("frequency", 1).mean == pytest.approx(modes.frequency[second], rel=5e-3)
     # the same again, bit for bit
     assert simulate(monkeypatch, tmp_path / "again", *given) == 0
     for file in sorted(path for path in out.rglob("*") if path.is_file()):

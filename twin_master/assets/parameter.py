@@ -95,10 +95,10 @@ def draw_parameter(
             return ParameterDraws(name, np.array([mean]), mean, 0.0, "fixed in the scenario")
         from scipy.special import ndtri
 
+        from calibration.static.posterior import stratified
+
         random = generator(seed, "calibration")
-        values = random.permutation(
-            mean + deviation * ndtri((np.arange(count) + random.random(count)) / count)
-        )
+        values = mean + deviation * ndtri(stratified(random, count))
         return ParameterDraws(name, values, mean, deviation, "normal distribution of the scenario")
     if calibration.curve == "design" and model is None:
         raise MissingObservationModelError(

@@ -6,14 +6,19 @@ from typing import Self
 
 import numpy as np
 
-from calibration.virtual_wing import RECORDED_GAUGE, SENSITIVITY, RingDownSignal, sampling_times
+from calibration.virtual_wing import (
+    RECORDED_GAUGE,
+    SENSITIVITY,
+    RingDownSignal,
+    check_recorded,
+    sampling_times,
+)
 from fe.runtime.state import DigitalState, losses_of
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.slaves.variables import QUASI_STATIC, TRANSIENT
 from scenarios import binding_files
-from twin_master.errors import MissionInputError
 
 BINDING = "uav_wing_laboratory"
 """The shipped binding of the test bench."""
@@ -32,17 +37,13 @@ class FmuTestBench:
         The wing FMU.
     truth : DigitalState
         Its true state; the geometry is that of the FMU's wing.
-    gauge : int
-        Whose strain is recorded, counted from 1.
-    sensitivity : float
-        Of the strain signal [V].
     isolated : bool
         Whether the FMU runs in a worker process.
 
     Raises
     ------
-    MissionInputError
-        If the FMU has no such gauge.
+    calibration.errors.ExperimentDataError
+        If the FMU's wing has fewer gauges than `RECORDED_GAUGE`.
     FmuError
         If the FMU cannot be flown or its parameters are out of range.
     """
@@ -52,20 +53,13 @@ class FmuTestBench:
         fmu: Path,
         truth: DigitalState,
         *,
-        gauge: int = RECORDED_GAUGE,
-        sensitivity: float = SENSITIVITY,
         isolated: bool = True,
     ) -> None:
         self._fmu, self._isolated = Path(fmu), isolated
         declared = [item.name for item in read_fmu(fmu).variables]
         regions = [name.removeprefix("health.") for name in declared if name.startswith("health.")]
         self._binding = load_binding(binding_files()[BINDING]).with_regions(regions)
-        gauges = len(self._binding.observation["strain"].variables)
-        if not 1 <= gauge <= gauges:
-            raise MissionInputError(
-                f"the FMU's wing has the gauges 1 to {gauges}, but {gauge} was asked for."
-            )
-        self._row, self._sensitivity = gauge - 1, sensitivity
+        check_recorded(len(self._binding.observation["strain"].variables))
         self._parameters = {
             "young_modulus_factor": truth.young_modulus_factor,
             "servo_mass": truth.servo_mass,
@@ -104,10 +98,10 @@ class FmuTestBench:
         strain = np.empty_like(time)
         with self._session(binding, release) as session:
             session.reset(control={"load_factor": 0.0}, health=self._health, load={"tip_force": 0.0})
-            strain[0] = session.observe().values[self._row]
+            strain[0] = session.observe().values[RECORDED_GAUGE - 1]
             for sample in range(1, time.size):
-                strain[sample] = session.step().values[self._row]
-        return RingDownSignal(time, self._sensitivity * strain)
+                strain[sample] = session.step().values[RECORDED_GAUGE - 1]
+        return time, SENSITIVITY * strain
 
     def _session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:
         return FmiAsset(self._fmu, binding, isolated=self._isolated, parameters=self._parameters | parameters)

@@ -10,7 +10,7 @@ import pytest
 
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.trials import fit_trials, refine_by_extremes
-from calibration.errors import RingDownError
+from calibration.errors import ExperimentDataError
 
 WIDTH = 0.00811
 
@@ -38,22 +38,22 @@ def test_damping_of_a_drawn_signal() -> None:
     # The spectral peak of a mode damped by 7 % lies a little off its frequency.
     assert second.damping_ratio == pytest.approx(0.0717, rel=0.10)
     assert second.damped_frequency == trials.fits[0].modes[1].damped_frequency
-    middle = abs(trials.damping_ratio(1).mean / 0.0717 - 1.0)
+    middle = abs(trials.average("damping_ratio", 1).mean / 0.0717 - 1.0)
     assert abs(second.damping_ratio / 0.0717 - 1.0) <= middle + 0.02
-    assert 0.0 < second.damping_ratio_standard_error < 0.02
+    assert 0.0 < second.standard_error["damping_ratio"] < 0.02
 
 
 def test_the_digitised_records(reference: Path) -> None:
     trials = fit_trials(read_records(reference))
     refined = refine_by_extremes(trials)
-    assert refined.damping_ratio(0).mean == pytest.approx(0.028, rel=0.10)
+    assert refined.average("damping_ratio", 0).mean == pytest.approx(0.028, rel=0.10)
     # Nearer to the 0.0717 of the raw records than the middle of the ink is.
-    assert trials.damping_ratio(1).mean < refined.damping_ratio(1).mean < 0.0717
-    assert refined.frequency(1).mean == pytest.approx(29.9, rel=0.005)
+    assert trials.average("damping_ratio", 1).mean < refined.average("damping_ratio", 1).mean < 0.0717
+    assert refined.average("frequency", 1).mean == pytest.approx(29.9, rel=0.005)
 
 
 def test_a_sampled_record_has_no_extremes() -> None:
     record = drawn()
     trials = fit_trials([RingDownRecord(record.time, record.signal)])
-    with pytest.raises(RingDownError, match="no lowest and highest"):
+    with pytest.raises(ExperimentDataError, match="no lowest and highest"):
         refine_by_extremes(trials)

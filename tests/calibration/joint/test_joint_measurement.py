@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration.dynamics.damped_cosine import RingDownMode
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import RingDownTrials, fit_trials
-from calibration.joint.measurement import PUBLISHED_MODES, _mean, measured_modes
+from calibration.joint.measurement import PUBLISHED_MODES, _mean_of, measured_modes
 from calibration.result.record import Reading
 
 TIME = np.arange(0.0, 6.4, 1.0 / 250.0)
@@ -59,7 +62,7 @@ def test_a_linear_wing_is_given_its_statistical_error_alone() -> None:
                 (found["damping_ratio_2"].value - ZETA2) / found["damping_ratio_2"].deviation,
             )
         )
-        errors = [fit.modes[0].frequency_standard_error for fit in fitted.fits]
+        errors = [fit.modes[0].standard_error["frequency"] for fit in fitted.fits]
         expected = math.sqrt(sum(error**2 for error in errors)) / 5.0
         # Five trials in a row seldom scatter, and windows seldom slope, beyond chance.
         assert found["frequency_1"].deviation < 6.0 * expected
@@ -87,13 +90,20 @@ def test_frequencies_of_spectral_peaks_carry_their_bias() -> None:
     assert found["frequency_2"].deviation < 2.0 * bias
 
 
+def _mean_of_values(values: list[float], errors: list[float]) -> tuple[float, float]:
+    """Return mean and standard error of trials whose fits give these frequencies and standard errors."""
+    pairs = zip(values, errors, strict=True)
+    modes = [SimpleNamespace(frequency=value, standard_error={"frequency": error}) for value, error in pairs]
+    return _mean_of(cast(list[RingDownMode], modes), "frequency")
+
+
 def test_mean_over_trials() -> None:
-    mean, error = _mean([1.0, 1.1, 0.9, 1.05, 0.95], [0.1] * 5)  # scatter as expected
+    mean, error = _mean_of_values([1.0, 1.1, 0.9, 1.05, 0.95], [0.1] * 5)  # scatter as expected
     assert (mean, error) == (pytest.approx(1.0), pytest.approx(0.1 / math.sqrt(5.0)))
-    _, error = _mean([1.0, 1.1, 0.9, 1.05, 0.95], [1e-3] * 5)  # scatter beyond the fits' errors
+    _, error = _mean_of_values([1.0, 1.1, 0.9, 1.05, 0.95], [1e-3] * 5)  # scatter beyond the fits' errors
     assert error == pytest.approx(math.sqrt(2.0) * np.std([1.0, 1.1, 0.9, 1.05, 0.95], ddof=1) / math.sqrt(5))
-    assert _mean([3.0], [0.2]) == (3.0, pytest.approx(0.2))
-    assert _mean([1.0, 2.0], [1e-3, 1e-3])[1] == pytest.approx(1.0)
+    assert _mean_of_values([3.0], [0.2]) == (3.0, pytest.approx(0.2))
+    assert _mean_of_values([1.0, 2.0], [1e-3, 1e-3])[1] == pytest.approx(1.0)
 
 
 def test_the_published_records(reference: Path) -> None:

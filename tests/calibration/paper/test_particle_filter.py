@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calibration.errors import DegenerateFilterError, PosteriorError
+from calibration.errors import PosteriorError
 from calibration.paper.load_test import kernel_density, normal_reference_bandwidth, particle_filter
 from calibration.static.errors_in_variables import exact_posterior, pair_log_likelihoods
 from calibration.static.experiments import published_measurements
@@ -74,12 +74,12 @@ def test_effective_particles_fall_with_the_pairs_on_the_whole():
 
 def test_measurements_that_no_particle_explains_are_refused():
     far = dataclasses.replace(DATA, displacement=DATA.displacement * 0.5)
-    with pytest.raises(DegenerateFilterError, match="no particle explains pair"):
+    with pytest.raises(PosteriorError, match="no particle explains pair"):
         particle_filter(far, seed=0, particle_count=2000)
 
 
 def test_too_few_effective_particles_are_refused():
-    with pytest.raises(DegenerateFilterError, match="effectively remain"):
+    with pytest.raises(PosteriorError, match="effectively remain"):
         particle_filter(DATA, seed=0, prior=GaussianPrior(0.93, 0.015), particle_count=100)
     with pytest.raises(PosteriorError, match="at least 100"):
         particle_filter(DATA, seed=0, particle_count=0)

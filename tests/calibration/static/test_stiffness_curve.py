@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.errors import StiffnessCurveError
+from calibration.errors import PosteriorError
 from calibration.static.stiffness_curve import (
     PUBLISHED_LINE,
     TABLE_TOLERANCE,
@@ -62,11 +62,11 @@ def test_a_curve_continues_smoothly_beyond_its_table():
 
 
 def test_bad_curves_are_refused():
-    with pytest.raises(StiffnessCurveError, match="rise with e"):
+    with pytest.raises(PosteriorError, match="rise with e"):
         stiffness_line(-1.0, 700.0)
-    with pytest.raises(StiffnessCurveError, match="positive"):
+    with pytest.raises(PosteriorError, match="positive"):
         stiffness_line(1.0, -5.0)
-    with pytest.raises(StiffnessCurveError, match="rise with e"):
+    with pytest.raises(PosteriorError, match="rise with e"):
         stiffness_curve_of(lambda factor: 700.0 - factor, RANGE)
 
 
@@ -74,5 +74,5 @@ def test_a_model_too_rough_to_tabulate_is_refused():
     def stairs(young_modulus_factor: float) -> float:
         return 600.0 + 100.0 * young_modulus_factor + 5.0 * math.floor(70.0 * young_modulus_factor)
 
-    with pytest.raises(StiffnessCurveError, match="too rough"):
+    with pytest.raises(PosteriorError, match="too rough"):
         stiffness_curve_of(stairs, RANGE, "stairs")

@@ -25,8 +25,10 @@ def test_digitised_records_are_fitted_by_their_extremes(reference: Path) -> None
     read = read_lab_folder(reference)
     assert read.trials is not None
     assert len(read.trials.fits) == 5
-    assert [read.trials.frequency(mode).mean for mode in (0, 1)] == pytest.approx((5.6547, 29.94), rel=1e-3)
-    assert [read.trials.damping_ratio(mode).mean for mode in (0, 1)] == pytest.approx(
+    assert [read.trials.average("frequency", mode).mean for mode in (0, 1)] == pytest.approx(
+        (5.6547, 29.94), rel=1e-3
+    )
+    assert [read.trials.average("damping_ratio", mode).mean for mode in (0, 1)] == pytest.approx(
         (0.0280, 0.0573), rel=0.03
     )
     assert sum(name.startswith("ring_down_") for name in read.input_hashes) == 5
